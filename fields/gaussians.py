@@ -1,0 +1,273 @@
+"""`GaussianField`: the map's Gaussians, a pool that grows without recompiling the kernels that use it."""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+__all__ = ["SH_C0", "GaussianField"]
+
+# The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[0].
+SH_C0 = 0.28209479177387814
+BLOCK = 1024
+
+
+@ti.data_oriented
+class GaussianField:
+    """Anisotropic Gaussians in world space, with their gradients and Adam moments beside the values.
+
+    SNode tree: pointer(blocks) over dense(1024), so that memory follows the number of Gaussians and no kernel is
+    compiled anew when it grows. Gaussians are `0 .. count - 1`, always contiguous.
+
+    position (3), log_scale (3), quaternion (4; w, x, y, z, any length but zero), opacity_logit (1),
+    sh (K, 3) with K = (sh_degree + 1)^2 coefficients: the layout of 3DGS files. `steps` counts the updates that
+    a Gaussian has had. 236 bytes per Gaussian at degree 0 in float32.
+    """
+
+    def __init__(self, sh_degree: int = 0, max_gaussians: int = 1 << 22, real=ti.f32) -> None:
+        self.sh_degree = sh_degree
+        self.sh_count = (sh_degree + 1) ** 2
+        self.real = real
+        self.count = 0
+        self.capacity = -(-max_gaussians // BLOCK) * BLOCK
+        self.dtype = np.float64 if real == ti.f64 else np.float32
+
+        def vector(n: int, needs_grad: bool = False):
+            return ti.Vector.field(n, real, needs_grad=needs_grad)
+
+        self.position, self.position_m, self.position_v = vector(3, True), vector(3), vector(3)
+        self.log_scale, self.log_scale_m, self.log_scale_v = vector(3, True), vector(3), vector(3)
+        self.quaternion, self.quaternion_m, self.quaternion_v = vector(4, True), vector(4), vector(4)
+        self.opacity_logit = ti.field(real, needs_grad=True)
+        self.opacity_logit_m, self.opacity_logit_v = ti.field(real), ti.field(real)
+        self.sh, self.sh_m, self.sh_v = vector(3, True), vector(3), vector(3)
+        self.steps = ti.field(ti.i32)
+        self.touched = ti.field(ti.i32)
+
+        builder = ti.FieldsBuilder()
+        blocks = builder.pointer(ti.i, self.capacity // BLOCK)
+        # One dense child a use: culling reads positions without dragging moments through the cache.
+        geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
+        blocks.dense(ti.i, BLOCK).place(*geometry)
+        blocks.dense(ti.i, BLOCK).place(*(f.grad for f in geometry))
+        blocks.dense(ti.i, BLOCK).place(
+            self.position_m, self.position_v, self.log_scale_m, self.log_scale_v,
+            self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v,
+        )  # fmt: skip
+        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh)
+        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
+        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
+        blocks.dense(ti.i, BLOCK).place(self.steps, self.touched)
+        self._tree = builder.finalize()
+
+    def destroy(self) -> None:
+        """Free the memory; the object must not be used after it."""
+        self._tree.destroy()
+
+    def __len__(self) -> int:
+        return self.count
+
+    # ---- growing and shrinking -------------------------------------------------------------------------------
+
+    def append(
+        self,
+        position: NDArray,
+        log_scale: NDArray,
+        quaternion: NDArray,
+        opacity_logit: NDArray,
+        sh: NDArray,
+    ) -> None:
+        """Add N Gaussians: position (N, 3), log_scale (N, 3), quaternion (N, 4), opacity_logit (N,), sh (N, K, 3).
+
+        Gradients, moments and step counts of the new ones are zero.
+        Raises ValueError naming the first Gaussian that holds NaN, infinity or a zero quaternion, or where the
+        shapes disagree or the pool is full.
+        """
+        arrays = [
+            np.ascontiguousarray(a, dtype=self.dtype) for a in (position, log_scale, quaternion, opacity_logit, sh)
+        ]
+        n = len(arrays[0])
+        shapes = [(n, 3), (n, 3), (n, 4), (n,), (n, self.sh_count, 3)]
+        for array, shape, name in zip(arrays, shapes, _NAMES, strict=True):
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+            bad = ~np.isfinite(array.reshape(n, -1)).all(axis=1)
+            if bad.any():
+                raise ValueError(f"Gaussian {int(np.argmax(bad))}: {name} is not finite")
+        zero = np.linalg.norm(arrays[2], axis=1) < 1e-12
+        if zero.any():
+            raise ValueError(f"Gaussian {int(np.argmax(zero))}: quaternion is zero")
+        if self.count + n > self.capacity:
+            raise ValueError(f"{self.count + n} Gaussians exceed the pool of {self.capacity}; raise max_gaussians")
+        if n:
+            self._write(self.count, *arrays)
+            self.count += n
+
+    def remove(self, keep: NDArray[np.bool_]) -> int:
+        """Keep the Gaussians where `keep` (count,) is true; return how many went.
+
+        Survivors from the end move into the holes, in order: parallel, and the same on every run.
+        """
+        if keep.shape != (self.count,):
+            raise ValueError(f"keep has shape {keep.shape}, expected ({self.count},)")
+        kept = int(np.count_nonzero(keep))
+        removed = self.count - kept
+        if removed:
+            holes = np.flatnonzero(~keep[:kept]).astype(np.int32)
+            movers = (kept + np.flatnonzero(keep[kept:])).astype(np.int32)
+            if len(holes):
+                self._move(movers, holes)
+            self.count = kept
+        return removed
+
+    # ---- saving and loading ----------------------------------------------------------------------------------
+
+    def to_numpy(self) -> dict[str, NDArray]:
+        """Values of all Gaussians by name: position (N, 3), log_scale, quaternion, opacity_logit (N,), sh (N, K, 3)."""
+        n, k = self.count, self.sh_count
+        arrays = [np.zeros(s, dtype=self.dtype) for s in ((n, 3), (n, 3), (n, 4), (n,), (n, k, 3))]
+        if n:
+            self._read(n, *arrays)
+        return dict(zip(_NAMES, arrays, strict=True))
+
+    def gradients_to_numpy(self) -> dict[str, NDArray]:
+        """Gradients of all Gaussians, by the names and shapes of `to_numpy`."""
+        n, k = self.count, self.sh_count
+        arrays = [np.zeros(s, dtype=self.dtype) for s in ((n, 3), (n, 3), (n, 4), (n,), (n, k, 3))]
+        if n:
+            self._read_gradients(n, *arrays)
+        return dict(zip(_NAMES, arrays, strict=True))
+
+    def load(self, state: dict[str, NDArray]) -> None:
+        """Replace the content by the values of `state`, as `to_numpy` gives them. Raises as `append` does."""
+        self.count = 0
+        self.append(**{name: state[name] for name in _NAMES})
+
+    def opacities(self) -> NDArray:
+        """Opacity in (0, 1) of all Gaussians (N,)."""
+        return 1.0 / (1.0 + np.exp(-self.to_numpy()["opacity_logit"]))
+
+    @ti.kernel
+    def clear_gradients(self, count: ti.i32):
+        """Zero the gradients and marks of the Gaussians that the last step touched."""
+        for i in range(count):
+            if self.touched[i] != 0:
+                self.touched[i] = 0
+                self.position.grad[i].fill(0.0)
+                self.log_scale.grad[i].fill(0.0)
+                self.quaternion.grad[i].fill(0.0)
+                self.opacity_logit.grad[i] = 0.0
+                for k in range(self.sh_count):
+                    self.sh.grad[i, k].fill(0.0)
+
+    @ti.func
+    def _forget(self, i):
+        """A Gaussian's first state: no gradient, no history."""
+        self.position.grad[i].fill(0.0)
+        self.log_scale.grad[i].fill(0.0)
+        self.quaternion.grad[i].fill(0.0)
+        self.opacity_logit.grad[i] = 0.0
+        self.position_m[i].fill(0.0)
+        self.position_v[i].fill(0.0)
+        self.log_scale_m[i].fill(0.0)
+        self.log_scale_v[i].fill(0.0)
+        self.quaternion_m[i].fill(0.0)
+        self.quaternion_v[i].fill(0.0)
+        self.opacity_logit_m[i] = 0.0
+        self.opacity_logit_v[i] = 0.0
+        for k in range(self.sh_count):
+            self.sh.grad[i, k].fill(0.0)
+            self.sh_m[i, k].fill(0.0)
+            self.sh_v[i, k].fill(0.0)
+        self.steps[i] = 0
+        self.touched[i] = 0
+
+    @ti.kernel
+    def _write(
+        self,
+        first: ti.i32,
+        position: ti.types.ndarray(),
+        log_scale: ti.types.ndarray(),
+        quaternion: ti.types.ndarray(),
+        opacity_logit: ti.types.ndarray(),
+        sh: ti.types.ndarray(),
+    ):
+        for j in range(opacity_logit.shape[0]):
+            i = first + j
+            for c in ti.static(range(3)):
+                self.position[i][c] = position[j, c]
+                self.log_scale[i][c] = log_scale[j, c]
+            for c in ti.static(range(4)):
+                self.quaternion[i][c] = quaternion[j, c]
+            self.opacity_logit[i] = opacity_logit[j]
+            for k in range(self.sh_count):
+                for c in ti.static(range(3)):
+                    self.sh[i, k][c] = sh[j, k, c]
+            self._forget(i)
+
+    @ti.kernel
+    def _read(
+        self,
+        count: ti.i32,
+        position: ti.types.ndarray(),
+        log_scale: ti.types.ndarray(),
+        quaternion: ti.types.ndarray(),
+        opacity_logit: ti.types.ndarray(),
+        sh: ti.types.ndarray(),
+    ):
+        for i in range(count):
+            for c in ti.static(range(3)):
+                position[i, c] = self.position[i][c]
+                log_scale[i, c] = self.log_scale[i][c]
+            for c in ti.static(range(4)):
+                quaternion[i, c] = self.quaternion[i][c]
+            opacity_logit[i] = self.opacity_logit[i]
+            for k in range(self.sh_count):
+                for c in ti.static(range(3)):
+                    sh[i, k, c] = self.sh[i, k][c]
+
+    @ti.kernel
+    def _read_gradients(
+        self,
+        count: ti.i32,
+        position: ti.types.ndarray(),
+        log_scale: ti.types.ndarray(),
+        quaternion: ti.types.ndarray(),
+        opacity_logit: ti.types.ndarray(),
+        sh: ti.types.ndarray(),
+    ):
+        for i in range(count):
+            for c in ti.static(range(3)):
+                position[i, c] = self.position.grad[i][c]
+                log_scale[i, c] = self.log_scale.grad[i][c]
+            for c in ti.static(range(4)):
+                quaternion[i, c] = self.quaternion.grad[i][c]
+            opacity_logit[i] = self.opacity_logit.grad[i]
+            for k in range(self.sh_count):
+                for c in ti.static(range(3)):
+                    sh[i, k, c] = self.sh.grad[i, k][c]
+
+    @ti.kernel
+    def _move(self, source: ti.types.ndarray(), target: ti.types.ndarray()):
+        for j in range(source.shape[0]):
+            s, t = source[j], target[j]
+            self._forget(t)
+            self.position[t] = self.position[s]
+            self.position_m[t] = self.position_m[s]
+            self.position_v[t] = self.position_v[s]
+            self.log_scale[t] = self.log_scale[s]
+            self.log_scale_m[t] = self.log_scale_m[s]
+            self.log_scale_v[t] = self.log_scale_v[s]
+            self.quaternion[t] = self.quaternion[s]
+            self.quaternion_m[t] = self.quaternion_m[s]
+            self.quaternion_v[t] = self.quaternion_v[s]
+            self.opacity_logit[t] = self.opacity_logit[s]
+            self.opacity_logit_m[t] = self.opacity_logit_m[s]
+            self.opacity_logit_v[t] = self.opacity_logit_v[s]
+            for k in range(self.sh_count):
+                self.sh[t, k] = self.sh[s, k]
+                self.sh_m[t, k] = self.sh_m[s, k]
+                self.sh_v[t, k] = self.sh_v[s, k]
+            self.steps[t] = self.steps[s]
+
+
+_NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")

@@ -1,0 +1,37 @@
+"""`ProjectedGaussians`: the visible Gaussians of one view in image space, nearest first."""
+
+import taichi as ti
+
+__all__ = ["ProjectedGaussians"]
+
+BLOCK = 1024
+
+
+@ti.data_oriented
+class ProjectedGaussians:
+    """One slot per visible Gaussian, in order of depth, with the gradients of all that compositing reads.
+
+    gaussian: index in the `GaussianField`. mean (2): pixel position. conic (3): inverse 2D covariance
+    (xx, xy, yy) [1/px^2]. opacity: after the anti-aliasing compensation. colour (3), depth: z in the camera frame.
+    tangent (6): a copy per slot of the camera tangent xi = 0, so that its gradient is gathered without contention
+    and in a fixed order. first_pair: index of the slot's first tile pair.
+    """
+
+    def __init__(self, builder: ti.FieldsBuilder, capacity: int = 1 << 22, real=ti.f32) -> None:
+        self.real = real
+        self.capacity = -(-capacity // BLOCK) * BLOCK
+        self.count = 0
+        self.gaussian = ti.field(ti.i32)
+        self.first_pair = ti.field(ti.i32)
+        self.mean = ti.Vector.field(2, real, needs_grad=True)
+        self.conic = ti.Vector.field(3, real, needs_grad=True)
+        self.opacity = ti.field(real, needs_grad=True)
+        self.colour = ti.Vector.field(3, real, needs_grad=True)
+        self.depth = ti.field(real, needs_grad=True)
+        self.tangent = ti.Vector.field(6, real, needs_grad=True)
+        blocks = builder.pointer(ti.i, self.capacity // BLOCK)
+        composited = (self.mean, self.conic, self.opacity, self.colour, self.depth)
+        blocks.dense(ti.i, BLOCK).place(*composited)
+        blocks.dense(ti.i, BLOCK).place(*(f.grad for f in composited))
+        blocks.dense(ti.i, BLOCK).place(self.tangent, self.tangent.grad)
+        blocks.dense(ti.i, BLOCK).place(self.gaussian, self.first_pair)

@@ -1,0 +1,136 @@
+"""SE(3): rigid motions and their tangents, as NumPy functions and as Taichi functions of the same names.
+
+The tangent is xi = (rho, omega): translation first, then rotation. Increments act on the left,
+T <- exp(xi) T, so that xi of a `T_camera_world` is expressed in the camera frame.
+"""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "exp_se3",
+    "hat",
+    "interpolate_se3",
+    "inverse_se3",
+    "log_se3",
+    "matrix_from_quaternion",
+    "orthonormalised",
+    "quaternion_from_matrix",
+    "ti_rotation_from_quaternion",
+]
+
+# Below this angle [rad] the closed forms lose digits and their series are exact to rounding.
+SMALL_ANGLE = 1e-4
+
+
+def hat(v: ArrayLike) -> NDArray[np.float64]:
+    """The 3x3 skew matrix with hat(v) @ u = v x u."""
+    x, y, z = np.asarray(v, dtype=np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _coefficients(theta: float) -> tuple[float, float, float]:
+    """sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3."""
+    if theta < SMALL_ANGLE:
+        t2 = theta * theta
+        return 1.0 - t2 / 6.0, 0.5 - t2 / 24.0, 1.0 / 6.0 - t2 / 120.0
+    return np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta**2, (theta - np.sin(theta)) / theta**3
+
+
+def exp_se3(xi: ArrayLike) -> NDArray[np.float64]:
+    """Rigid motion (4, 4) of the tangent xi = (rho, omega) (6,)."""
+    xi = np.asarray(xi, dtype=np.float64)
+    omega = hat(xi[3:])
+    a, b, c = _coefficients(float(np.linalg.norm(xi[3:])))
+    T = np.eye(4)
+    T[:3, :3] += a * omega + b * omega @ omega
+    T[:3, 3] = (np.eye(3) + b * omega + c * omega @ omega) @ xi[:3]
+    return T
+
+
+def log_se3(T: ArrayLike) -> NDArray[np.float64]:
+    """Tangent (6,) of a rigid motion (4, 4), rotation angle in [0, pi]; the inverse of `exp_se3`."""
+    T = np.asarray(T, dtype=np.float64)
+    q = quaternion_from_matrix(T[:3, :3])
+    if q[0] < 0:
+        q = -q
+    norm = float(np.linalg.norm(q[1:]))
+    theta = 2.0 * np.arctan2(norm, q[0])
+    omega = q[1:] * (theta / norm if norm > 1e-12 else 2.0)
+    _, b, c = _coefficients(theta)
+    w = hat(omega)
+    V = np.eye(3) + b * w + c * w @ w
+    return np.concatenate([np.linalg.solve(V, T[:3, 3]), omega])
+
+
+def inverse_se3(T: ArrayLike) -> NDArray[np.float64]:
+    """Inverse (4, 4) of a rigid motion, exact in its structure."""
+    T = np.asarray(T, dtype=np.float64)
+    inverse = np.eye(4)
+    inverse[:3, :3] = T[:3, :3].T
+    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
+def interpolate_se3(T_a: ArrayLike, T_b: ArrayLike, t: float) -> NDArray[np.float64]:
+    """The motion at t in [0, 1] on the screw from `T_a` to `T_b`, both (4, 4)."""
+    return exp_se3(t * log_se3(np.asarray(T_b) @ inverse_se3(T_a))) @ np.asarray(T_a, dtype=np.float64)
+
+
+def orthonormalised(T: ArrayLike) -> NDArray[np.float64]:
+    """The rigid motion nearest to T (4, 4): what long products of increments are brought back to."""
+    T = np.array(T, dtype=np.float64)
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return T
+
+
+def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
+    """Rotation (3, 3) of a quaternion (w, x, y, z), normalised first."""
+    w, x, y, z = np.asarray(q, dtype=np.float64) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
+    """Unit quaternion (w, x, y, z) of a rotation (3, 3), by the largest component for a stable root."""
+    R = np.asarray(R, dtype=np.float64)
+    squares = np.array(
+        [
+            1 + R[0, 0] + R[1, 1] + R[2, 2],
+            1 + R[0, 0] - R[1, 1] - R[2, 2],
+            1 - R[0, 0] + R[1, 1] - R[2, 2],
+            1 - R[0, 0] - R[1, 1] + R[2, 2],
+        ]
+    )
+    k = int(np.argmax(squares))
+    if k == 0:
+        q = [squares[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
+    elif k == 1:
+        q = [R[2, 1] - R[1, 2], squares[1], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]]
+    elif k == 2:
+        q = [R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], squares[2], R[1, 2] + R[2, 1]]
+    else:
+        q = [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], squares[3]]
+    q = np.array(q) / (2.0 * np.sqrt(squares[k]))
+    return q / np.linalg.norm(q)
+
+
+@ti.func
+def ti_rotation_from_quaternion(q):
+    """Taichi twin of `matrix_from_quaternion` for a quaternion of any length but zero."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    return ti.Matrix(
+        [
+            [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
+            [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
+            [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
+        ]
+    )

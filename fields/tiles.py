@@ -1,0 +1,43 @@
+"""`TilePairs`: which Gaussians reach which tile of the image, nearest first."""
+
+import taichi as ti
+
+__all__ = ["TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
+
+# Powers of two; a row of a tile is one AVX-512 vector of float32.
+TILE_WIDTH = 16
+TILE_HEIGHT = 16
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+BLOCK = 4096
+
+
+@ti.data_oriented
+class TilePairs:
+    """Pairs (tile, Gaussian), sorted by tile and within a tile by depth.
+
+    Per tile: `first` and `count` of its pairs, `reached`: how many of them were composited before it was opaque.
+    Per pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse reaches
+    in the tile (first | last << 16), `gradient`: ten sums over the tile's pixels (see `compositing.py`).
+    `position[first_pair[s] + k]` is the place of slot s's k-th pair.
+    """
+
+    def __init__(self, builder: ti.FieldsBuilder, max_tiles: int, chunks: int, max_pairs: int = 1 << 27, real=ti.f32) -> None:
+        self.max_tiles = max_tiles
+        self.max_pairs = max_pairs
+        self.count = 0
+        self.first = ti.field(ti.i32)
+        self.tile_count = ti.field(ti.i32)
+        self.reached = ti.field(ti.i32)
+        self.histogram = ti.field(ti.i32)
+        self.chunk_pairs = ti.field(ti.i32)
+        self.slot = ti.field(ti.i32)
+        self.rows = ti.field(ti.i32)
+        self.position = ti.field(ti.i32)
+        self.gradient = ti.Vector.field(10, real)
+        builder.dense(ti.i, max_tiles).place(self.first, self.tile_count, self.reached)
+        builder.dense(ti.ij, (chunks, max_tiles)).place(self.histogram)
+        builder.dense(ti.i, chunks + 1).place(self.chunk_pairs)
+        blocks = builder.pointer(ti.i, max_pairs // BLOCK)
+        blocks.dense(ti.i, BLOCK).place(self.slot, self.rows)
+        blocks.dense(ti.i, BLOCK).place(self.position)
+        blocks.dense(ti.i, BLOCK).place(self.gradient)

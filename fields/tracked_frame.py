@@ -1,0 +1,74 @@
+"""`TrackedFrame`: what a tracker hands to the mapper, and the only thing that the mapper takes in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.camera import PinholeCamera
+
+__all__ = ["SparsePoints", "TrackedFrame"]
+
+
+def _empty(*shape: int) -> NDArray[np.float64]:
+    return np.zeros(shape, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Tracked 3D points observed in one frame (P_i of the paper).
+
+    xyz: (N, 3) float64, world frame. pixels: (N, 2) float64, (x, y) observed in the undistorted image, pixel
+    centres at +0.5. ids: (N,) int64, the same number for the same point in every frame.
+    """
+
+    xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
+    pixels: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 2))
+    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if self.xyz.shape != (n, 3) or self.pixels.shape != (n, 2):
+            raise ValueError(
+                f"sparse points disagree in number: xyz {self.xyz.shape}, pixels {self.pixels.shape}, ids ({n},)"
+            )
+        if not (np.isfinite(self.xyz).all() and np.isfinite(self.pixels).all()):
+            raise ValueError("sparse points hold NaN or infinite values")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """One frame with its tracked pose.
+
+    index: position among the frames that the tracker delivered, from 0. timestamp: seconds.
+    image: (H, W, 3) float32 RGB in [0, 1], undistorted. camera: its intrinsics.
+    T_camera_world: (4, 4) float64, world to camera, OpenCV axes.
+    mask: (H, W) bool, True where the pixel is valid; None where all are.
+    held_out: only for evaluation; such a frame never touches the map.
+    """
+
+    index: int
+    timestamp: float
+    name: str
+    image: NDArray[np.float32]
+    camera: PinholeCamera
+    T_camera_world: NDArray[np.float64]
+    points: SparsePoints = field(default_factory=SparsePoints)
+    mask: NDArray[np.bool_] | None = None
+    held_out: bool = False
+
+    def __post_init__(self) -> None:
+        expected = (self.camera.height, self.camera.width)
+        if self.image.shape != (*expected, 3) or self.image.dtype != np.float32:
+            raise ValueError(
+                f"{self.name}: image is {self.image.shape} {self.image.dtype}, the camera asks for {(*expected, 3)} float32"
+            )
+        if self.mask is not None and self.mask.shape != expected:
+            raise ValueError(f"{self.name}: mask is {self.mask.shape}, the image {expected}")
+        if self.T_camera_world.shape != (4, 4) or not np.isfinite(self.T_camera_world).all():
+            raise ValueError(f"{self.name}: T_camera_world must be a finite 4x4 matrix")

@@ -1,0 +1,43 @@
+"""Straight-line products of 3-vectors for differentiated kernels.
+
+Taichi's own `@` and `dot` sum into a mutable local; reverse-mode differentiation has to keep every state of such a
+local on a stack, which made the projection's gradient three times slower. These are single expressions.
+"""
+
+import taichi as ti
+
+__all__ = ["cross", "dot", "rotate", "rotate_back"]
+
+
+@ti.func
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@ti.func
+def cross(a, b):
+    return ti.Vector([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@ti.func
+def rotate(m, v):
+    """m @ v for a 3x3 matrix."""
+    return ti.Vector(
+        [
+            m[0, 0] * v[0] + m[0, 1] * v[1] + m[0, 2] * v[2],
+            m[1, 0] * v[0] + m[1, 1] * v[1] + m[1, 2] * v[2],
+            m[2, 0] * v[0] + m[2, 1] * v[1] + m[2, 2] * v[2],
+        ]
+    )
+
+
+@ti.func
+def rotate_back(m, v):
+    """m.transpose() @ v for a 3x3 matrix."""
+    return ti.Vector(
+        [
+            m[0, 0] * v[0] + m[1, 0] * v[1] + m[2, 0] * v[2],
+            m[0, 1] * v[0] + m[1, 1] * v[1] + m[2, 1] * v[2],
+            m[0, 2] * v[0] + m[1, 2] * v[1] + m[2, 2] * v[2],
+        ]
+    )

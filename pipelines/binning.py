@@ -1,0 +1,177 @@
+"""Binning: the tiles that every projected ellipse reaches, as lists sorted by tile and then by depth.
+
+A counting sort over (tile, chunk of slots): linear in the number of pairs, stable because chunks and the slots in
+them are taken in depth order, and the same for any number of threads.
+"""
+
+import numpy as np
+import taichi as ti
+
+from fields.projected import ProjectedGaussians
+from fields.tiles import TILE_HEIGHT, TILE_WIDTH, TilePairs
+from fields.view import ViewField
+from pipelines.projection import ALPHA_MIN
+
+__all__ = ["CHUNKS", "Binning", "ellipse_span"]
+
+CHUNKS = 16
+# Slack [px] around an ellipse, far above rounding and far below a pixel.
+SLACK = 0.01
+
+
+@ti.func
+def ellipse_span(a, b, c, det, limit, low, high):
+    """Lowest and highest v on the ellipse a u^2 + 2 b u v + c v^2 <= limit with u in [low, high]; det = a c - b^2.
+
+    An empty range comes back with lowest > highest.
+    """
+    u_reach = ti.sqrt(limit * c / det)
+    v_reach = ti.sqrt(limit * a / det)
+    low = ti.max(low, -u_reach)
+    high = ti.min(high, u_reach)
+    # v is largest at u = -b / a * v_reach, smallest at its mirror image; elsewhere at the nearer end of the range.
+    u_top = ti.min(ti.max(-b / a * v_reach, low), high)
+    u_bottom = ti.min(ti.max(b / a * v_reach, low), high)
+    top = (-b * u_top + ti.sqrt(ti.max(limit * c - det * u_top * u_top, 0.0))) / c
+    bottom = (-b * u_bottom - ti.sqrt(ti.max(limit * c - det * u_bottom * u_bottom, 0.0))) / c
+    return ti.select(low > high, ti.Vector([1.0, -1.0]), ti.Vector([bottom - SLACK, top + SLACK]))
+
+
+@ti.func
+def first_centre(x):
+    """Index of the first pixel whose centre lies at x or behind."""
+    return ti.cast(ti.ceil(x - 0.5), ti.i32)
+
+
+@ti.func
+def last_centre(x):
+    """Index of the last pixel whose centre lies at x or before."""
+    return ti.cast(ti.floor(x - 0.5), ti.i32)
+
+
+@ti.data_oriented
+class Binning:
+    """Fills `pairs` from `projected` for the view in `view`."""
+
+    def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: TilePairs) -> None:
+        self.view = view
+        self.projected = projected
+        self.pairs = pairs
+        self._total = np.zeros(1, dtype=np.int64)
+
+    def forward(self) -> int:
+        """Bin the projected Gaussians of the current view; return the number of pairs."""
+        tiles_x = -(-self.view.width // TILE_WIDTH)
+        tiles_y = -(-self.view.height // TILE_HEIGHT)
+        slots = self.projected.count
+        self._count(slots, tiles_x, tiles_y)
+        self._scan(tiles_x * tiles_y, self._total)
+        total = int(self._total[0])
+        if total > self.pairs.max_pairs:
+            raise ValueError(f"{total} tile pairs exceed the room for {self.pairs.max_pairs}; the map is degenerate")
+        self._scatter(slots, tiles_x, tiles_y)
+        self.pairs.count = total
+        return total
+
+    @ti.func
+    def _ellipse(self, s):
+        """Of slot s: conic, its determinant (float64 inside: a needle's would be all rounding), squared reach."""
+        conic = self.projected.conic[s]
+        a, b, c = ti.cast(conic[0], ti.f64), ti.cast(conic[1], ti.f64), ti.cast(conic[2], ti.f64)
+        det = ti.cast(a * c - b * b, self.projected.real)
+        opacity = self.projected.opacity[s]
+        limit = 2.0 * ti.log(ti.max(opacity, ALPHA_MIN) / ALPHA_MIN)
+        return ti.Vector([conic[0], conic[1], conic[2], det, limit])
+
+    @ti.func
+    def _tile_rows(self, s, e, tiles_y):
+        """First tile row and the one behind the last that slot s reaches."""
+        reach = ti.sqrt(e[4] * e[0] / e[3]) + SLACK
+        y = self.projected.mean[s][1]
+        first = ti.max(first_centre(y - reach), 0) // TILE_HEIGHT
+        last = ti.min(last_centre(y + reach), tiles_y * TILE_HEIGHT - 1)
+        return ti.Vector([first, ti.select(last < 0, 0, last // TILE_HEIGHT + 1)])
+
+    @ti.func
+    def _tile_columns(self, s, e, tile_y, tiles_x):
+        """First tile column and the one behind the last that slot s reaches in a tile row."""
+        mean = self.projected.mean[s]
+        top = tile_y * TILE_HEIGHT + 0.5 - mean[1]
+        span = ellipse_span(e[2], e[1], e[0], e[3], e[4], top, top + (TILE_HEIGHT - 1))
+        first = ti.max(first_centre(mean[0] + span[0]), 0)
+        last = ti.min(last_centre(mean[0] + span[1]), tiles_x * TILE_WIDTH - 1)
+        return ti.select(
+            (last < first) | (span[0] > span[1]),
+            ti.Vector([0, 0]),
+            ti.Vector([first // TILE_WIDTH, last // TILE_WIDTH + 1]),
+        )
+
+    @ti.func
+    def _pixel_rows(self, s, e, tile_x, tile_y):
+        """Rows of a tile that slot s reaches, packed as first | behind last << 16."""
+        mean = self.projected.mean[s]
+        left = tile_x * TILE_WIDTH + 0.5 - mean[0]
+        span = ellipse_span(e[0], e[1], e[2], e[3], e[4], left, left + (TILE_WIDTH - 1))
+        first = ti.max(first_centre(mean[1] + span[0]) - tile_y * TILE_HEIGHT, 0)
+        last = ti.min(last_centre(mean[1] + span[1]) - tile_y * TILE_HEIGHT, TILE_HEIGHT - 1)
+        return ti.select((last < first) | (span[0] > span[1]), 0, first | ((last + 1) << 16))
+
+    @ti.kernel
+    def _count(self, slots: ti.i32, tiles_x: ti.i32, tiles_y: ti.i32):
+        ti.loop_config(block_dim=1)
+        for chunk in range(CHUNKS):
+            for t in range(tiles_x * tiles_y):
+                self.pairs.histogram[chunk, t] = 0
+            n = 0
+            for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+                self.projected.first_pair[s] = n
+                e = self._ellipse(s)
+                if e[4] > 0.0:
+                    rows = self._tile_rows(s, e, tiles_y)
+                    for tile_y in range(rows[0], rows[1]):
+                        columns = self._tile_columns(s, e, tile_y, tiles_x)
+                        for tile_x in range(columns[0], columns[1]):
+                            t = tile_y * tiles_x + tile_x
+                            self.pairs.histogram[chunk, t] = self.pairs.histogram[chunk, t] + 1
+                            n += 1
+            self.pairs.chunk_pairs[chunk] = n
+
+    @ti.kernel
+    def _scan(self, tiles: ti.i32, total: ti.types.ndarray()):
+        # One serial pass over tiles x chunks: microseconds, and nothing to synchronise.
+        for _ in range(1):
+            place = 0
+            for t in range(tiles):
+                self.pairs.first[t] = place
+                for chunk in range(CHUNKS):
+                    n = self.pairs.histogram[chunk, t]
+                    self.pairs.histogram[chunk, t] = place
+                    place += n
+                self.pairs.tile_count[t] = place - self.pairs.first[t]
+            total[0] = place
+            pairs = 0
+            for chunk in range(CHUNKS):
+                n = self.pairs.chunk_pairs[chunk]
+                self.pairs.chunk_pairs[chunk] = pairs
+                pairs += n
+
+    @ti.kernel
+    def _scatter(self, slots: ti.i32, tiles_x: ti.i32, tiles_y: ti.i32):
+        ti.loop_config(block_dim=1)
+        for chunk in range(CHUNKS):
+            for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+                pair = self.projected.first_pair[s] + self.pairs.chunk_pairs[chunk]
+                self.projected.first_pair[s] = pair
+                e = self._ellipse(s)
+                if e[4] > 0.0:
+                    rows = self._tile_rows(s, e, tiles_y)
+                    for tile_y in range(rows[0], rows[1]):
+                        columns = self._tile_columns(s, e, tile_y, tiles_x)
+                        for tile_x in range(columns[0], columns[1]):
+                            t = tile_y * tiles_x + tile_x
+                            place = self.pairs.histogram[chunk, t]
+                            self.pairs.histogram[chunk, t] = place + 1
+                            self.pairs.slot[place] = s
+                            self.pairs.rows[place] = self._pixel_rows(s, e, tile_x, tile_y)
+                            self.pairs.position[pair] = place
+                            pair += 1

@@ -1,0 +1,90 @@
+"""`Renderer`: a view of the map as colour, depth and opacity, and the way back to gradients."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from fields.camera import PinholeCamera
+from fields.gaussians import GaussianField
+from fields.images import ImageBuffers
+from fields.projected import ProjectedGaussians
+from fields.tiles import TilePairs
+from fields.view import ViewField
+from pipelines.binning import CHUNKS, Binning
+from pipelines.compositing import Compositing
+from pipelines.projection import Projection
+
+__all__ = ["RenderedView", "Renderer"]
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """A picture on the host: colour (H, W, 3) float32 not clipped, depth (H, W) as the weighted sum of z, opacity (H, W)."""
+
+    colour: np.ndarray
+    depth: np.ndarray
+    opacity: np.ndarray
+
+    def expected_depth(self, min_opacity: float = 0.5) -> np.ndarray:
+        """Depth (H, W) divided by opacity; 0 where the map is thinner than `min_opacity`."""
+        return np.where(self.opacity >= min_opacity, self.depth / np.maximum(self.opacity, 1e-6), 0.0)
+
+
+class Renderer:
+    """Differentiable renderer of one `GaussianField`.
+
+    `forward` leaves the picture in `images`; after a loss has filled `images.colour_grad`, `backward` adds the
+    gradients of the Gaussians to their fields and returns the camera's. Images of any size up to the given one.
+    """
+
+    def __init__(self, gaussians: GaussianField, max_width: int, max_height: int) -> None:
+        real = gaussians.real
+        self.gaussians = gaussians
+        # One SNode tree for all that compositing reads and writes: with two, Taichi fetches the trees' roots at every
+        # pixel and LLVM cannot vectorise the inner loop (measured: six times slower).
+        builder = ti.FieldsBuilder()
+        self.view = ViewField(builder, real)
+        self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
+        self.images = ImageBuffers(builder, max_width, max_height, real)
+        self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
+        self._tree = builder.finalize()
+        self.projection = Projection(gaussians, self.view, self.projected)
+        self.binning = Binning(self.view, self.projected, self.pairs)
+        self.compositing = Compositing(self.view, self.projected, self.pairs, self.images)
+
+    def destroy(self) -> None:
+        """Free the buffers; the Gaussians stay."""
+        self._tree.destroy()
+
+    def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float) -> None:
+        """Render into `images`. near: depth [scene units] below which nothing is drawn."""
+        self.images.resize(camera.width, camera.height)
+        self.view.set(camera, T_camera_world, near)
+        self.projection.forward()
+        self.binning.forward()
+        self.compositing.forward()
+
+    def backward(self, with_depth: bool = False) -> None:
+        """Add d loss / d Gaussian to the gradients of the Gaussians, for the view that was rendered last."""
+        self.compositing.backward(with_depth)
+        self.projection.backward()
+
+    def camera_gradient(self) -> np.ndarray:
+        """d loss / d xi (6,) of the T_camera_world that was rendered last, after `backward`."""
+        return self.projection.camera_gradient()
+
+    def render(
+        self,
+        camera: PinholeCamera,
+        T_camera_world: np.ndarray,
+        near: float,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> RenderedView:
+        """Render and bring the picture to the host."""
+        self.images.background[None] = ti.Vector(background)
+        self.forward(camera, T_camera_world, near)
+        self.images.background[None] = ti.Vector((0.0, 0.0, 0.0))
+        return RenderedView(
+            self.images.colour_to_numpy(), self.images.depth_to_numpy(), self.images.opacity_to_numpy()
+        )

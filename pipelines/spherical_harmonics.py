@@ -1,0 +1,54 @@
+"""Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS files."""
+
+import taichi as ti
+
+from fields.gaussians import SH_C0
+
+__all__ = ["evaluate_sh"]
+
+
+@ti.func
+def _band1(sh: ti.template(), i, x, y, z):
+    return 0.4886025119029199 * (z * sh[i, 2] - y * sh[i, 1] - x * sh[i, 3])
+
+
+@ti.func
+def _band2(sh: ti.template(), i, x, y, z):
+    return (
+        1.0925484305920792 * (x * y * sh[i, 4] - y * z * sh[i, 5] - x * z * sh[i, 7])
+        + 0.31539156525252005 * (2.0 * z * z - x * x - y * y) * sh[i, 6]
+        + 0.5462742152960396 * (x * x - y * y) * sh[i, 8]
+    )
+
+
+@ti.func
+def _band3(sh: ti.template(), i, x, y, z):
+    return (
+        -0.5900435899266435 * y * (3.0 * x * x - y * y) * sh[i, 9]
+        + 2.890611442640554 * x * y * z * sh[i, 10]
+        - 0.4570457994644658 * y * (4.0 * z * z - x * x - y * y) * sh[i, 11]
+        + 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y) * sh[i, 12]
+        - 0.4570457994644658 * x * (4.0 * z * z - x * x - y * y) * sh[i, 13]
+        + 1.445305721320277 * z * (x * x - y * y) * sh[i, 14]
+        - 0.5900435899266435 * x * (x * x - 3.0 * y * y) * sh[i, 15]
+    )
+
+
+@ti.func
+def evaluate_sh(degree: ti.template(), sh: ti.template(), i, d):
+    """Sum of coefficients sh[i, k] (3) times the basis in the unit direction d (3,), without the offset of 0.5.
+
+    One expression a degree: a colour summed step by step would cost the reverse kernel a stack.
+    """
+    x, y, z = d[0], d[1], d[2]
+    zero = ti.Vector([0.0, 0.0, 0.0])
+    band1 = zero
+    band2 = zero
+    band3 = zero
+    if ti.static(degree >= 1):
+        band1 = _band1(sh, i, x, y, z)
+    if ti.static(degree >= 2):
+        band2 = _band2(sh, i, x, y, z)
+    if ti.static(degree >= 3):
+        band3 = _band3(sh, i, x, y, z)
+    return SH_C0 * sh[i, 0] + band1 + band2 + band3
