@@ -57,11 +57,7 @@ class GaussianField:
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
         blocks.dense(ti.i, BLOCK).place(self.steps, self.touched)
-        self._tree = builder.finalize()
-
-    def destroy(self) -> None:
-        """Free the memory; the object must not be used after it."""
-        self._tree.destroy()
+        builder.finalize()
 
     def __len__(self) -> int:
         return self.count

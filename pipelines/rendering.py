@@ -48,14 +48,10 @@ class Renderer:
         self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
         self.images = ImageBuffers(builder, max_width, max_height, real)
         self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
-        self._tree = builder.finalize()
+        builder.finalize()
         self.projection = Projection(gaussians, self.view, self.projected)
         self.binning = Binning(self.view, self.projected, self.pairs)
         self.compositing = Compositing(self.view, self.projected, self.pairs, self.images)
-
-    def destroy(self) -> None:
-        """Free the buffers; the Gaussians stay."""
-        self._tree.destroy()
 
     def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float) -> None:
         """Render into `images`. near: depth [scene units] below which nothing is drawn."""

@@ -1,16 +1,15 @@
 """Settings of everything that happens to the map: one section a concept, each field with its default and meaning.
 
-The sections are part of the one configuration model (`modp_ti.config.SceneConfig`); lengths are relative to the
-scene: `view scale` is the median of depth / focal length over a view's sparse points (Section 3.2.1), `scene depth`
-the median depth of the sparse points.
+The sections are part of the one configuration model (`modp_ti.config.SceneConfig`). Lengths are relative to the scene:
+a `view scale` is the median of depth / focal length over a view's tracked points (Section 3.2.1), the width of a pixel
+out there; the `scene depth` is the median depth of the tracked points over all keyframes.
 """
-
-from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = [
     "DensifySettings",
+    "DepthSettings",
     "KeyframeSettings",
     "MappingSettings",
     "OptimiseSettings",
@@ -31,14 +30,95 @@ class StrictModel(BaseModel):
 class KeyframeSettings(StrictModel):
     """When a frame becomes a keyframe (Section 3.3.1)."""
 
-    covisibility: float = Field(0.95, ge=0, le=1, description="a frame that shares less than this with the last keyframe becomes one")
+    covisibility: float = Field(0.95, ge=0, le=1, description="a frame that shares less with the last keyframe becomes one")
+    baseline: float = Field(0.05, gt=0, description="movement since the last keyframe, in its median depths, that makes one: an orbit keeps all points in view")
     max_gap: int = Field(5, ge=1, description="frames after which a keyframe is taken in any case (t_k)")
-    max_rotation: float = Field(10.0, gt=0, description="degrees per frame above which a frame is too blurred to be a keyframe")
+    max_rotation: float = Field(10.0, gt=0, description="degrees since the last frame beyond which a frame of a video is blurred and no keyframe, unless max_gap is exceeded")
     min_points: int = Field(10, ge=0, description="tracked points that a keyframe needs")
 
 
-class MappingSettings(StrictModel):
-    """The parts of the online loop."""
+class DepthSettings(StrictModel):
+    """Depth of pixels without a tracked point: Gaussian process on the log depths of the tracked points."""
 
-    sh_degree: int = Field(0, ge=0, le=3, description="degree of the spherical harmonics")
+    max_points: int = Field(500, ge=10, description="tracked points that condition the process, drawn at random beyond")
+    max_deviation: float = Field(0.06, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian")
+
+
+class DensifySettings(StrictModel):
+    """Where new Gaussians go and how they begin (Section 3.2.2)."""
+
+    error_compensation: bool = Field(True, description="also add Gaussians at pixels of low SSIM, not only at tracked points")
+    pixels: int = Field(1600, ge=0, description="such pixels per keyframe of 640x480; other sizes by the power 3/4 of their area")
+    dissimilarity: float = Field(0.08, ge=0, le=1, description="1 - SSIM from which a pixel is a candidate")
+    warm_up: int = Field(8, ge=0, description="frames at the start that take random pixels instead of those of low SSIM")
+    initial_scale: float = Field(0.5, gt=0, description="size of a new Gaussian in pixels of its view, before scale_offset")
+    scale_offset: float = Field(0.5, description="added to the log of that size (epsilon of Eq. 1)")
+    initial_opacity: float = Field(0.5, gt=0, lt=1, description="opacity of a new Gaussian")
+    prune_every: int = Field(100, ge=1, description="frames between removals of transparent Gaussians")
+    prune_opacity: float = Field(0.01, ge=0, lt=1, description="opacity below which a Gaussian is removed")
+
+
+class VoxelSettings(StrictModel):
+    """Multi-level occupancy voxels (Section 3.2.3)."""
+
+    enabled: bool = Field(True, description="filter new Gaussians by the voxels")
+    levels: int = Field(8, ge=1, le=12, description="number of cell sizes (L)")
+    resolution: int = Field(512, ge=1, description="coarsest cells a side that the finest level covers (n)")
+    coarsest: float = Field(12.5, gt=0, description="coarsest cell (S_init) in view scales of the first keyframe")
+    target: float = Field(1.0, gt=0, description="spacing asked for in a view, in its view scales")
+
+
+class ViewSettings(StrictModel):
+    """Which keyframes an optimisation step looks at (Section 3.3.2)."""
+
+    local_views: int = Field(1, ge=0, description="views from the local bank per step")
+    bank: int = Field(10, ge=1, description="keyframes in the local bank")
+    global_views: int = Field(4, ge=0, description="views from all keyframes per step")
+    error_weight: float = Field(50.0, ge=0, description="sigma of the mean absolute error in the draw of global views")
+    recency_weight: float = Field(0.001, ge=0, description="sigma of the age in keyframes in that draw")
+
+
+class PoseSettings(StrictModel):
+    """SE(3) refinement of keyframe poses (Section 3.3.3)."""
+
+    enabled: bool = Field(True, description="refine keyframe poses while mapping")
+    steps: int = Field(8, ge=0, description="first steps of a keyframe that also refine poses")
+    learning_rate: float = Field(1e-5, ge=0, description="Adam step of rotation [rad] and of translation [scene depths]")
+
+
+class OptimiseSettings(StrictModel):
+    """Loss and learning rates."""
+
+    steps: int = Field(25, ge=0, description="steps per keyframe")
+    last_steps: int = Field(40, ge=0, description="steps after the last frame")
+    ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
+    aspect_weight: float = Field(1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
+    position_rate: float = Field(8e-6, ge=0, description="Adam step of positions [scene depths]")
+    scale_rate: float = Field(3e-3, ge=0, description="Adam step of log-scales")
+    rotation_rate: float = Field(1e-3, ge=0, description="Adam step of quaternions")
+    opacity_rate: float = Field(0.05, ge=0, description="Adam step of opacity logits")
+    colour_rate: float = Field(2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth")
+
+
+class MappingSettings(StrictModel):
+    """The online loop."""
+
+    sh_degree: int = Field(0, ge=0, le=3, description="degree of the spherical harmonics of colour")
+    max_gaussians: int = Field(4_000_000, ge=1024, description="size of the pool; further Gaussians are not added")
+    near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     keyframes: KeyframeSettings = KeyframeSettings()
+    densify: DensifySettings = DensifySettings()
+    depth: DepthSettings = DepthSettings()
+    voxels: VoxelSettings = VoxelSettings()
+    views: ViewSettings = ViewSettings()
+    poses: PoseSettings = PoseSettings()
+    optimise: OptimiseSettings = OptimiseSettings()
+
+
+class RefineSettings(StrictModel):
+    """Post refinement of the finished map (Section 4.7)."""
+
+    steps: int = Field(1000, ge=0, description="steps over all keyframes after the last frame; 0 for none")
+    views: int = Field(4, ge=1, description="views per step, drawn as the global views are")
+    position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
+    scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")

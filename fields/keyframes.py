@@ -1,0 +1,109 @@
+"""Keyframes: what the map keeps of the frames that it is optimised on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.camera import PinholeCamera
+from fields.se3 import interpolate_se3, inverse_se3
+from fields.tracked_frame import SparsePoints, TrackedFrame
+
+__all__ = ["Keyframe", "KeyframeStore"]
+
+
+@dataclass
+class Keyframe:
+    """One keyframe. Images stay in host memory with 8 bits a channel.
+
+    index: of its frame. rgba: (H, W, 4) uint8, the image and 255 where it is valid. T_tracked: the tracker's
+    T_camera_world; T_camera_world: the refined one. median_depth: of its tracked points [scene units]; view_scale:
+    median_depth / focal, the width of a pixel out there (Section 3.2.1). error: mean absolute error when the frame was
+    optimised last (err(j) of Eq. 2).
+    """
+
+    index: int
+    rgba: NDArray[np.uint8]
+    camera: PinholeCamera
+    T_tracked: NDArray[np.float64]
+    T_camera_world: NDArray[np.float64]
+    points: SparsePoints
+    median_depth: float
+    error: float
+    pose_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
+    pose_v: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
+    pose_steps: int = 0
+
+    @property
+    def view_scale(self) -> float:
+        return self.median_depth / self.camera.focal
+
+    @property
+    def correction(self) -> NDArray[np.float64]:
+        """The motion (4, 4) that refinement has put on the left of the tracked pose."""
+        return self.T_camera_world @ inverse_se3(self.T_tracked)
+
+
+class KeyframeStore:
+    """The keyframes in the order of their frames."""
+
+    def __init__(self) -> None:
+        self._keyframes: list[Keyframe] = []
+        self._scene_depth = 1.0
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def __getitem__(self, i: int) -> Keyframe:
+        return self._keyframes[i]
+
+    def __iter__(self):
+        return iter(self._keyframes)
+
+    @property
+    def scene_depth(self) -> float:
+        """Median over the keyframes of the median depth of their tracked points: the unit of all lengths."""
+        return self._scene_depth
+
+    def append(self, frame: TrackedFrame) -> Keyframe:
+        """Keep `frame`. It starts at the mean error of the others (1 for the first), so that it is drawn soon."""
+        keyframe = self.view(frame)
+        self._keyframes.append(keyframe)
+        self._scene_depth = float(np.median([k.median_depth for k in self._keyframes]))
+        return keyframe
+
+    def view(self, frame: TrackedFrame) -> Keyframe:
+        """`frame` as a keyframe would be, at the pose that the keyframes around it imply, but not kept."""
+        depth = frame.points.xyz @ frame.T_camera_world[2, :3] + frame.T_camera_world[2, 3]
+        depth = depth[depth > 0]
+        rgba = np.full((*frame.image.shape[:2], 4), 255, dtype=np.uint8)
+        rgba[..., :3] = np.round(frame.image * 255.0)
+        if frame.mask is not None:
+            rgba[~frame.mask] = 0
+        return Keyframe(
+            index=frame.index,
+            rgba=rgba,
+            camera=frame.camera,
+            T_tracked=frame.T_camera_world.copy(),
+            T_camera_world=self.corrected(frame.index, frame.T_camera_world),
+            points=frame.points,
+            median_depth=float(np.median(depth)) if len(depth) else self._scene_depth,
+            error=float(np.mean([k.error for k in self._keyframes])) if self._keyframes else 1.0,
+        )
+
+    def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:
+        """T_camera_world (4, 4) of frame `index`: its tracked pose with the corrections of the keyframes around it.
+
+        The correction is interpolated between the two by frame index, and the nearest one's outside (Section 3.3.3).
+        """
+        if not self._keyframes:
+            return np.array(T_tracked, dtype=np.float64)
+        indices = [k.index for k in self._keyframes]
+        after = int(np.searchsorted(indices, index))
+        if after == 0 or after == len(indices):
+            return self._keyframes[min(after, len(indices) - 1)].correction @ T_tracked
+        a, b = self._keyframes[after - 1], self._keyframes[after]
+        t = (index - a.index) / (b.index - a.index)
+        return interpolate_se3(a.correction, b.correction, t) @ T_tracked

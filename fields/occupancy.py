@@ -1,0 +1,135 @@
+"""`OccupancyVoxels`: the paper's Multi-level Occupancy Hash Voxels (MOHV, Section 3.2.3) as a sparse SNode hierarchy."""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["OccupancyVoxels"]
+
+LEAF = 8
+# Fan-outs of the pointer levels above the bitmasked leaves: 32 * 16 * 16 * 8 cells a side. More (17 bits an axis) buys
+# nothing at 8 levels of 512, and fewer would make the finest level repeat or end inside the scene.
+POINTERS = (32, 16, 16)
+SIDE = LEAF * int(np.prod(POINTERS))
+
+
+@ti.data_oriented
+class OccupancyVoxels:
+    """Which places of the world already hold a Gaussian, at `levels` cell sizes `coarsest / 2^l`.
+
+    levels, resolution, coarsest: L, n and S_init of the paper. The finest level covers `resolution * coarsest` a side
+    around `origin` with cells of their own (floor of the offset by the cell size: the same width on both sides of the
+    origin, never repeated); a level twice as coarse covers twice that. A position outside a level's extent is answered
+    by the coarser levels. Memory follows the occupied places.
+
+    A position is asked for with a target size: the levels used are those whose cells are no smaller than it, and
+    always the coarsest, so that no target size goes unanswered.
+    """
+
+    def __init__(
+        self, coarsest: float = 1.0, levels: int = 8, resolution: int = 512, origin: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> None:
+        if levels < 1 or resolution << (levels - 1) > SIDE:
+            raise ValueError(
+                f"voxels need a level and resolution * 2^(levels - 1) <= {SIDE}; got {levels=}, {resolution=}"
+            )
+        self.levels = levels
+        self.resolution = resolution
+        self.settle(coarsest, origin)
+        self.occupied = [ti.field(ti.u8) for _ in range(levels)]
+        builder = ti.FieldsBuilder()
+        for level in self.occupied:
+            node = builder
+            for fan_out in POINTERS:
+                node = node.pointer(ti.ijk, (fan_out,) * 3)
+            node.bitmasked(ti.ijk, (LEAF,) * 3).place(level)
+        builder.finalize()
+
+    def settle(self, coarsest: float, origin: ArrayLike) -> None:
+        """Choose the coarsest cell's size and the middle of the extent, while nothing is marked yet."""
+        if not coarsest > 0:
+            raise ValueError(f"voxels need a positive cell, got {coarsest=}")
+        self.coarsest = float(coarsest)
+        self.origin = np.array(origin, dtype=np.float64)
+
+    def level_of(self, size: ArrayLike) -> NDArray[np.int32]:
+        """The finest level whose cells are at least `size` wide; 0, the coarsest, for sizes beyond all of them."""
+        size = np.maximum(np.asarray(size, dtype=np.float64), 1e-300)
+        # The slack keeps a size of exactly S_init / 2^l at level l.
+        level = np.floor(np.log2(self.coarsest / size) + 1e-9)
+        return np.clip(level, 0, self.levels - 1).astype(np.int32)
+
+    def query(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:
+        """Whether each position (N, 3) is occupied at its target size (N,) or (): the AND from the coarsest level down."""
+        cells, level = self._cells(position, size)
+        out = np.zeros(len(cells), dtype=np.uint8)
+        if len(cells):
+            self._query(cells, level, out)
+        return out.astype(bool)
+
+    def update(self, position: ArrayLike, size: ArrayLike) -> None:
+        """Mark each position (N, 3) as occupied on the levels from the coarsest to that of its target size."""
+        cells, level = self._cells(position, size)
+        if len(cells):
+            self._update(cells, level)
+
+    def admit(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:
+        """Which of the positions (N, 3) may hold a new Gaussian: in free cells, and of several in one cell the first.
+
+        The admitted ones are marked. The order of the batch decides, so that every run decides alike.
+        """
+        cells, level = self._cells(position, size)
+        out = np.zeros(len(cells), dtype=np.uint8)
+        if len(cells):
+            self._query(cells, level, out)
+        free = np.flatnonzero(out == 0)
+        at = (cells[free] >> (self.levels - 1 - level[free, None])) + SIDE // 2
+        keys = ((at[:, 0] * SIDE + at[:, 1]) * SIDE + at[:, 2]) * self.levels + level[free]
+        _, first = np.unique(keys, return_index=True)
+        admitted = np.zeros(len(cells), dtype=bool)
+        admitted[free[first]] = True
+        if len(first):
+            self._update(cells[admitted], level[admitted])
+        return admitted
+
+    def _cells(self, position: ArrayLike, size: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Cell indices (N, 3) at the finest level, and the level (N,) that is asked for and contains the position."""
+        position = np.asarray(position, dtype=np.float64).reshape(-1, 3)
+        finest = self.coarsest / 2 ** (self.levels - 1)
+        cells = np.floor((position - self.origin) / finest).astype(np.int64)
+        level = np.broadcast_to(self.level_of(size), len(cells)).copy()
+        # A level's cells are the finest cells shifted right, so that levels nest exactly. Its extent is SIDE cells.
+        reach = np.maximum(cells, -cells - 1).max(axis=1, initial=0)
+        beyond = np.ceil(np.log2((reach + 1) / (SIDE // 2))).astype(np.int64).clip(0)
+        return cells, np.minimum(level, self.levels - 1 - beyond).astype(np.int32)
+
+    @ti.kernel
+    def _query(
+        self, cells: ti.types.ndarray(ndim=2), level: ti.types.ndarray(ndim=1), out: ti.types.ndarray(ndim=1)
+    ):
+        for i in range(level.shape[0]):
+            # Beyond even the coarsest extent nothing can be told apart: such a place is never free.
+            hit = 1
+            for l in ti.static(range(self.levels)):
+                if l <= level[i]:
+                    c = self._at(cells, i, l)
+                    if self.occupied[l][c] == 0:
+                        hit = 0
+            out[i] = ti.cast(hit, ti.u8)
+
+    @ti.kernel
+    def _update(self, cells: ti.types.ndarray(ndim=2), level: ti.types.ndarray(ndim=1)):
+        # One thread: nested pointers activated by two threads at once crashed (Taichi 1.7.4). A batch is a few thousand.
+        ti.loop_config(serialize=True)
+        for i in range(level.shape[0]):
+            for l in ti.static(range(self.levels)):
+                if l <= level[i]:
+                    self.occupied[l][self._at(cells, i, l)] = ti.u8(1)
+
+    @ti.func
+    def _at(self, cells: ti.template(), i, l: ti.template()):
+        """Index of point i's cell in level l's sparse grid, its origin in the middle."""
+        shift = ti.static(self.levels - 1 - l)
+        return ti.Vector(
+            [ti.cast((cells[i, k] >> shift) + SIDE // 2, ti.i32) for k in ti.static(range(3))]
+        )

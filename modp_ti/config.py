@@ -1,0 +1,411 @@
+"""`scene.yaml`: one strict model of every setting, read from YAML with overrides, written resolved.
+
+`python -m modp_ti.config` prints the documentation of every key as Markdown.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, get_args
+
+import yaml
+from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic_core import PydanticUndefined
+
+from modp_ti.errors import InputError
+from pipelines.settings import MappingSettings, RefineSettings, StrictModel
+
+__all__ = [
+    "KeyDoc",
+    "SceneConfig",
+    "SourceSettings",
+    "TrackerSettings",
+    "documented_keys",
+    "dump_scene",
+    "load_scene",
+    "markdown_of_keys",
+]
+
+
+class SourceSettings(StrictModel):
+    """Where the frames are."""
+
+    path: Path | None = Field(
+        None, description="folder of the images; subfolders are searched too (not used by `synthetic`)"
+    )
+    scale: float = Field(1.0, gt=0, le=1, description="factor on width and height of every frame")
+    holdout: int | None = Field(
+        None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
+    )
+    fps: float = Field(30.0, gt=0, description="frames per second: time stamp = position in the folder / fps")
+    start: int = Field(0, ge=0, description="first frame, as position in the folder")
+    stop: int | None = Field(None, ge=1, description="position after the last frame; empty for all")
+    step: int = Field(1, ge=1, description="every n-th frame")
+
+    @model_validator(mode="after")
+    def _range_is_not_empty(self) -> SourceSettings:
+        if self.stop is not None and self.stop <= self.start:
+            raise ValueError(f"source.stop ({self.stop}) must be larger than source.start ({self.start})")
+        return self
+
+
+class TrackerSettings(StrictModel):
+    """Where the camera poses and the sparse points come from."""
+
+    kind: Literal["colmap", "transforms", "synthetic"] = Field(
+        description="`colmap` (a model), `transforms` (transforms.json) or `synthetic` (the embedded demo)"
+    )
+    path: Path | None = Field(
+        None,
+        description="model folder or file; empty: `sparse/0`, `sparse` or `transforms.json` near the images",
+    )
+
+
+class SceneConfig(StrictModel):
+    """Everything that a run depends on."""
+
+    source: SourceSettings = SourceSettings()
+    tracker: TrackerSettings
+    output: Path = Field(description="folder of the results, made where it is missing")
+    device: Literal["cpu", "cuda", "auto"] = Field(
+        "auto", description="`auto` takes CUDA where there is a GPU"
+    )
+    seed: int = Field(0, ge=0, description="seed of all randomness")
+    threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
+    mapping: MappingSettings = MappingSettings()
+    refine: RefineSettings = RefineSettings()
+
+    @model_validator(mode="after")
+    def _images_are_named(self) -> SceneConfig:
+        if self.source.path is None and self.tracker.kind != "synthetic":
+            raise ValueError("source.path is missing: give the folder that holds the images")
+        return self
+
+
+# --------------------------------------------------------------------------------------------- read and write
+
+
+def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneConfig:
+    """Reads a scene file; `overrides` are "section.key=value" with the value in YAML, applied in their order.
+
+    Relative paths, those of overrides included, are relative to the scene file's folder; the result holds
+    absolute paths. Raises InputError (one line) for an unreadable file, an unknown key or a wrong value.
+    """
+    file = Path(path)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{file}: no such scene file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: cannot be read as text: {error}") from None
+
+    lines: dict[str, int] = {}
+    data = _parse_yaml(text, str(file), lines)
+    if not isinstance(data, dict):
+        raise InputError(
+            f"{file}: a scene file has keys such as `source:`, `tracker:` and `output:`; this one holds none"
+        )
+    where = {key: f"{file}:{line}" for key, line in lines.items()}
+    _refuse_unknown_keys(data, SceneConfig, where, str(file))
+    for override in overrides:
+        _apply_override(data, override, where)
+    config = _validated(data, where, str(file))
+    return _with_absolute_paths(config, file.resolve().parent)
+
+
+def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
+    """Writes every setting with absolute paths, so that the file gives the same run from wherever it lies."""
+    resolved = _with_absolute_paths(config, Path.cwd())
+    text = "# Every setting of this run: `modp-ti run` on this file gives the same map.\n"
+    text += yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    target = Path(path)
+    partial = target.with_name(target.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, target)
+
+
+def _with_absolute_paths(model: Any, base: Path) -> Any:
+    update: dict[str, Any] = {}
+    for name in type(model).model_fields:
+        value = getattr(model, name)
+        if isinstance(value, Path):
+            update[name] = (base / value.expanduser()).resolve()
+        elif isinstance(value, BaseModel):
+            update[name] = _with_absolute_paths(value, base)
+    return model.model_copy(update=update)
+
+
+def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
+    try:
+        # Strict JSON keeps `scale: "0.5"` and `holdout: true` from passing as numbers, and still takes text
+        # as path.
+        return SceneConfig.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        problems = error.errors()
+        first = problems[0]
+        place = ".".join(str(part) for part in first["loc"])
+        text = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "missing":
+            text = f"{place} is missing: {_description(place) or 'it has no default'}"
+        elif place and first["type"] != "value_error":
+            text = f"{place}: {text.replace('Input should be', 'must be')}, not {_as_yaml(first['input'])}"
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise InputError(f"{_origin(where, place, name)}: {text}{more}") from None
+
+
+def _as_yaml(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, default=str)
+
+
+def _origin(where: Mapping[str, str], place: str, name: str) -> str:
+    """Where the user wrote a setting: file and line, or the override; else the file's name."""
+    return where.get(place, name)
+
+
+# --------------------------------------------------------------------------------------------- YAML, strictly
+
+_INT = re.compile(r"[-+]?[0-9]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+
+
+def _parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
+    """Plain data of a YAML text under the YAML 1.2 rules: `1e-3` is a number, `no` is text, keys are unique.
+
+    lines: filled with the line (from 1) of every dotted key.
+    """
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        return None if node is None else _plain(node, "", name, lines)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f"{name}:{mark.line + 1}" if mark else name
+        raise InputError(f"{place}: not valid YAML: {error.problem or error.context}") from None
+    except yaml.YAMLError as error:
+        raise InputError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise InputError(f"{name}: not valid here: an alias that holds itself") from None
+
+
+def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any:
+    line = node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        result: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            key_line = key_node.start_mark.line + 1
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise InputError(f"{name}:{key_line}: a key must be a word")
+            key = str(key_node.value)
+            inner = f"{place}.{key}" if place else key
+            if key in result:
+                raise InputError(f"{name}:{key_line}: `{inner}` stands twice (first in line {lines[inner]})")
+            lines[inner] = key_line
+            result[key] = _plain(value_node, inner, name, lines)
+        return result
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(item, f"{place}.{i}", name, lines) for i, item in enumerate(node.value)]
+    value = str(node.value)
+    if node.style is not None:  # quoted or block text
+        return value
+    if value in ("", "~", "null", "Null", "NULL"):
+        return None
+    if value in ("true", "True", "TRUE", "false", "False", "FALSE"):
+        return value[0] in "tT"
+    if _INT.fullmatch(value):
+        return int(value)
+    number = None
+    if _FLOAT.fullmatch(value):
+        number = float(value)
+    elif value.lstrip("+-").lower() in (".inf", ".nan"):
+        number = math.inf
+    if number is not None:
+        if not math.isfinite(number):
+            raise InputError(f"{name}:{line}: {place or 'the value'}: must be a finite number, not {value}")
+        return number
+    return value
+
+
+def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
+    """Puts one "section.key=value" into the raw data."""
+    origin = f"--set {override}"
+    key, equals, text = override.partition("=")
+    key = key.strip()
+    if not equals or not key:
+        raise InputError(f"{origin}: write it as section.key=value, for example source.scale=0.5")
+    value = _parse_yaml(text, origin, {})
+
+    parts = key.split(".")
+    nested: dict[str, Any] = {parts[-1]: value}
+    for part in reversed(parts[:-1]):
+        nested = {part: nested}
+    _refuse_unknown_keys(nested, SceneConfig, {}, origin, whole_key=key)
+
+    section = data
+    for part in parts[:-1]:
+        if not isinstance(section.get(part), dict):
+            section[part] = {}
+        section = section[part]
+    section[parts[-1]] = value
+    for known in [k for k in where if k == key or k.startswith(key + ".")]:
+        del where[known]
+    where[key] = origin
+
+
+# ----------------------------------------------------------------------------------------------- keys by name
+
+
+@dataclass(frozen=True)
+class KeyDoc:
+    """One setting: dotted key, type, default as YAML text (None where the key is required), meaning."""
+
+    key: str
+    type: str
+    default: str | None
+    description: str
+
+
+def documented_keys() -> Iterator[KeyDoc]:
+    """Every setting of a scene file in the order of the model."""
+    yield from _walk(SceneConfig, "")
+
+
+def _walk(model: type[BaseModel], prefix: str) -> Iterator[KeyDoc]:
+    for name, info in model.model_fields.items():
+        sections = _sections(info.annotation)
+        if sections:
+            for section in sections:
+                yield from _walk(section, f"{prefix}{name}.")
+            continue
+        default = None
+        if info.default_factory is not None or info.default is not PydanticUndefined:
+            value = info.get_default(call_default_factory=True, validated_data={})
+            default = "" if value is None else _as_yaml(value)
+        yield KeyDoc(prefix + name, _type_name(info.annotation), default, info.description or "")
+
+
+def _sections(annotation: Any) -> list[type[BaseModel]]:
+    """The models that a field can hold: one for `Section` and `Section | None`, none for a plain value."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    arguments = get_args(annotation)
+    if getattr(annotation, "__origin__", None) in (list, tuple, dict):
+        return []
+    return [model for argument in arguments for model in _sections(argument)]
+
+
+def _type_name(annotation: Any) -> str:
+    names = {
+        int: "integer",
+        float: "number",
+        str: "text",
+        bool: "true or false",
+        Path: "path",
+        NoneType: "empty",
+    }
+    if annotation in names:
+        return names[annotation]
+    origin, arguments = getattr(annotation, "__origin__", None), get_args(annotation)
+    if origin is Literal:
+        return " or ".join(f"`{argument}`" for argument in arguments)
+    if origin in (list, tuple):
+        return "list of " + _type_name(arguments[0])
+    if arguments:
+        return " or ".join(_type_name(argument) for argument in arguments)
+    return getattr(annotation, "__name__", str(annotation))
+
+
+def _description(key: str) -> str:
+    """What a key means; for a section, the keys that it needs."""
+    keys = list(documented_keys())
+    for entry in keys:
+        if entry.key == key:
+            return f"{entry.description} ({entry.type})"
+    needed = [entry.key for entry in keys if entry.key.startswith(key + ".") and entry.default is None]
+    return f"it needs {', '.join(needed)}" if needed else ""
+
+
+def _refuse_unknown_keys(
+    data: Mapping[str, Any],
+    model: type[BaseModel],
+    where: Mapping[str, str],
+    origin: str,
+    prefix: str = "",
+    whole_key: str | None = None,
+) -> None:
+    """Raises InputError for the first key that the model does not have, with the nearest one that it has.
+
+    whole_key: the dotted key of an override, compared as a whole with all dotted keys.
+    """
+    for key, value in data.items():
+        place = prefix + key
+        if key not in model.model_fields:
+            hint = _nearest(place, prefix, model, whole_key)
+            raise InputError(f"{_origin(where, place, origin)}: unknown key `{place}`{hint}")
+        sections = _sections(model.model_fields[key].annotation)
+        if not isinstance(value, Mapping):
+            continue
+        if not sections and whole_key is not None:
+            raise InputError(f"{origin}: `{place}` is a value, it has no keys of its own")
+        if len(sections) == 1:
+            _refuse_unknown_keys(value, sections[0], where, origin, f"{place}.", whole_key)
+
+
+def _nearest(place: str, prefix: str, model: type[BaseModel], whole_key: str | None) -> str:
+    siblings = [prefix + name for name in model.model_fields]
+    every = [entry.key for entry in documented_keys()]
+    leaf = place.removeprefix(prefix)
+    in_section = difflib.get_close_matches(leaf, list(model.model_fields), n=1, cutoff=0.6)
+    same_leaf = [key for key in every if key.rpartition(".")[2] == leaf]
+    whole = difflib.get_close_matches(whole_key or place, every, n=1, cutoff=0.6)
+    if in_section:
+        found = prefix + in_section[0]
+        if whole_key is not None and whole_key != place:  # the wrong part is a section: name the key below it
+            below = difflib.get_close_matches(
+                whole_key, [k for k in every if k.startswith(found)], n=1, cutoff=0
+            )
+            found = below[0] if below else found
+    elif same_leaf:
+        found = same_leaf[0]
+    elif whole:
+        found = whole[0]
+    else:
+        return f"; {'this section has' if prefix else 'the keys are'} {', '.join(siblings)}"
+    return f"; did you mean `{found}`?"
+
+
+# ---------------------------------------------------------------------------------------------- documentation
+
+
+def markdown_of_keys() -> str:
+    """The reference of all keys as Markdown tables, one a section."""
+    sections: dict[str, list[KeyDoc]] = {}
+    for entry in documented_keys():
+        sections.setdefault(entry.key.rpartition(".")[0], []).append(entry)
+    text = [
+        "# Configuration",
+        "",
+        "Every key of `scene.yaml`. Relative paths are relative to the file. Any key can be set on the",
+        "command line: `modp-ti run scene.yaml --set source.scale=0.5`.",
+        "This page is written by `python -m modp_ti.config`.",
+    ]
+    for section, entries in sections.items():
+        text += ["", f"## {f'`{section}`' if section else 'Top level'}", ""]
+        text += ["| key | type | default | meaning |", "|---|---|---|---|"]
+        for entry in entries:
+            default = (
+                "required" if entry.default is None else f"`{entry.default}`" if entry.default else "empty"
+            )
+            cells = [f"`{entry.key}`", entry.type, default, entry.description]
+            text.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(text) + "\n"
+
+
+if __name__ == "__main__":
+    print(markdown_of_keys(), end="")

@@ -1,0 +1,1 @@
+"""What a run leaves: one file per output format."""

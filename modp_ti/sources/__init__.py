@@ -1,0 +1,7 @@
+"""Where images come from: one file per source, decoded frame by frame."""
+
+from modp_ti.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.sources.image_folder import ImageFolder
+from modp_ti.sources.undistortion import Undistorter
+
+__all__ = ["NO_DISTORTION", "Distortion", "ImageFolder", "Undistorter"]

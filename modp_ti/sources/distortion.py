@@ -1,0 +1,142 @@
+"""Lens distortion of the COLMAP and transforms.json camera models, forward and inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial
+from numpy.typing import NDArray
+
+__all__ = ["NO_DISTORTION", "Distortion", "colmap_intrinsics"]
+
+Points = NDArray[np.float64]
+
+TABLE_SIZE = 4096
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Maps ideal pinhole coordinates (x / z, y / z) to those where the lens puts them.
+
+    With r^2 = x^2 + y^2, the radial part multiplies (x, y) by
+
+        perspective  (1 + n1 r^2 + n2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
+        fisheye      theta (1 + n1 theta^2 + n2 theta^4 + ...) / r,   theta = atan(r)
+
+    and the tangential part (p1, p2) adds (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y), all as
+    in OpenCV.
+    """
+
+    numerator: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: bool = False
+
+    @property
+    def is_identity(self) -> bool:
+        return not (self.fisheye or any(self.numerator) or any(self.denominator) or any(self.tangential))
+
+    def distort(self, points: Points) -> Points:
+        """Distorted coordinates (..., 2) of ideal ones (..., 2)."""
+        x, y = points[..., 0], points[..., 1]
+        r2 = x * x + y * y
+        factor = self._radial_factor(np.sqrt(r2))
+        p1, p2 = self.tangential
+        return np.stack(
+            [
+                x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+    def _radial_factor(self, r: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self.fisheye:
+            theta = np.arctan(r)
+            ratio = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-12)
+            return ratio * polynomial.polyval(theta * theta, (1.0, *self.numerator))
+        r2 = r * r
+        return polynomial.polyval(r2, (1.0, *self.numerator)) / polynomial.polyval(
+            r2, (1.0, *self.denominator)
+        )
+
+    def valid_radius(self, limit: float) -> float:
+        """Radius of ideal coordinates up to which the radial part grows, at most `limit`.
+
+        Beyond it a polynomial folds back: two rays would land on one pixel, and only the inner one is real.
+        """
+        r, distorted = self._radial_table(limit)
+        falling = np.flatnonzero(np.diff(distorted) <= 0)
+        return float(r[falling[0]]) if len(falling) else limit
+
+    def _radial_table(self, limit: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        r = np.linspace(0.0, limit, TABLE_SIZE)
+        return r, r * self._radial_factor(r)
+
+    def undistort(self, points: Points, limit: float) -> Points:
+        """Ideal coordinates (N, 2) of distorted ones (N, 2), searched for up to radius `limit`.
+
+        NaN where no ideal point of that radius lands there. Newton's method from the inverse of the radial
+        part.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        if self.is_identity or len(points) == 0:
+            return points.copy()
+        valid = self.valid_radius(limit)
+        r, distorted = self._radial_table(valid)
+        radius = np.linalg.norm(points, axis=1)
+        ratio = np.divide(
+            np.interp(radius, distorted, r), radius, out=np.ones_like(radius), where=radius > 1e-12
+        )
+        ideal = points * ratio[:, None]
+        for _ in range(8):
+            residual = self.distort(ideal) - points
+            ideal = ideal - np.linalg.solve(self._jacobian(ideal), residual[..., None])[..., 0]
+        error = np.abs(self.distort(ideal) - points).max(axis=1)
+        found = (error < 1e-9) & (np.linalg.norm(ideal, axis=1) <= valid)
+        return np.where(found[:, None], ideal, np.nan)
+
+    def _jacobian(self, points: Points) -> NDArray[np.float64]:
+        """Jacobians (N, 2, 2) by central differences; Newton's method needs no more than that."""
+        step = 1e-6
+        dx, dy = np.array([step, 0.0]), np.array([0.0, step])
+        columns = [(self.distort(points + d) - self.distort(points - d)) / (2 * step) for d in (dx, dy)]
+        jacobian = np.stack(columns, axis=-1)
+        singular = ~np.isfinite(jacobian).all(axis=(1, 2)) | (np.abs(np.linalg.det(jacobian)) < 1e-9)
+        jacobian[singular] = np.eye(2)  # these points fail the check at the end
+        return jacobian
+
+
+NO_DISTORTION = Distortion()
+
+
+def colmap_intrinsics(
+    model: str, params: Sequence[float]
+) -> tuple[float, float, float, float, Distortion] | None:
+    """(fx, fy, cx, cy, distortion) of a COLMAP camera model; None for a model that is not supported."""
+    p = [float(value) for value in params]
+    one_focal = model in (
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+        "SIMPLE_FISHEYE",
+    )
+    fx, fy, cx, cy, k = (p[0], p[0], p[1], p[2], p[3:]) if one_focal else (p[0], p[1], p[2], p[3], p[4:])
+    if model in ("SIMPLE_PINHOLE", "PINHOLE"):
+        distortion = NO_DISTORTION
+    elif model in ("SIMPLE_RADIAL", "RADIAL"):
+        distortion = Distortion(numerator=tuple(k))
+    elif model == "OPENCV":
+        distortion = Distortion(numerator=tuple(k[:2]), tangential=(k[2], k[3]))
+    elif model == "FULL_OPENCV":
+        k1, k2, p1, p2, k3, k4, k5, k6 = k
+        distortion = Distortion((k1, k2, k3), (k4, k5, k6), (p1, p2))
+    elif model in ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"):
+        distortion = Distortion(numerator=tuple(k), fisheye=True)
+    else:
+        return None
+    return fx, fy, cx, cy, distortion

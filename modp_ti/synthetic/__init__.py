@@ -1,0 +1,33 @@
+"""The embedded demo sequence: a furnished room that the project renders itself, with a simulated tracker."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from modp_ti.errors import InputError
+from modp_ti.synthetic.simulated_tracker import FRAMES, SMALLEST, SyntheticTracker, TrackerNoise
+
+if TYPE_CHECKING:
+    from modp_ti.config import SourceSettings, TrackerSettings
+
+__all__ = ["SyntheticTracker", "TrackerNoise", "open_synthetic"]
+
+WIDTH, HEIGHT = 320, 240  # [px] at scale 1
+
+
+def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> SyntheticTracker:
+    """The demo sequence. Of `source`, scale, start, stop, step, holdout and fps count; nothing of `tracker` does.
+
+    Raises InputError where the scale leaves no picture or the range no frames.
+    """
+    width, height = round(WIDTH * source.scale), round(HEIGHT * source.scale)
+    if min(width, height) < SMALLEST:
+        raise InputError(
+            f"source.scale {source.scale:g} leaves {width}x{height} pixels of the demo room: use {SMALLEST / HEIGHT:.2f} or more"
+        )
+    select = slice(source.start, source.stop, source.step)
+    if not range(FRAMES)[select]:
+        raise InputError(f"source.start {source.start} lies behind the {FRAMES} frames of the demo room")
+    return SyntheticTracker(
+        width=width, height=height, select=select, holdout=source.holdout or 0, fps=source.fps
+    )

@@ -1,0 +1,120 @@
+"""Image features, and which of them look alike in two views with known poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Features", "Matches", "detect_features", "essential_matrix", "match_features"]
+
+MAX_SIDE = 1000
+MAX_FEATURES = 3000
+RATIO = 0.8
+CONTRAST = 0.02
+
+# Descriptors are whole numbers with squares that add up to this number's square at most: their float32
+# products are exact, so that matches do not depend on how a matrix product is split over threads.
+DESCRIPTOR_NORM = 512
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one image.
+
+    pixels: (N, 2) in the stored image, centres at +0.5. descriptors: (N, 128) uint8. pixel: size of a pixel
+    of the image that was searched, in pixels of the stored one.
+    """
+
+    pixels: NDArray[np.float64]
+    descriptors: NDArray[np.uint8]
+    pixel: float
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Features of two views that look alike.
+
+    pairs: (M, 2) int64, their numbers in both. ratio: (M,) squared distance of their descriptors over that to the
+    second best: the smaller, the clearer.
+    """
+
+    pairs: NDArray[np.int64]
+    ratio: NDArray[np.floating]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+
+def detect_features(image: NDArray[np.uint8]) -> Features:
+    """SIFT features of an image (H, W, 3) uint8 RGB, found at a longer side of at most 1000 pixels."""
+    import cv2
+
+    height, width = image.shape[:2]
+    pixel = max(1.0, max(height, width) / MAX_SIDE)
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    small = (max(1, round(width / pixel)), max(1, round(height / pixel)))
+    if small != (width, height):
+        gray = cv2.resize(gray, small, interpolation=cv2.INTER_AREA)
+    # Without the precise upscale every place is a quarter of a pixel too far to the right and below.
+    sift = cv2.SIFT_create(nfeatures=MAX_FEATURES, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    keypoints, raw = sift.detectAndCompute(gray, None)
+    if raw is None or len(keypoints) == 0:
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), pixel)
+
+    # cv2 counts pixel centres from 0.
+    places = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
+    pixels = (places + 0.5) * np.divide((width, height), small)
+    raw = raw.astype(np.float64)
+    root = np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-12))  # RootSIFT
+    descriptors = np.clip(np.floor(DESCRIPTOR_NORM * root), 0, 255).astype(np.uint8)
+    return Features(pixels, descriptors, pixel)
+
+
+def essential_matrix(T_a_world: NDArray[np.float64], T_b_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """E (3, 3) with x_b^T E x_a = 0 for the ideal coordinates x_a, x_b of one point in two cameras."""
+    T_b_a = T_b_world @ np.linalg.inv(T_a_world)
+    x, y, z = T_b_a[:3, 3]
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T_b_a[:3, :3]
+
+
+def match_features(
+    descriptors_a: NDArray[np.uint8],
+    descriptors_b: NDArray[np.uint8],
+    rays_a: NDArray[np.float64],
+    rays_b: NDArray[np.float64],
+    essential: NDArray[np.float64],
+    band: float,
+) -> Matches:
+    """Features that are each other's clearly best match near the epipolar line.
+
+    rays: ideal coordinates (N, 2). band: allowed distance from the line in image b, as ideal coordinate
+    (pixels / focal).
+    """
+    if len(descriptors_a) < 2 or len(descriptors_b) < 2:
+        return Matches(np.zeros((0, 2), dtype=np.int64), np.zeros(0))
+    a, b = descriptors_a.astype(np.float32), descriptors_b.astype(np.float32)
+    similarity = a @ b.T
+    lines = np.c_[rays_a, np.ones(len(rays_a))] @ essential.T  # (Na, 3)
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    off = lines.astype(np.float32) @ np.c_[rays_b, np.ones(len(rays_b))].T.astype(np.float32)
+    similarity[~(np.abs(off) <= band)] = -1.0  # also where the lens model has no ray
+
+    # Mutual best first, by passes over whole rows; the second best is looked for among these few only.
+    row = np.arange(len(a))
+    best_b = similarity.argmax(axis=1)
+    top = similarity[row, best_b]
+    mutual = (top > 0) & (top == similarity.max(axis=0)[best_b])
+    row, best_b, top = row[mutual], best_b[mutual], top[mutual]
+    rows, columns = similarity[row], np.ascontiguousarray(similarity[:, best_b].T)
+    rows[np.arange(len(row)), best_b] = -1.0
+    columns[np.arange(len(row)), row] = -1.0
+    norm_a, norm_b = (a * a).sum(axis=1), (b * b).sum(axis=1)
+    second_b, second_a = rows.argmax(axis=1), columns.argmax(axis=1)
+    square = norm_a[row] + norm_b[best_b] - 2 * top
+    square_b = norm_a[row] + norm_b[second_b] - 2 * rows[np.arange(len(row)), second_b]
+    square_a = norm_a[second_a] + norm_b[best_b] - 2 * columns[np.arange(len(row)), second_a]
+    ratio = square / np.maximum(np.minimum(square_a, square_b), 1.0)
+    clear = ratio < RATIO**2
+    return Matches(np.stack([row[clear], best_b[clear]], axis=1), ratio[clear])

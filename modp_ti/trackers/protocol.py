@@ -1,0 +1,33 @@
+"""What a tracker is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Protocol, runtime_checkable
+
+from fields.tracked_frame import TrackedFrame
+
+__all__ = ["Progress", "Tracker", "frame_count"]
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(what, done, total) while a tracker prepares."""
+
+
+@runtime_checkable
+class Tracker(Protocol):
+    """Delivers frames in order, each decoded when it is asked for.
+
+    notes: one-line remarks for the user, known when the tracker is opened, such as frames that were skipped.
+    A tracker that knows how many frames it will deliver has `__len__`. Iterating raises InputError where an
+    input turns out bad.
+    """
+
+    @property
+    def notes(self) -> list[str]: ...
+
+    def __iter__(self) -> Iterator[TrackedFrame]: ...
+
+
+def frame_count(tracker: Tracker) -> int | None:
+    """How many frames the tracker delivers; None where it does not know, as with a live camera."""
+    return len(tracker) if hasattr(tracker, "__len__") else None

@@ -1,0 +1,137 @@
+"""Replays poses and points that were tracked before, decoding each image when its turn comes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.tracked_frame import SparsePoints, TrackedFrame
+from modp_ti.config import SourceSettings
+from modp_ti.errors import InputError
+from modp_ti.sources import ImageFolder, Undistorter
+
+__all__ = ["PosedImage", "ReplayedTracker", "checked_pose", "points_inside", "require_fitting_sizes"]
+
+# A rotation this far from orthonormal was not meant as one; below it lies the rounding of text files.
+MAX_ROTATION_DEFECT = 1e-2
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image of the folder with its pose and its points, in pixels of the delivered image."""
+
+    name: str
+    undistorter: Undistorter
+    T_camera_world: NDArray[np.float64]
+    points: SparsePoints = field(default_factory=SparsePoints)
+
+    def with_points(self, points: SparsePoints) -> PosedImage:
+        return replace(self, points=points)
+
+
+class ReplayedTracker:
+    """A `Tracker` over posed images, in the order given."""
+
+    def __init__(
+        self,
+        images: ImageFolder,
+        frames: Sequence[PosedImage],
+        source: SourceSettings,
+        notes: Iterable[str] = (),
+    ) -> None:
+        self.frames = tuple(frames)
+        self.notes = list(notes)
+        self._images = images
+        self._source = source
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[TrackedFrame]:
+        for index, frame in enumerate(self.frames):
+            image, mask = frame.undistorter.image(self._images.read(frame.name))
+            yield TrackedFrame(
+                index=index,
+                timestamp=self._images.position(frame.name) / self._source.fps,
+                name=frame.name,
+                image=image,
+                camera=frame.undistorter.camera,
+                T_camera_world=frame.T_camera_world,
+                points=frame.points,
+                mask=mask,
+                held_out=is_held_out(index, self._source),
+            )
+
+
+def is_held_out(index: int, source: SourceSettings) -> bool:
+    """Whether the frame delivered as number `index` is only for evaluation."""
+    return source.holdout is not None and index % source.holdout == 0
+
+
+def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    """The rigid (4, 4) matrix next to the given one. Raises InputError that starts with `what` for others."""
+    rotation, translation = matrix[:3, :3], matrix[:3, 3]
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{what}: the pose holds NaN or infinite numbers")
+    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
+        raise InputError(f"{what}: the last row of the pose must be 0 0 0 1")
+    defect = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if defect > MAX_ROTATION_DEFECT:
+        raise InputError(
+            f"{what}: the pose is no rigid motion (R^T R differs from the identity by {defect:.2g}); "
+            "give a rotation without scale or shear"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise InputError(f"{what}: the pose mirrors (determinant -1); its axes are not those of a camera")
+    u, _, vt = np.linalg.svd(rotation)
+    pose = np.eye(4)
+    pose[:3, :3] = u @ vt
+    pose[:3, 3] = translation
+    return pose
+
+
+def require_fitting_sizes(
+    images: ImageFolder, frames: Sequence[tuple[str, Undistorter]], intrinsics: str
+) -> None:
+    """Raises InputError for the first image that is unreadable or not of its camera's size.
+
+    intrinsics: where the cameras come from, for the message. Reads the headers only, so that a run fails at
+    its start.
+    """
+    for name, undistorter in frames:
+        raw = undistorter.raw
+        width, height = images.size(name)
+        if (width, height) == (raw.width, raw.height):
+            continue
+        advice = "give source.path the images that belong to these intrinsics"
+        ratio = width / raw.width
+        if (width, height) == (raw.height, raw.width):
+            advice = "the image lies on its side: turn the pixels (an EXIF orientation is not applied)"
+        elif abs(ratio * raw.height - height) <= 1.0:
+            advice = (
+                f"the image is the same view at {ratio:.4g} of the size: {advice}"
+                + (f" and set source.scale: {ratio:.4g}" if ratio < 1 else "")
+                + f", or multiply the intrinsics and the size in {intrinsics} by {ratio:.4g}"
+            )
+        raise InputError(
+            f"{images.path / name} is {width}x{height}, its camera in {intrinsics} is "
+            f"{raw.width}x{raw.height}; {advice}"
+        )
+
+
+def points_inside(
+    xyz: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    ids: NDArray[np.int64],
+    undistorter: Undistorter,
+    T_camera_world: NDArray[np.float64],
+) -> SparsePoints:
+    """The points before the camera whose pixels (N, 2) are known and inside the delivered image."""
+    depth = xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
+    known = np.isfinite(pixels).all(axis=1) & np.isfinite(xyz).all(axis=1)
+    kept = known & (depth > 0)
+    kept[kept] = undistorter.camera.contains(pixels[kept])
+    return SparsePoints(xyz[kept], pixels[kept], ids[kept].astype(np.int64))

@@ -1,0 +1,125 @@
+"""Densification: where new Gaussians go, and how they begin (Section 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.gaussians import SH_C0, GaussianField
+from fields.keyframes import Keyframe
+from fields.occupancy import OccupancyVoxels
+from fields.se3 import inverse_se3
+from pipelines.depth import DepthEstimator
+from pipelines.settings import DensifySettings
+
+__all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "tracked_seeds"]
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Places of new Gaussians: xyz (N, 3) world, size (N,) of their pixel out there, colour (N, 3) in [0, 1]."""
+
+    xyz: NDArray[np.float64]
+    size: NDArray[np.float64]
+    colour: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+    def __getitem__(self, keep: NDArray) -> Seeds:
+        return Seeds(self.xyz[keep], self.size[keep], self.colour[keep])
+
+
+def _at_pixels(view: Keyframe, pixels: NDArray[np.float64], xyz: NDArray, depth: NDArray) -> Seeds:
+    """Seeds at pixels (N, 2) of a view, without those on masked pixels. Size is d / f of Eq. 1."""
+    column, row = np.floor(pixels).astype(int).T
+    rgba = view.rgba[row, column]
+    return Seeds(xyz, depth / view.camera.focal, rgba[:, :3] / 255.0)[rgba[:, 3] > 0]
+
+
+def tracked_seeds(view: Keyframe) -> Seeds:
+    """Geometry and texture complex regions: the tracked points of the view that lie in its image (P_i)."""
+    depth = view.points.xyz @ view.T_camera_world[2, :3] + view.T_camera_world[2, 3]
+    keep = (depth > 0) & view.camera.contains(view.points.pixels)
+    return _at_pixels(view, view.points.pixels[keep], view.points.xyz[keep], depth[keep])
+
+
+def dissimilarity(render: NDArray[np.floating], rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """1 - SSIM (H, W) of a render (H, W, 3) and an image (H, W, 4) in grey, after a slight blur against noise.
+
+    0 where the image is masked.
+    """
+
+    def smooth(image: NDArray, side: int, sigma: float) -> NDArray[np.float32]:
+        return cv2.GaussianBlur(image, (side, side), sigma)
+
+    a = smooth(cv2.cvtColor(np.clip(render, 0, 1).astype(np.float32), cv2.COLOR_RGB2GRAY), 5, 0.5)
+    b = smooth(cv2.cvtColor(rgba[..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0, 5, 0.5)
+    mu_a, mu_b = smooth(a, 11, 1.5), smooth(b, 11, 1.5)
+    var_a, var_b = smooth(a * a, 11, 1.5) - mu_a**2, smooth(b * b, 11, 1.5) - mu_b**2
+    covariance = smooth(a * b, 11, 1.5) - mu_a * mu_b
+    c1, c2 = 0.01**2, 0.03**2
+    ssim = (2 * mu_a * mu_b + c1) * (2 * covariance + c2) / ((mu_a**2 + mu_b**2 + c1) * (var_a + var_b + c2))
+    return np.where(rgba[..., 3] > 0, 1.0 - ssim, 0.0).astype(np.float32)
+
+
+def error_pixels(
+    view: Keyframe,
+    error: NDArray[np.float32] | None,
+    settings: DensifySettings,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """High error regions: pixel centres (N, 2) drawn without replacement where 1 - SSIM is high and no point is tracked.
+
+    error: (H, W) 1 - SSIM of the map's render; None draws from all valid pixels (the warm-up).
+    """
+    height, width = view.rgba.shape[:2]
+    candidate = view.rgba[..., 3] > 0
+    if error is not None:
+        candidate &= error >= settings.dissimilarity
+    inside = view.points.pixels[view.camera.contains(view.points.pixels)].astype(int)
+    candidate[inside[:, 1], inside[:, 0]] = False
+    places = np.flatnonzero(candidate)
+    count = min(round(settings.pixels * (width * height / (640 * 480)) ** 0.75), len(places))
+    chosen = np.sort(rng.choice(places, count, replace=False))
+    return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
+
+
+def pixel_seeds(
+    view: Keyframe, pixels: NDArray[np.float64], estimator: DepthEstimator, max_deviation: float
+) -> Seeds:
+    """Seeds at pixels (N, 2) whose depth the estimator knows well enough."""
+    estimate = estimator.estimate(view, pixels)
+    sure = estimate.deviation < max_deviation
+    camera_points = view.camera.unproject(pixels[sure], estimate.depth[sure])
+    T_world_camera = inverse_se3(view.T_camera_world)
+    xyz = camera_points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return _at_pixels(view, pixels[sure], xyz, estimate.depth[sure])
+
+
+def grow(
+    gaussians: GaussianField,
+    seeds: Seeds,
+    voxels: OccupancyVoxels | None,
+    target: float,
+    settings: DensifySettings,
+) -> int:
+    """Add isotropic Gaussians at the seeds that the voxels admit at the spacing `target` [scene units]; return how many."""
+    if voxels is not None:
+        seeds = seeds[voxels.admit(seeds.xyz, target)]
+    seeds = seeds[np.arange(len(seeds)) < gaussians.capacity - gaussians.count]
+    n = len(seeds)
+    log_scale = np.log(settings.initial_scale * seeds.size) + settings.scale_offset
+    sh = np.zeros((n, gaussians.sh_count, 3))
+    sh[:, 0] = (seeds.colour - 0.5) / SH_C0
+    gaussians.append(
+        position=seeds.xyz,
+        log_scale=np.repeat(log_scale[:, None], 3, axis=1),
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        opacity_logit=np.full(n, np.log(settings.initial_opacity / (1.0 - settings.initial_opacity))),
+        sh=sh,
+    )
+    return n

@@ -1,0 +1,97 @@
+"""Keyframe selection by the overlap of tracked points (Section 3.3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.camera import PinholeCamera
+from fields.keyframes import Keyframe
+from fields.se3 import inverse_se3
+from fields.tracked_frame import TrackedFrame
+from pipelines.settings import KeyframeSettings
+
+__all__ = ["KeyframeSelector", "SeenPoints", "covisibility"]
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """A view reduced to what covisibility needs: its camera, T_camera_world (4, 4) and tracked points (N, 3)."""
+
+    camera: PinholeCamera
+    T_camera_world: NDArray[np.float64]
+    xyz: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, view: TrackedFrame | Keyframe) -> SeenPoints:
+        return cls(view.camera, view.T_camera_world, view.points.xyz)
+
+    @property
+    def farthest(self) -> float:
+        """Depth of the farthest tracked point."""
+        return float((self.xyz @ self.T_camera_world[2, :3]).max() + self.T_camera_world[2, 3])
+
+    def count(self, xyz: NDArray[np.float64]) -> int:
+        """How many of the world points (N, 3) lie inside the view and no farther than its own farthest one."""
+        p = xyz @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
+        p = p[(p[:, 2] > 0) & (p[:, 2] <= self.farthest)]
+        return int(np.count_nonzero(self.camera.contains(self.camera.project(p))))
+
+
+def covisibility(a: SeenPoints, b: SeenPoints) -> float:
+    """Overlap of two views in [0, 1]: m / (m + only in a + only in b), m the mean number of one's points seen in the other.
+
+    0.1 where either has no points.
+    """
+    if len(a.xyz) == 0 or len(b.xyz) == 0:
+        return 0.1
+    a_in_b, b_in_a = b.count(a.xyz), a.count(b.xyz)
+    shared = 0.5 * (a_in_b + b_in_a)
+    only = (len(a.xyz) - a_in_b) + (len(b.xyz) - b_in_a)
+    return shared / max(shared + only, 1e-9)
+
+
+class KeyframeSelector:
+    """Decides frame by frame.
+
+    A frame that turned more than `max_rotation` since the last one is taken for blurred, unless turning that much is
+    usual here (within three times the median of the frames so far): image collections are no videos.
+    """
+
+    def __init__(self, settings: KeyframeSettings) -> None:
+        self.settings = settings
+        self._previous: TrackedFrame | None = None
+        self._rotations: list[float] = []
+
+    def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
+        """Whether `frame` becomes a keyframe, `last` being the latest one."""
+        previous, self._previous = self._previous, frame
+        if previous is not None:
+            self._rotations.append(rotation_per_frame(previous, frame))
+        if len(frame.points) < self.settings.min_points:
+            return False
+        if last is None or previous is None:
+            return True
+        if frame.index - last.index > self.settings.max_gap:
+            return True
+        rotation = self._rotations[-1]
+        if rotation > max(self.settings.max_rotation, 3.0 * float(np.median(self._rotations))):
+            return False
+        moved = np.linalg.norm(camera_centre(frame.T_camera_world) - camera_centre(last.T_camera_world))
+        if moved > self.settings.baseline * last.median_depth:
+            return True
+        return covisibility(SeenPoints.of(frame), SeenPoints.of(last)) < self.settings.covisibility
+
+
+def rotation_per_frame(a: TrackedFrame, b: TrackedFrame) -> float:
+    """Degrees that the camera turned from frame a to frame b, per frame between them."""
+    R = b.T_camera_world[:3, :3] @ a.T_camera_world[:3, :3].T
+    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0)))
+    return float(angle) / max(b.index - a.index, 1)
+
+
+def camera_centre(T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Position (3,) of a camera in the world."""
+    return inverse_se3(T_camera_world)[:3, 3]

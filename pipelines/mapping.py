@@ -1,0 +1,159 @@
+"""The online loop: track, add, filter, select views, optimise (the paper's overview figure)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fields.camera import PinholeCamera
+from fields.gaussians import GaussianField
+from fields.keyframes import Keyframe, KeyframeStore
+from fields.occupancy import OccupancyVoxels
+from fields.se3 import inverse_se3
+from fields.tracked_frame import SparsePoints, TrackedFrame
+from pipelines.densification import dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
+from pipelines.depth import DepthEstimator, GaussianProcessDepth
+from pipelines.keyframe_selection import KeyframeSelector
+from pipelines.optimisation import MapOptimiser
+from pipelines.rendering import Renderer
+from pipelines.settings import MappingSettings
+from pipelines.stopwatch import Stopwatch
+from pipelines.view_selection import LocalGlobalViews, ViewSelection
+
+__all__ = ["FrameReport", "OnlineMapper"]
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What a frame did to the map. psnr: mean of the last step's views, None where nothing was optimised."""
+
+    index: int
+    is_keyframe: bool
+    keyframes: int
+    gaussians: int
+    psnr: float | None
+
+
+class OnlineMapper:
+    """Turns a stream of `TrackedFrame`s into a Gaussian map while they arrive.
+
+    Images may have any size up to `max_width` x `max_height`. Depth estimation and view selection can be replaced by
+    any object of their Protocols.
+    """
+
+    def __init__(
+        self,
+        settings: MappingSettings,
+        max_width: int,
+        max_height: int,
+        seed: int = 0,
+        depth: DepthEstimator | None = None,
+        views: ViewSelection | None = None,
+    ) -> None:
+        self.settings = settings
+        self.rng = np.random.default_rng(seed)
+        self.stopwatch = Stopwatch()
+        self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
+        self.renderer = Renderer(self.gaussians, max_width, max_height)
+        self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
+        self.keyframes = KeyframeStore()
+        v = settings.voxels
+        self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
+        self.selector = KeyframeSelector(settings.keyframes)
+        self.depth = depth or GaussianProcessDepth(settings.depth, self.rng)
+        self.views = views or LocalGlobalViews(settings.views, self.rng)
+        self._frames = 0
+
+    # ---- the loop --------------------------------------------------------------------------------------------
+
+    def process(self, frame: TrackedFrame) -> FrameReport:
+        """Take in the next frame. Held-out frames must not come here: ValueError."""
+        if frame.held_out:
+            raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
+        self._frames += 1
+        if self._frames % self.settings.densify.prune_every == 0:
+            self.prune()
+        with self.stopwatch.measure("select"):
+            is_keyframe = self.selector.is_keyframe(frame, self.keyframes[-1] if len(self.keyframes) else None)
+        psnr = None
+        if is_keyframe:
+            view = self.keyframes.append(frame)
+            self._add(view, compensate=self.settings.densify.error_compensation)
+            psnr = self.optimise(self.settings.optimise.steps)
+        elif len(self.keyframes):
+            # Other frames only bring their points, at the pose that the keyframes around them imply.
+            self._add(self.keyframes.view(frame), compensate=False)
+        return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr)
+
+    def finish(self) -> float | None:
+        """After the last frame: more steps on the last keyframe, and a last removal of transparent Gaussians."""
+        psnr = self.optimise(self.settings.optimise.last_steps - self.settings.optimise.steps)
+        self.prune()
+        return psnr
+
+    def optimise(self, steps: int) -> float | None:
+        """Optimise the map for the last keyframe and the views chosen with it; return the last step's mean PSNR."""
+        if len(self.keyframes) == 0 or len(self.gaussians) == 0:
+            return None
+        psnr = None
+        with self.stopwatch.measure("select"):
+            self.views.begin(self.keyframes)
+        for step in range(steps):
+            with self.stopwatch.measure("select"):
+                views = self.views.select(self.keyframes)
+            with self.stopwatch.measure("optimise"):
+                psnr = self.optimiser.step(
+                    self.keyframes,
+                    views,
+                    self.optimiser.rates(self.keyframes.scene_depth),
+                    refine_poses=self.settings.poses.enabled and step < self.settings.poses.steps,
+                )
+        return psnr
+
+    def prune(self) -> int:
+        """Remove Gaussians that have become transparent; return how many."""
+        return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
+
+    # ---- adding Gaussians ------------------------------------------------------------------------------------
+
+    def _add(self, view: Keyframe, compensate: bool) -> None:
+        """Densify from one view: tracked points, then pixels of high error, each filtered by the voxels."""
+        self._grow(tracked_seeds(view), view)
+        if not compensate:
+            return
+        with self.stopwatch.measure("depth"):
+            error = None
+            if self._frames > self.settings.densify.warm_up:
+                self.optimiser.compare(view, self.keyframes.scene_depth)
+                error = dissimilarity(self.renderer.images.colour_to_numpy(), view.rgba)
+            pixels = error_pixels(view, error, self.settings.densify, self.rng)
+            seeds = pixel_seeds(view, pixels, self.depth, self.settings.depth.max_deviation)
+        self._grow(seeds, view)
+
+    def _grow(self, seeds, view: Keyframe) -> None:
+        with self.stopwatch.measure("occupancy"):
+            v = self.settings.voxels
+            if self.voxels is not None and len(self.gaussians) == 0:
+                centre = inverse_se3(view.T_camera_world)[:3, 3]
+                self.voxels.settle(v.coarsest * view.view_scale, centre)
+            grow(self.gaussians, seeds, self.voxels, v.target * view.view_scale, self.settings.densify)
+
+    # ---- compiling -------------------------------------------------------------------------------------------
+
+    def compile(self) -> None:
+        """Compile every kernel on a scene of one Gaussian, so that no frame waits for it. The map must be empty."""
+        camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
+        with self.stopwatch.measure("compile"):
+            image = np.full((16, 16, 3), 0.5, dtype=np.float32)
+            points = SparsePoints(np.array([[0.0, 0.0, 1.0]]), np.array([[8.0, 8.0]]), np.zeros(1, dtype=np.int64))
+            store = KeyframeStore()
+            view = store.append(TrackedFrame(0, 0.0, "compile", image, camera, np.eye(4), points))
+            if self.voxels is not None:
+                self.voxels.query(view.points.xyz, 1.0)
+                self.voxels.update(np.zeros((0, 3)), 1.0)
+            grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
+            self.optimiser.step(store, [0], self.optimiser.rates(1.0), refine_poses=False)
+            self.renderer.camera_gradient()
+            self.renderer.images.colour_to_numpy()
+            self.gaussians.remove(np.zeros(1, dtype=bool))

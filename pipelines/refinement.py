@@ -1,0 +1,41 @@
+"""Post refinement: the finished map, optimised on all keyframes alike (Section 4.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pipelines.mapping import OnlineMapper
+from pipelines.settings import RefineSettings
+from pipelines.view_selection import global_probabilities
+
+__all__ = ["decay", "refine"]
+
+
+def decay(step: int, steps: int, final: float) -> float:
+    """Exponential factor from 1 at step 0 to `final` at the last."""
+    return float(final ** (step / max(steps - 1, 1)))
+
+
+def refine(
+    mapper: OnlineMapper, settings: RefineSettings, progress: Callable[[int, float], None] | None = None
+) -> None:
+    """Run `settings.steps` steps on error-weighted draws of keyframes, poses fixed; positions and scales slow down.
+
+    progress: called after every step with (steps done, mean PSNR of its views).
+    """
+    store, views = mapper.keyframes, mapper.settings.views
+    if len(store) == 0 or len(mapper.gaussians) == 0:
+        return
+    for step in range(settings.steps):
+        with mapper.stopwatch.measure("refine"):
+            p = global_probabilities(store, views.error_weight, 0.0)
+            batch = [int(j) for j in mapper.rng.choice(len(store), settings.views, p=p)]
+            rates = mapper.optimiser.rates(
+                store.scene_depth,
+                position_factor=decay(step, settings.steps, settings.position_decay),
+                scale_factor=decay(step, settings.steps, settings.scale_decay),
+            )
+            psnr = mapper.optimiser.step(store, batch, rates, refine_poses=False)
+        if progress is not None:
+            progress(step + 1, psnr)
+    mapper.prune()

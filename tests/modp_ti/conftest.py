@@ -1,0 +1,141 @@
+"""Inputs of the readers: the real data where it is there, and a posed scene with known geometry."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+@pytest.fixture
+def shared_data() -> Callable[[str], Path]:
+    """The folder of a real data set; skips the test where it is not there."""
+
+    def folder(name: str) -> Path:
+        if not (SHARED_DATA / name).is_dir():
+            pytest.skip(f"no ../shared/data/{name}")
+        return SHARED_DATA / name
+
+    return folder
+
+
+@dataclass(frozen=True)
+class PlaneScene:
+    """Photographs of a textured plane z = 0 of the world, written as PNG files.
+
+    K: (3, 3), pixel centres at +0.5. T_camera_world: (N, 4, 4), OpenCV axes. size: (width, height).
+    """
+
+    folder: Path
+    names: list[str]
+    K: NDArray[np.float64]
+    T_camera_world: NDArray[np.float64]
+    size: tuple[int, int]
+
+    def write_transforms(self, **changes: object) -> Path:
+        """transforms.json beside the image folder; `changes` replace or (None) remove its keys."""
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])
+        data: dict[str, object] = {
+            "fl_x": self.K[0, 0],
+            "fl_y": self.K[1, 1],
+            "cx": self.K[0, 2],
+            "cy": self.K[1, 2],
+            "w": self.size[0],
+            "h": self.size[1],
+            "frames": [
+                {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(T) @ flip).tolist()}
+                for name, T in zip(self.names, self.T_camera_world, strict=True)
+            ],
+        }
+        data.update(changes)
+        file = self.folder.parent / "transforms.json"
+        file.write_text(json.dumps({key: value for key, value in data.items() if value is not None}))
+        return file
+
+    def write_colmap(self, points: NDArray[np.float64], text: bool = False) -> Path:
+        """A COLMAP model in sparse/0 in which every image observes every point that it sees."""
+        model = pycolmap.Reconstruction()
+        camera = pycolmap.Camera(
+            camera_id=1,
+            model="PINHOLE",
+            width=self.size[0],
+            height=self.size[1],
+            params=[self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2]],
+        )
+        model.add_camera_with_trivial_rig(camera)
+        observations: list[list[tuple[int, int]]] = [[] for _ in points]
+        for i, (name, T) in enumerate(zip(self.names, self.T_camera_world, strict=True)):
+            p = points @ T[:3, :3].T + T[:3, 3]
+            uv = (p / p[:, 2:]) @ self.K.T
+            seen = np.flatnonzero(
+                (p[:, 2] > 0)
+                & (uv[:, :2] > 0).all(axis=1)
+                & (uv[:, 0] < self.size[0])
+                & (uv[:, 1] < self.size[1])
+            )
+            image = pycolmap.Image(
+                name=name,
+                camera_id=1,
+                image_id=i + 1,
+                points2D=pycolmap.Point2DList([pycolmap.Point2D(uv[j, :2]) for j in seen]),
+            )
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
+            for place, j in enumerate(seen):
+                observations[j].append((i + 1, place))
+        for j, xyz in enumerate(points):
+            track = pycolmap.Track()
+            for image_id, place in observations[j]:
+                track.add_element(image_id, place)
+            model.add_point3D(xyz, track)
+        folder = self.folder.parent / "sparse" / "0"
+        folder.mkdir(parents=True, exist_ok=True)
+        model.write_text(str(folder)) if text else model.write_binary(str(folder))
+        return folder
+
+
+@pytest.fixture
+def plane_scene(tmp_path: Path) -> PlaneScene:
+    """Seven views, 320x240, of a plane with blobs of many sizes, from an arc of 25 degrees at distance 4."""
+    rng = np.random.default_rng(7)
+    texture = np.zeros((800, 1000, 3), np.float32)
+    for size in (4, 8, 16, 40):
+        noise = rng.random((800 // size + 2, 1000 // size + 2, 3)).astype(np.float32)
+        texture += cv2.resize(noise, (1000, 800), interpolation=cv2.INTER_CUBIC)
+    texture = np.clip(255 * (texture - texture.min()) / np.ptp(texture), 0, 255).astype(np.uint8)
+
+    width, height = 320, 240
+    K = np.array([[300.0, 0, 161.3], [0, 298.0, 118.6], [0, 0, 1]])
+    metres_per_texel = 0.006
+    world_texture = np.array(  # texel with centre at +0.5 -> point of the plane, homogeneous
+        [
+            [metres_per_texel, 0, -500 * metres_per_texel],
+            [0, metres_per_texel, -400 * metres_per_texel],
+            [0, 0, 1],
+        ]
+    )
+    folder = tmp_path / "images"
+    folder.mkdir()
+    names, poses = [], []
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # to cv2's integer centres
+    for i, angle in enumerate(np.linspace(-12.5, 12.5, 7)):
+        R = Rotation.from_euler("yxz", [angle, 0.2 * angle, 3 * np.sin(i)], degrees=True).as_matrix()
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, R @ [0.0, 0.0, 4.0 + 0.1 * i] + [0.05 * i, 0, 0]
+        homography = K @ T[:3, [0, 1, 3]] @ world_texture
+        image = cv2.warpPerspective(
+            texture, half @ homography @ np.linalg.inv(half), (width, height), flags=cv2.INTER_AREA
+        )
+        names.append(f"view{i + 8}.png")  # view8 ... view14: not in the order of the alphabet
+        cv2.imwrite(str(folder / names[-1]), image)
+        poses.append(T)
+    return PlaneScene(folder, names, K, np.stack(poses), (width, height))

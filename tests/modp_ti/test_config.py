@@ -1,0 +1,237 @@
+"""scene.yaml is read strictly, every mistake is named in one line, and what is written gives the same run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from modp_ti.config import SceneConfig, documented_keys, dump_scene, load_scene, markdown_of_keys
+from modp_ti.errors import InputError
+
+MINIMAL = "source: {path: images}\ntracker: {kind: colmap}\noutput: out/here\n"
+
+
+@pytest.fixture
+def scene(tmp_path: Path):
+    def write(text: str) -> Path:
+        file = tmp_path / "scene.yaml"
+        file.write_text(text)
+        return file
+
+    return write
+
+
+def failure(path: Path, *overrides: str) -> str:
+    with pytest.raises(InputError) as caught:
+        load_scene(path, overrides)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_three_keys_are_enough_and_paths_are_relative_to_the_file(scene, tmp_path, monkeypatch):
+    file = scene(MINIMAL)
+    monkeypatch.chdir("/")
+    config = load_scene(file)
+    assert config.source.path == (tmp_path / "images").resolve()
+    assert config.output == (tmp_path / "out" / "here").resolve()
+    assert (config.source.scale, config.source.holdout, config.source.fps) == (1.0, None, 30.0)
+    assert (config.seed, config.threads, config.tracker.path) == (0, None, None)
+
+
+def test_settings_cannot_be_changed_after_reading(scene):
+    config = load_scene(scene(MINIMAL))
+    with pytest.raises(ValidationError):
+        config.seed = 3
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong", "right"),
+    [
+        ("sorce: {path: x}", "sorce", "source"),
+        ("sede: 3", "sede", "seed"),
+        ("scale: 0.5", "scale", "source.scale"),
+        (
+            "mapping: {keyframes: {covisibilty: 0.9}}",
+            "mapping.keyframes.covisibilty",
+            "mapping.keyframes.covisibility",
+        ),
+        ("refine: {step: 3}", "refine.step", "refine.steps"),
+    ],
+)
+def test_unknown_key_is_named_with_its_place_its_line_and_the_nearest_right_one(scene, line, wrong, right):
+    message = failure(scene(MINIMAL + line + "\n"))
+    assert "scene.yaml:4:" in message
+    assert f"unknown key `{wrong}`" in message
+    assert f"did you mean `{right}`?" in message
+
+
+def test_unknown_key_in_a_written_section_is_compared_with_that_section(scene):
+    message = failure(scene("source:\n  path: x\n  hold_out: 8\ntracker: {kind: colmap}\noutput: o\n"))
+    assert "scene.yaml:3: unknown key `source.hold_out`; did you mean `source.holdout`?" in message
+
+
+def test_key_unlike_any_other_lists_those_that_there_are(scene):
+    message = failure(scene(MINIMAL + "qqq: 1\n"))
+    assert "unknown key `qqq`" in message
+    for key in SceneConfig.model_fields:
+        assert key in message
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("source.scal=0.5", ["unknown key `source.scal`", "`source.scale`"]),
+        ("scale=0.5", ["unknown key `scale`", "`source.scale`"]),
+        ("mapping.keyframe.max_gap=3", ["unknown key `mapping.keyframe`", "`mapping.keyframes.max_gap`"]),
+        ("source={scal: 0.5}", ["unknown key `source.scal`", "`source.scale`"]),
+        ("device.kind=cpu", ["`device` is a value"]),
+        ("source.scale", ["section.key=value"]),
+        ("=3", ["section.key=value"]),
+        ("source.scale=2", ["source.scale", "less than or equal to 1", "not 2"]),
+        ("seed=[1", ["not valid YAML"]),
+    ],
+)
+def test_wrong_override_is_named_as_it_was_typed(scene, override, parts):
+    message = failure(scene(MINIMAL), override)
+    assert f"--set {override}" in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("source.scale", "0"),
+        ("source.scale", "1.5"),
+        ("source.scale", '"0.5"'),
+        ("source.scale", "true"),
+        ("source.scale", ".nan"),
+        ("source.scale", "1e999"),
+        ("source.scale", "[0.5]"),
+        ("source.holdout", "1"),
+        ("source.holdout", "2.5"),
+        ("source.fps", "-1"),
+        ("source.start", "-1"),
+        ("source.step", "0"),
+        ("tracker.kind", "orb"),
+        ("tracker.path", "3"),
+        ("device", "gpu"),
+        ("seed", "-1"),
+        ("seed", "null"),
+        ("threads", "0"),
+        ("mapping", "7"),
+        ("mapping.keyframes.max_gap", "0"),
+    ],
+)
+def test_wrong_value_is_refused_with_its_key(scene, key, value):
+    assert key in failure(scene(MINIMAL), f"{key}={value}")
+
+
+def test_wrong_value_in_the_file_is_named_with_its_line(scene):
+    message = failure(scene("source:\n  path: images\n  scale: 3\ntracker: {kind: colmap}\noutput: o\n"))
+    assert "scene.yaml:3: source.scale: must be less than or equal to 1, not 3" in message
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("tracker: {kind: colmap}\noutput: o\n", ["source.path is missing"]),
+        ("source: {path: x}\noutput: o\n", ["tracker is missing", "tracker.kind"]),
+        ("source: {path: x}\ntracker: {}\noutput: o\n", ["tracker.kind is missing"]),
+        ("source: {path: x}\ntracker: {kind: colmap}\n", ["output is missing", "folder of the results"]),
+    ],
+)
+def test_missing_key_is_named_with_its_meaning(scene, text, parts):
+    message = failure(scene(text))
+    for part in parts:
+        assert part in message
+
+
+def test_empty_range_of_frames_is_refused(scene):
+    assert "source.stop (5) must be larger than source.start (5)" in failure(
+        scene(MINIMAL), "source.start=5", "source.stop=5"
+    )
+
+
+def test_synthetic_tracker_needs_no_images(scene):
+    assert load_scene(scene("tracker: {kind: synthetic}\noutput: o\n")).source.path is None
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("source: {path: x\ntracker: 3\n", "scene.yaml:2: not valid YAML"),
+        ("source: x\n\tseed: 3\n", "scene.yaml:2: not valid YAML"),
+        (MINIMAL + "seed: 1\nseed: 2\n", "scene.yaml:5: `seed` stands twice (first in line 4)"),
+        ("source:\n  path: a\n  path: b\n", "scene.yaml:3: `source.path` stands twice"),
+        ("a: &a [*a]\n", "alias"),
+        ("", "holds none"),
+        ("- 3\n", "holds none"),
+    ],
+)
+def test_bad_yaml_is_named_with_its_line(scene, text, part):
+    assert part in failure(scene(text))
+
+
+def test_missing_scene_file_is_named(tmp_path):
+    assert failure(tmp_path / "no.yaml") == f"{tmp_path / 'no.yaml'}: no such scene file"
+    assert "cannot be read" in failure(tmp_path)
+
+
+def test_numbers_are_those_of_yaml_1_2(scene):
+    config = load_scene(scene(MINIMAL), ["source.fps=3e1", "source.scale=5e-1", "seed=010"])
+    assert (config.source.fps, config.source.scale, config.seed) == (30.0, 0.5, 10)
+
+
+def test_overrides_win_over_the_file_and_later_ones_over_earlier_ones(scene):
+    file = scene(MINIMAL + "seed: 1\n")
+    assert load_scene(file, ["seed=2", "seed=3", "tracker.path=model"]).seed == 3
+    assert load_scene(file, ["source.holdout=8", "source.holdout="]).source.holdout is None
+    assert load_scene(file, ["mapping.keyframes.max_gap=9"]).mapping.keyframes.max_gap == 9
+
+
+def test_override_path_is_relative_to_the_file(scene, tmp_path):
+    assert load_scene(scene(MINIMAL), ["output=there"]).output == (tmp_path / "there").resolve()
+
+
+def test_written_configuration_gives_the_same_run_from_wherever_it_lies(scene, tmp_path, monkeypatch):
+    config = load_scene(
+        scene(MINIMAL),
+        ["source.scale=0.3", "source.holdout=8", "tracker.path=a b/0", "threads=2", "mapping.sh_degree=1"],
+    )
+    elsewhere = tmp_path / "deep" / "er"
+    elsewhere.mkdir(parents=True)
+    monkeypatch.chdir("/")
+    dump_scene(config, elsewhere / "config.yaml")
+    assert load_scene(elsewhere / "config.yaml") == config
+    assert [file.name for file in elsewhere.iterdir()] == ["config.yaml"]
+
+
+def leaves(data: dict, prefix: str = "") -> list[str]:
+    keys = []
+    for key, value in data.items():
+        keys += leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [prefix + key]
+    return keys
+
+
+def test_written_configuration_names_every_documented_key(scene, tmp_path):
+    dump_scene(load_scene(scene(MINIMAL)), tmp_path / "config.yaml")
+    written = leaves(yaml.safe_load((tmp_path / "config.yaml").read_text()))
+    assert written == [entry.key for entry in documented_keys()]
+
+
+def test_every_key_is_documented_with_its_meaning_and_default():
+    text = markdown_of_keys()
+    for entry in documented_keys():
+        assert entry.description, f"{entry.key} has no description"
+        assert f"| `{entry.key}` |" in text
+    defaults = {entry.key: entry.default for entry in documented_keys()}
+    assert (defaults["source.scale"], defaults["source.holdout"], defaults["output"]) == ("1.0", "", None)
+
+
+def test_reference_of_the_keys_is_up_to_date():
+    page = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
+    assert page.read_text() == markdown_of_keys(), "run: python -m modp_ti.config > docs/configuration.md"
