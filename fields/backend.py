@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import io
+
 import taichi as ti
 
 __all__ = ["initialise"]
@@ -15,20 +19,28 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
 
     Raises RuntimeError where "cuda" was asked for and does not start.
     """
-    options = {
-        "offline_cache": True,
-        "log_level": ti.ERROR,
-        "random_seed": seed,
-        "default_fp": ti.f32,
-        "default_ip": ti.i32,
-    }
+    options = {"offline_cache": True, "log_level": ti.ERROR, "random_seed": seed, "default_fp": ti.f32}
     if threads is not None:
         options["cpu_max_num_threads"] = threads
-    if device in ("cuda", "auto") and ti._lib.core.with_cuda():
-        ti.init(arch=ti.cuda, **options)
+    if device in ("cuda", "auto") and _has_cuda_driver():
+        _start(ti.cuda, options)
         if ti.lang.impl.current_cfg().arch == ti.cuda:
             return "cuda"
     if device == "cuda":
-        raise RuntimeError("device: cuda was asked for, and no CUDA device starts here; use device: cpu or auto")
-    ti.init(arch=ti.cpu, **options)
+        raise RuntimeError("device: cuda was asked for, but no CUDA device starts here; use device: cpu or auto")
+    _start(ti.cpu, options)
     return "cpu"
+
+
+def _has_cuda_driver() -> bool:
+    # Asked of the system and not of Taichi, which complains on the terminal where there is none.
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def _start(arch: object, options: dict) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(arch=arch, **options)

@@ -90,6 +90,12 @@ class ImageBuffers:
         for i in range(9 * self.plane):
             self.ssim_partial[i] = 0.0
 
+    @ti.kernel
+    def clip_colour(self):
+        """Clip the rendered image to [0, 1], as a file of it would."""
+        for i in range(3 * self.plane):
+            self.colour[i] = ti.min(ti.max(self.colour[i], 0.0), 1.0)
+
     # ---- to and from NumPy -----------------------------------------------------------------------------------
 
     def set_reference(self, image: np.ndarray) -> None:

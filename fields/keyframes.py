@@ -78,13 +78,9 @@ class KeyframeStore:
         """`frame` as a keyframe would be, at the pose that the keyframes around it imply, but not kept."""
         depth = frame.points.xyz @ frame.T_camera_world[2, :3] + frame.T_camera_world[2, 3]
         depth = depth[depth > 0]
-        rgba = np.full((*frame.image.shape[:2], 4), 255, dtype=np.uint8)
-        rgba[..., :3] = np.round(frame.image * 255.0)
-        if frame.mask is not None:
-            rgba[~frame.mask] = 0
         return Keyframe(
             index=frame.index,
-            rgba=rgba,
+            rgba=frame.rgba(),
             camera=frame.camera,
             T_tracked=frame.T_camera_world.copy(),
             T_camera_world=self.corrected(frame.index, frame.T_camera_world),

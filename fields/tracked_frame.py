@@ -72,3 +72,11 @@ class TrackedFrame:
             raise ValueError(f"{self.name}: mask is {self.mask.shape}, the image {expected}")
         if self.T_camera_world.shape != (4, 4) or not np.isfinite(self.T_camera_world).all():
             raise ValueError(f"{self.name}: T_camera_world must be a finite 4x4 matrix")
+
+    def rgba(self) -> NDArray[np.uint8]:
+        """The image with 8 bits a channel (H, W, 4), 255 in the last where the pixel is valid and all 0 where not."""
+        rgba = np.full((*self.image.shape[:2], 4), 255, dtype=np.uint8)
+        rgba[..., :3] = np.round(self.image * 255.0)
+        if self.mask is not None:
+            rgba[~self.mask] = 0
+        return rgba

@@ -90,9 +90,6 @@ class SceneConfig(StrictModel):
         return self
 
 
-# --------------------------------------------------------------------------------------------- read and write
-
-
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneConfig:
     """Reads a scene file; `overrides` are "section.key=value" with the value in YAML, applied in their order.
 
@@ -144,6 +141,7 @@ def _with_absolute_paths(model: Any, base: Path) -> Any:
 
 
 def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
+    """The model of the raw data. where: file and line, or the override, that wrote a dotted key."""
     try:
         # Strict JSON keeps `scale: "0.5"` and `holdout: true` from passing as numbers, and still takes text
         # as path.
@@ -158,19 +156,12 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         elif place and first["type"] != "value_error":
             text = f"{place}: {text.replace('Input should be', 'must be')}, not {_as_yaml(first['input'])}"
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise InputError(f"{_origin(where, place, name)}: {text}{more}") from None
+        raise InputError(f"{where.get(place, name)}: {text}{more}") from None
 
 
 def _as_yaml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, default=str)
 
-
-def _origin(where: Mapping[str, str], place: str, name: str) -> str:
-    """Where the user wrote a setting: file and line, or the override; else the file's name."""
-    return where.get(place, name)
-
-
-# --------------------------------------------------------------------------------------------- YAML, strictly
 
 _INT = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
@@ -256,9 +247,6 @@ def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) 
     for known in [k for k in where if k == key or k.startswith(key + ".")]:
         del where[known]
     where[key] = origin
-
-
-# ----------------------------------------------------------------------------------------------- keys by name
 
 
 @dataclass(frozen=True)
@@ -347,7 +335,7 @@ def _refuse_unknown_keys(
         place = prefix + key
         if key not in model.model_fields:
             hint = _nearest(place, prefix, model, whole_key)
-            raise InputError(f"{_origin(where, place, origin)}: unknown key `{place}`{hint}")
+            raise InputError(f"{where.get(place, origin)}: unknown key `{place}`{hint}")
         sections = _sections(model.model_fields[key].annotation)
         if not isinstance(value, Mapping):
             continue
@@ -378,9 +366,6 @@ def _nearest(place: str, prefix: str, model: type[BaseModel], whole_key: str | N
     else:
         return f"; {'this section has' if prefix else 'the keys are'} {', '.join(siblings)}"
     return f"; did you mean `{found}`?"
-
-
-# ---------------------------------------------------------------------------------------------- documentation
 
 
 def markdown_of_keys() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from modp_ti.errors import InputError
@@ -16,14 +17,15 @@ WIDTH, HEIGHT = 320, 240  # [px] at scale 1
 
 
 def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> SyntheticTracker:
-    """The demo sequence. Of `source`, scale, start, stop, step, holdout and fps count; nothing of `tracker` does.
+    """The demo sequence. Of `source`, scale, start, stop, step, holdout and fps count; of `tracker` nothing.
 
     Raises InputError where the scale leaves no picture or the range no frames.
     """
     width, height = round(WIDTH * source.scale), round(HEIGHT * source.scale)
     if min(width, height) < SMALLEST:
+        least = math.ceil(100 * SMALLEST / HEIGHT) / 100
         raise InputError(
-            f"source.scale {source.scale:g} leaves {width}x{height} pixels of the demo room: use {SMALLEST / HEIGHT:.2f} or more"
+            f"source.scale {source.scale:g} leaves {width}x{height} pixels of the demo: use {least} or more"
         )
     select = slice(source.start, source.stop, source.step)
     if not range(FRAMES)[select]:

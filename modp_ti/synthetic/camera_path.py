@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 __all__ = ["camera_path", "look_at"]
 
-# Eye and target at equal steps of time [m]. The eye always moves sideways while it turns: rotation alone gives no parallax.
+# Eye and target at equal steps of time [m]. The eye always moves sideways while it turns: rotation alone
+# gives no parallax.
 STATIONS = np.array(
     [
         [[1.10, -1.10, 1.42], [-1.60, 1.30, 1.00]],

@@ -1,9 +1,11 @@
-"""The pieces that stand in the demo room. Each is built around the origin, on the floor z = 0, its front towards -y.
+"""The pieces that stand in the demo room, each around the origin, on the floor z = 0, its front towards -y.
 
 Place one with `with scene.placed(at, degrees):`. Lengths are metres.
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 
@@ -12,9 +14,9 @@ from modp_ti.synthetic.scene import Material, Scene, rotation
 
 __all__ = [
     "armchair",
-    "bookshelf",
     "books_row",
     "books_stack",
+    "bookshelf",
     "chair",
     "coffee_table",
     "curtain",
@@ -205,7 +207,7 @@ def bookshelf(s: Scene, rng: np.random.Generator, width: float = 1.1, height: fl
 
 
 def framed(s: Scene, picture: str, width: float, height: float, lean: float = 0.0, mat: float = 0.0) -> None:
-    """A framed picture whose lower edge stands at z = 0, leaning back by degrees; `mat` is the white margin."""
+    """A framed picture standing on z = 0, leaning back by degrees; `mat` is its white margin."""
     with s.placed((0, 0, 0), rotation(pitch=-lean)):
         bar = 0.022 if width < 0.4 else 0.032
         s.box((0, 0, height / 2), (width - bar, 0.012, height - bar), WHITE)
@@ -353,7 +355,7 @@ def plant(
         t = np.linspace(0, 1, 6)
         out = lean * t**1.7
         path = np.stack([out * np.cos(heading), out * np.sin(heading), 0.29 + (tall - 0.29) * t], axis=1)
-        for a, b in zip(path[:-1], path[1:], strict=True):
+        for a, b in pairwise(path):
             s.rod(a, b, 0.009, green)
         for n in range(leaves):
             at = 0.45 + 0.55 * (n + 1) / leaves

@@ -1,4 +1,7 @@
-"""Noise and small drawing helpers for the procedural textures. Colours are sRGB in [0, 255], images float32 until `finish`."""
+"""Noise and small drawing helpers for the procedural textures.
+
+Colours are sRGB in [0, 255]; images are float32 until `finish`.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,10 @@ Colour = Sequence[float]
 
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: tuple[float, float]) -> Floats:
-    """Standard-normal values on a grid of `cell` (down, across) pixels, interpolated to `shape`; repeats without a seam."""
+    """Standard-normal values on a grid of `cell` (down, across) pixels, interpolated to `shape`.
+
+    Repeats without a seam.
+    """
     height, width = int(shape[0]), int(shape[1])
     rows, columns = max(1, round(height / float(cell[0]))), max(1, round(width / float(cell[1])))
     values = rng.standard_normal((rows, columns)).astype(np.float32)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from modp_ti.synthetic import pictures, textures
+from modp_ti.synthetic import pictures, prints, textures
 from modp_ti.synthetic.noise import Image
 
 __all__ = ["COVERS", "SPINES", "make_textures"]
@@ -55,21 +55,21 @@ MAKERS: dict[str, Callable[[np.random.Generator], Image]] = {
     "pages": textures.pages,
     "landscape": pictures.landscape_painting,
     "abstract": pictures.abstract_painting,
-    "poster": pictures.splat_poster,
-    "map": pictures.contour_map,
+    "poster": prints.splat_poster,
+    "map": prints.contour_map,
     "fern": pictures.botanical_print,
     "photo": pictures.photograph,
     "view": pictures.window_view,
-    "clock": pictures.clock_face,
-    "chess": pictures.chessboard,
-    "screen": pictures.editor_screen,
-    "keys": pictures.keyboard,
-    "globe": pictures.globe,
-    **dict.fromkeys(SPINES, pictures.book_spine),
-    **dict.fromkeys(COVERS, pictures.book_cover),
+    "clock": prints.clock_face,
+    "chess": prints.chessboard,
+    "screen": prints.editor_screen,
+    "keys": prints.keyboard,
+    "globe": prints.globe,
+    **dict.fromkeys(SPINES, prints.book_spine),
+    **dict.fromkeys(COVERS, prints.book_cover),
 }
 
 
 def make_textures() -> dict[str, Image]:
-    """Every texture, (H, W, 3) uint8 sRGB. Each has its own seed, so that a new one does not change the others."""
+    """Every texture, (H, W, 3) uint8 sRGB. Each has its own seed: a new one does not change the others."""
     return {name: make(np.random.default_rng(zlib.crc32(name.encode()))) for name, make in MAKERS.items()}

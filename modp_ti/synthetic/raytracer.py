@@ -1,129 +1,51 @@
 """Kernels of the demo room: rays against the scene tables, light-map baking, the radiance along rays.
 
-Plain functions of NumPy arrays (`scene.SceneArrays`): nothing lives in Taichi between two calls, and the loops run over
-table rows, so that the code stays small and compiles in seconds however much furniture there is.
+Plain functions of NumPy arrays (`scene.SceneArrays`): nothing lives in Taichi between two calls, and loops
+run over table rows, so that the code stays small and compiles in seconds however much furniture there is.
+
+No `from __future__ import annotations` here: Taichi reads the annotations of kernels as objects.
 """
 
 import taichi as ti
 import taichi.math as tm
 
-from modp_ti.synthetic.scene import BOX, FRUSTUM, ROUNDED, SPHERE
+from modp_ti.synthetic.scene import FRUSTUM, SPHERE
+from modp_ti.synthetic.shapes import (
+    chart,
+    inside,
+    integer,
+    intersect,
+    map_direction,
+    map_point,
+    reciprocal,
+    slab,
+    surface_point,
+    vec2,
+    vec3,
+    vec4,
+    world_normal,
+)
 
 __all__ = ["bake_direct", "camera_rays", "find_open_places", "gather_rays", "radiance"]
 
-FAR = 1e9
-LONGEST = 100.0  # [m]
+LONGEST = 100.0  # [m] of a ray
 SURFACE = 1e-3  # [m] how far a secondary ray starts above the surface
-MARCH_STEPS = 48
 
-vec2 = ti.types.vector(2, ti.f32)
-vec3 = ti.types.vector(3, ti.f32)
-vec4 = ti.types.vector(4, ti.f32)
 mat3 = ti.types.matrix(3, 3, ti.f32)
-
 vec4_table = ti.types.ndarray(dtype=vec4, ndim=2)
 vec3_table = ti.types.ndarray(dtype=vec3, ndim=2)
 vec3_list = ti.types.ndarray(dtype=vec3, ndim=1)
 int_table = ti.types.ndarray(dtype=ti.i32, ndim=2)
+int_list = ti.types.ndarray(dtype=ti.i32, ndim=1)
+float_list = ti.types.ndarray(dtype=ti.f32, ndim=1)
 word_list = ti.types.ndarray(dtype=ti.u32, ndim=1)
-
-
-@ti.func
-def integer(x):
-    """A whole number out of a table of floats (exact below 2^24)."""
-    return ti.cast(x, ti.i32)
-
-
-@ti.func
-def map_point(primitives: ti.template(), k, row, p):
-    """Rows `row` to `row + 2` of primitive k, an affine map, on a point."""
-    q = vec4(p, 1.0)
-    return vec3(primitives[k, row].dot(q), primitives[k, row + 1].dot(q), primitives[k, row + 2].dot(q))
-
-
-@ti.func
-def map_direction(primitives: ti.template(), k, row, d):
-    """The linear part of the same map on a direction."""
-    q = vec4(d, 0.0)
-    return vec3(primitives[k, row].dot(q), primitives[k, row + 1].dot(q), primitives[k, row + 2].dot(q))
-
-
-@ti.func
-def reciprocal(d):
-    """1 / d with axis-parallel components kept finite."""
-    inverse = vec3(0.0)
-    for i in ti.static(range(3)):
-        inverse[i] = 1.0 / ti.select(ti.abs(d[i]) < 1e-9, ti.select(d[i] < 0, -1e-9, 1e-9), d[i])
-    return inverse
-
-
-@ti.func
-def slab(o, inverse, lower, upper):
-    """Entry and exit of a ray through an axis-aligned box."""
-    a = (lower - o) * inverse
-    b = (upper - o) * inverse
-    return ti.min(a, b).max(), ti.max(a, b).min()
-
-
-@ti.func
-def rounded_distance(p, shape):
-    """Signed distance to a box of half sizes shape.xyz with edges of radius shape.w."""
-    q = ti.abs(p) - (shape.xyz - shape.w)
-    return ti.max(q, 0.0).norm() + ti.min(q.max(), 0.0) - shape.w
-
-
-@ti.func
-def intersect(kind, shape, o, d):
-    """Smallest positive ray parameter at which a local ray enters the unit shape, FAR if it does not."""
-    t = FAR
-    if kind == BOX:
-        near, far = slab(o, reciprocal(d), vec3(-1.0), vec3(1.0))
-        if 0.0 < near < far:
-            t = near
-    elif kind == SPHERE:
-        a, b, c = d.dot(d), o.dot(d), o.dot(o) - 1.0
-        root = b * b - a * c
-        if root > 0.0:
-            near = (-b - ti.sqrt(root)) / a
-            if near > 0.0:
-                t = near
-    elif kind == FRUSTUM:
-        radius, slope = shape.x + shape.y * o.z, shape.y * d.z
-        a = d.xy.dot(d.xy) - slope * slope
-        b = o.xy.dot(d.xy) - slope * radius
-        c = o.xy.dot(o.xy) - radius * radius
-        root = b * b - a * c
-        if root > 0.0 and ti.abs(a) > 1e-12:
-            for sign in range(2):
-                s = (-b + (2.0 * sign - 1.0) * ti.sqrt(root)) / a
-                z = o.z + s * d.z
-                if 0.0 < s < t and ti.abs(z) <= 1.0 and shape.x + shape.y * z > 0.0:
-                    t = s
-        if ti.abs(d.z) > 1e-9:
-            z = -tm.sign(d.z)
-            s = (z - o.z) / d.z
-            reach = shape.x + shape.y * z
-            if 0.0 < s < t and (o.xy + s * d.xy).norm() <= reach:
-                t = s
-    else:
-        near, far = slab(o, reciprocal(d), -shape.xyz, shape.xyz)
-        if near < far and far > 0.0 and rounded_distance(o, shape) > 0.0:
-            s = ti.max(near, 0.0)
-            for _ in range(MARCH_STEPS):
-                step = rounded_distance(o + s * d, shape)
-                s += step
-                if step < 1e-4 or s > far:
-                    break
-            if s < far:
-                t = s
-    return t
 
 
 @ti.func
 def trace(primitives: ti.template(), nodes: ti.template(), o, d, limit, shadow: ti.template()):
     """First primitive along a ray of unit direction within `limit` metres: (primitive or -1, distance).
 
-    shadow: any hit will do, and shining surfaces let the ray pass, as they are no obstacles for their own light.
+    shadow: any hit will do, and shining surfaces let the ray pass: they are no obstacle for their own light.
     """
     inverse = reciprocal(d)
     hit, best = -1, limit
@@ -148,114 +70,6 @@ def trace(primitives: ti.template(), nodes: ti.template(), o, d, limit, shadow: 
         else:
             node = integer(nodes[node, 2].x)
     return hit, best
-
-
-@ti.func
-def inside(kind, shape, p):
-    """Whether a local point lies in the unit shape."""
-    result = False
-    if kind == BOX:
-        result = ti.abs(p).max() < 1.0
-    elif kind == SPHERE:
-        result = p.norm() < 1.0
-    elif kind == FRUSTUM:
-        result = ti.abs(p.z) < 1.0 and p.xy.norm() < shape.x + shape.y * p.z
-    else:
-        result = rounded_distance(p, shape) < 0.0
-    return result
-
-
-@ti.func
-def chart(kind, shape, p):
-    """Of a local surface point: (face, u, v, local normal)."""
-    face, u, v, n = 0, 0.0, 0.0, vec3(0.0, 0.0, 1.0)
-    if kind == SPHERE:
-        n = p.normalized()
-        u = ti.atan2(n.y, n.x) / (2.0 * tm.pi) + 0.5
-        v = ti.acos(tm.clamp(n.z, -1.0, 1.0)) / tm.pi
-    elif kind == FRUSTUM:
-        across = p.xy.norm()
-        if ti.abs(p.z) > 1.0 - 1e-4 and across < shape.x + shape.y * p.z - 1e-5:
-            up = tm.sign(p.z)
-            face = ti.select(p.z > 0, 1, 2)
-            reach = shape.x + shape.y * up
-            u, v, n = 0.5 + 0.5 * p.x / reach, 0.5 - 0.5 * up * p.y / reach, vec3(0.0, 0.0, up)
-        else:
-            u = ti.atan2(p.y, p.x) / (2.0 * tm.pi) + 0.5
-            v = 0.5 - 0.5 * p.z
-            n = vec3(p.xy / ti.max(across, 1e-9), -shape.y)
-    else:
-        half, q, size = vec3(1.0), p, ti.abs(p)
-        if kind == ROUNDED:
-            half = shape.xyz
-            core = half - shape.w
-            n = (p - tm.clamp(p, -core, core)).normalized()
-            size = ti.abs(n)
-            q = p - n * shape.w + n * (shape.w / size.max())
-        axis = ti.select(size.x >= size.y and size.x >= size.z, 0, ti.select(size.y >= size.z, 1, 2))
-        side = 1.0
-        if axis == 0:
-            side = tm.sign(p.x)
-            u, v = 0.5 + 0.5 * side * q.y / half.y, 0.5 - 0.5 * q.z / half.z
-        elif axis == 1:
-            side = tm.sign(p.y)
-            u, v = 0.5 - 0.5 * side * q.x / half.x, 0.5 - 0.5 * q.z / half.z
-        else:
-            side = tm.sign(p.z)
-            u, v = 0.5 + 0.5 * side * q.x / half.x, 0.5 - 0.5 * q.y / half.y
-        face = 2 * axis + ti.select(side > 0, 0, 1)
-        if kind == BOX:
-            n = vec3(0.0)
-            n[axis] = side
-    return face, u, v, n
-
-
-@ti.func
-def surface_point(kind, shape, face, u, v):
-    """Inverse of `chart`: (local point, local normal) of (u, v) on a face."""
-    p, n = vec3(0.0), vec3(0.0, 0.0, 1.0)
-    if kind == SPHERE:
-        angle, polar = (u - 0.5) * 2.0 * tm.pi, v * tm.pi
-        p = vec3(ti.cos(angle) * ti.sin(polar), ti.sin(angle) * ti.sin(polar), ti.cos(polar))
-        n = p
-    elif kind == FRUSTUM:
-        if face == 0:
-            angle, z = (u - 0.5) * 2.0 * tm.pi, 1.0 - 2.0 * v
-            around = vec2(ti.cos(angle), ti.sin(angle))
-            p = vec3((shape.x + shape.y * z) * around, z)
-            n = vec3(around, -shape.y)
-        else:
-            up = ti.select(face == 1, 1.0, -1.0)
-            reach = shape.x + shape.y * up
-            p = vec3(reach * (2.0 * u - 1.0), reach * (1.0 - 2.0 * v) * up, up)
-            n = vec3(0.0, 0.0, up)
-    else:
-        half = ti.select(kind == ROUNDED, shape.xyz, vec3(1.0))
-        axis = face // 2
-        side = ti.select(face % 2 == 0, 1.0, -1.0)
-        a, b = 2.0 * u - 1.0, 1.0 - 2.0 * v
-        if axis == 0:
-            p = vec3(side, side * a, b)
-        elif axis == 1:
-            p = vec3(-side * a, side, b)
-        else:
-            p = vec3(side * a, b, side)
-        p *= half
-        n = vec3(0.0)
-        n[axis] = side
-        if kind == ROUNDED:
-            core = half - shape.w
-            inner = tm.clamp(p, -core, core)
-            n = (p - inner).normalized()
-            p = inner + n * shape.w
-    return p, n
-
-
-@ti.func
-def world_normal(primitives: ti.template(), k, n):
-    """Local to world for normals: the transpose of the world-to-local map."""
-    w = n.x * primitives[k, 0].xyz + n.y * primitives[k, 1].xyz + n.z * primitives[k, 2].xyz
-    return w.normalized()
 
 
 @ti.func
@@ -308,7 +122,7 @@ def sample_light(light: ti.template(), start, nu, nv, u, v, around):
 def sunlight(primitives: ti.template(), nodes: ti.template(), sun: ti.template(), p, n):
     """Direct sun on a surface point; zero unless the way to the sun goes through the window.
 
-    sun: rows direction to the sun, colour, lower corner and upper corner of the window in its plane x = const.
+    sun: rows direction to the sun, colour, lower and upper corner of the window in its plane x = const.
     """
     result = vec3(0.0)
     facing = n.dot(sun[0])
@@ -335,7 +149,10 @@ def shade(
     spread,
     seen,
 ):
-    """Radiance that leaves primitive k at world point p. spread: width of the ray there [m]. seen: show light sources."""
+    """Radiance that leaves primitive k at world point p.
+
+    spread: width of the ray there [m]. seen: whether light sources show.
+    """
     kind = integer(primitives[k, 7].x)
     face, u, v, n = chart(kind, primitives[k, 6], map_point(primitives, k, 0, p))
     patch = integer(primitives[k, 7].y) + face
@@ -369,7 +186,7 @@ def random_pair(seed):
 
 @ti.func
 def texel_surface(primitives: ti.template(), patches: ti.template(), owner: ti.template(), texel, place):
-    """World point and normal of a light-map texel, at one of nine places in it: 0 is its middle, the others lie around."""
+    """World point and normal of a light-map texel, at one of nine places in it: 0 is its middle."""
     k, face, patch = owner[texel, 0], owner[texel, 1], owner[texel, 2]
     about = patches[patch, 3]
     cell, nu, nv = texel - integer(about.x), integer(about.y), integer(about.z)
@@ -407,11 +224,11 @@ def find_open_places(
     owner: int_table,  # (N, 3)
     lower: vec3,
     upper: vec3,
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,), written
+    places: int_list,  # (N,), written
 ):
-    """Where in each texel its light is measured: the first place that is not inside another primitive, -1 where all are.
+    """Where in each texel its light is measured: the first place that is not inside another primitive.
 
-    Texels outside the box of interest get -1 too.
+    It is -1 where all are, and for texels outside the box from `lower` to `upper`.
     """
     for texel in range(places.shape[0]):
         found = -1
@@ -434,12 +251,15 @@ def bake_direct(
     nodes: vec4_table,
     patches: vec4_table,
     owner: int_table,
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,), of `find_open_places`
+    places: int_list,  # (N,), of `find_open_places`
     lights: vec3_table,  # (L, 5)
     side: ti.i32,
     light: vec3_list,  # (N,), written
 ):
-    """Light that the area lights send to each texel, over pi: what a white surface shows. side^2 stratified shadow rays each."""
+    """Light that the area lights send to each texel, over pi: what a white surface shows.
+
+    side^2 shadow rays go to strata of each light.
+    """
     for texel in range(light.shape[0]):
         total = vec3(0.0)
         if places[texel] >= 0:
@@ -473,13 +293,13 @@ def gather_rays(
     primitives: vec4_table,
     patches: vec4_table,
     owner: int_table,
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    places: int_list,
     side: ti.i32,
     sample: ti.i32,
     origins: vec3_list,  # (N,), written
     directions: vec3_list,  # (N,), written; zero for texels without a place
 ):
-    """One ray from each texel: number `sample` of side^2 that are distributed over the hemisphere as the cosine."""
+    """One ray from each texel: number `sample` of side^2 that follow the cosine over the hemisphere."""
     for texel in range(origins.shape[0]):
         directions[texel] = vec3(0.0)
         if places[texel] >= 0:
@@ -522,7 +342,7 @@ def radiance(
     width: ti.f32,  # of the rays at a distance of 1 m: the texture detail that they take in
     seen: ti.i32,  # whether they see the light sources themselves
     colour: vec3_list,  # (R,), written: linear, not exposed
-    distance: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (R,), written; 0 where nothing is hit
+    distance: float_list,  # (R,), written; 0 where nothing is hit
 ):
     """What comes along each ray."""
     for i in range(directions.shape[0]):

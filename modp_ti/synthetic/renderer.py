@@ -21,7 +21,7 @@ GATHER_SIDES = (
 )  # of each bounce: 16, then 49 rays over the hemisphere; only the last one is seen directly
 GATHER_WIDTH = 0.3  # such few rays see a blurred world
 
-# The centre, then four positions on a rotated grid: every row and column of a 5x5 raster of the pixel has one.
+# The centre, then four positions on a rotated grid: each row and column of a 5x5 raster of the pixel has one.
 SAMPLES = ((0.5, 0.5), (0.3, 0.1), (0.9, 0.3), (0.1, 0.7), (0.7, 0.9))
 BRIGHTEST = 4.0  # a sample counts at most this much, lest one in five frays an edge before the sky
 
@@ -39,7 +39,10 @@ class RoomRenderer:
     def render(
         self, camera: PinholeCamera, T_camera_world: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Image (H, W, 3) float32 RGB in [0, 1] and depth (H, W) float32: z in the camera frame at pixel centres, metres."""
+        """Image (H, W, 3) float32 RGB in [0, 1], and depth (H, W) float32.
+
+        Depth is z in the camera frame at the pixel centres, in metres.
+        """
         shape = camera.height, camera.width
         rotation = T_camera_world[:3, :3].T
         centre = (-rotation @ T_camera_world[:3, 3]).astype(np.float32).reshape(1, 3)
@@ -61,7 +64,7 @@ class RoomRenderer:
 
 
 def bake_light(arrays: SceneArrays, sun: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Light map (N, 3): what a white surface shows under the area lights and the light that other surfaces reflect.
+    """Light map (N, 3): what a white surface shows under the area lights and what other surfaces reflect.
 
     Direct sunlight has sharp edges and is left to the frames; reflected once, it is in the map.
     """
@@ -73,7 +76,8 @@ def bake_light(arrays: SceneArrays, sun: NDArray[np.float32]) -> NDArray[np.floa
     raytracer.bake_direct(
         a.primitives, a.nodes, a.patches, a.texel_owner, places, a.lights, SHADOW_SIDE, direct
     )
-    light = _smoothed(a, direct, places >= 0)
+    direct = _smoothed(a, direct, places >= 0, 0.7)
+    light = direct
     origins, directions = np.zeros_like(direct), np.zeros_like(direct)
     for side in GATHER_SIDES:
         gathered = np.zeros_like(direct)
@@ -82,7 +86,7 @@ def bake_light(arrays: SceneArrays, sun: NDArray[np.float32]) -> NDArray[np.floa
                 a.primitives, a.patches, a.texel_owner, places, side, sample, origins, directions
             )
             gathered += _radiance(a, light, sun, origins, directions, GATHER_WIDTH, seen=False)[0]
-        light = _smoothed(a, direct + gathered / (side * side), places >= 0)
+        light = direct + _smoothed(a, gathered / (side * side), places >= 0, 1.5)
     return light
 
 
@@ -111,11 +115,11 @@ def _developed(exposed: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _smoothed(
-    arrays: SceneArrays, light: NDArray[np.float32], measured: NDArray[np.bool_]
+    arrays: SceneArrays, light: NDArray[np.float32], measured: NDArray[np.bool_], blur: float
 ) -> NDArray[np.float32]:
-    """The sampling noise blurred within each patch; hidden texels take the light of the nearest measured ones.
+    """The light with its sampling noise blurred within each patch, by `blur` texels.
 
-    They would darken the edges of what hides them otherwise.
+    Hidden texels take the light of the nearest measured ones: they would darken the edges of what hides them.
     """
     result = light.copy()
     for start, nu, nv, _ in arrays.patches[:, 3].astype(int):
@@ -125,7 +129,7 @@ def _smoothed(
             continue
         patch = light[cells].reshape(nv, nu, 3) * known[..., None]
         blurred, missing = np.zeros_like(patch), np.ones((nv, nu), bool)
-        for sigma in (0.8, 2.0, 5.0, 50.0):
+        for sigma in (blur, 2 * blur, 5.0, 50.0):
             weight = cv2.GaussianBlur(known, (0, 0), sigma)
             total = cv2.GaussianBlur(patch, (0, 0), sigma)
             found = missing & (weight > 0.02)

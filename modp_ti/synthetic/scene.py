@@ -7,9 +7,9 @@ A primitive is an affine image of a unit shape, so that one table row holds it w
     FRUSTUM  -1 <= z <= 1 with radius a + b z: (a, b) in the shape row; a cylinder where b = 0
     ROUNDED  a box of half sizes h with edges of radius r: (h, r) in the shape row, the map rigid
 
-Its surface is cut into patches, each with coordinates (u, v) in [0, 1]^2, u to the right and v downwards as seen from outside:
-six faces (+x -x +y -y +z -z) for the boxes, one for the sphere, and side, top, bottom for the frustum. A patch carries a
-material and a rectangle of the light map (`lightmap.py`). Lengths are metres, z points up.
+Its surface is cut into patches with coordinates (u, v) in [0, 1]^2, u to the right and v down as seen from
+outside: six faces (+x -x +y -y +z -z) of a box, one of a sphere, and side, top, bottom of a frustum. A patch
+carries a material and a rectangle of the light map. Lengths are metres, z points up.
 """
 
 from __future__ import annotations
@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 __all__ = ["BOX", "FRUSTUM", "ROUNDED", "SPHERE", "Light", "Material", "Scene", "SceneArrays", "rotation"]
 
 BOX, SPHERE, FRUSTUM, ROUNDED = 0, 1, 2, 3
-BOX_FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
-FACES = {BOX: BOX_FACES, SPHERE: ("all",), FRUSTUM: ("side", "top", "bottom"), ROUNDED: BOX_FACES}
 
 MAX_MIP_LEVELS = 12
 LEAF_SIZE = 2
@@ -38,9 +36,10 @@ Vector = Sequence[float]
 class Material:
     """How a patch looks.
 
-    texture: name in the scene's textures. repeat: (width, height) of one repetition in metres, or None to stretch the
-    texture over the patch once. offset: shift in repetitions. turned: the texture lies on its side. tint: factor on the
-    linear colour. emission: 0 for a lit surface; otherwise the patch shows its colour times this, whatever the light.
+    texture: name in the scene's textures. repeat: (width, height) of one repetition in metres, or None
+    to stretch the texture over the patch once. offset: shift in repetitions. turned: it lies on its side.
+    tint: factor on the linear colour. emission: 0 for a lit surface; otherwise the patch shows its colour
+    times this.
     """
 
     texture: str
@@ -55,7 +54,7 @@ class Material:
 class Light:
     """An area light: points centre + s * edge_u + t * edge_v, s and t in [-1, 1].
 
-    normal: the side that shines, or zero for a light that shines everywhere alike. radiance: times area is the power.
+    normal: the side that shines, or zero for a light that shines everywhere alike. radiance: RGB.
     """
 
     centre: Vector
@@ -67,27 +66,29 @@ class Light:
 
 @dataclass(frozen=True)
 class SceneArrays:
-    """What the kernels read. P primitives, M nodes, K patches, T textures, L lights, N light-map texels.
+    """What the kernels read. P primitives, M nodes, K patches, N light-map texels, T textures, L lights.
 
     Whole numbers stand among the floats of a row; all are below 2^24, hence exact.
+
+    primitives: (P, 8, 4), three rows world to local, three rows local to world, the shape, and (kind, first
+    patch, 1 where it shines, unused).
+    nodes: (M, 3, 4), (lower corner, first primitive), (upper corner, number of primitives), (node to go to
+    when this one is missed, unused).
+    patches: (K, 4, 4), two rows from (u, v, 1) to repetitions of the texture, the first one ending with
+    texels per metre, then (tint, emission), then (first light-map texel, columns, rows, texture).
+    texel_owner: (N, 3), primitive, face and patch of a light-map texel.
+    texels: all mip levels of all textures, 8 bits a channel, as the square root of the linear colour.
+    textures: (T, 3 + MAX_MIP_LEVELS), width, height, number of levels, start of each level.
+    lights: (L, 5, 3), centre, edge_u, edge_v, normal, radiance.
     """
 
-    primitives: NDArray[
-        np.float32
-    ]  # (P, 8, 4): world to local, local to world (3 rows each), shape, (kind, first patch, shines)
-    nodes: NDArray[
-        np.float32
-    ]  # (M, 3, 4): (lower corner, first primitive), (upper corner, their number), (node when missed)
-    patches: NDArray[
-        np.float32
-    ]  # (K, 4, 4): texture affine (2 rows, row 0 ends with texels per metre), (tint, emission),
-    # (first light-map texel, its columns, its rows, texture)
-    texel_owner: NDArray[np.int32]  # (N, 3): primitive, face, patch
-    texels: NDArray[
-        np.uint32
-    ]  # all mip levels of all textures, 8 bits a channel, square root of the linear colour
-    textures: NDArray[np.int32]  # (T, 3 + MAX_MIP_LEVELS): width, height, levels, start of each level
-    lights: NDArray[np.float32]  # (L, 5, 3): centre, edge_u, edge_v, normal, radiance
+    primitives: NDArray[np.float32]
+    nodes: NDArray[np.float32]
+    patches: NDArray[np.float32]
+    texel_owner: NDArray[np.int32]
+    texels: NDArray[np.uint32]
+    textures: NDArray[np.int32]
+    lights: NDArray[np.float32]
 
 
 def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> NDArray[np.float64]:
@@ -149,7 +150,10 @@ class _Primitive:
 
 @dataclass
 class Scene:
-    """Collects primitives and lights; `arrays` turns them into tables. `textures` maps a name to (H, W, 3) uint8 sRGB."""
+    """Collects primitives and lights; `arrays` turns them into tables.
+
+    textures: (H, W, 3) uint8 sRGB images by name.
+    """
 
     textures: Mapping[str, NDArray[np.uint8]]
     lights: list[Light] = field(default_factory=list)
@@ -158,7 +162,7 @@ class Scene:
 
     @contextmanager
     def placed(self, at: Vector, turn: NDArray[np.float64] | float = 0.0) -> Iterator[None]:
-        """Within this block, positions are relative to `at` (x, y, z), turned by a matrix or by degrees about z."""
+        """Within this block, positions are relative to `at`, turned by a matrix or by degrees about z."""
         outer = self._frame
         linear = turn if isinstance(turn, np.ndarray) else rotation(turn)
         self._frame = outer @ _affine(linear, at)
@@ -175,7 +179,7 @@ class Scene:
         turn: NDArray[np.float64] | float = 0.0,
         **faces: Material,
     ) -> None:
-        """A box centred on `at` with edge lengths `size`. Faces by name (x1 = +x, x0 = -x, ...) override the material."""
+        """A box centred on `at` with edge lengths `size`; x1=... dresses its +x face, x0=... of -x."""
         self._add(BOX, at, np.diag(np.asarray(size, float) / 2), turn, (0, 0, 0, 0), _pick(material, faces))
 
     def rounded(
@@ -210,7 +214,7 @@ class Scene:
         top_radius: float | None = None,
         top: Material | None = None,
     ) -> None:
-        """A cylinder centred on `at` along its z axis, or a frustum where `top_radius` differs from `radius`."""
+        """A cylinder centred on `at` along its z axis, or a frustum where `top_radius` is another."""
         upper = 1.0 if top_radius is None else top_radius / radius
         shape = ((1 + upper) / 2, (upper - 1) / 2, 0.0, 0.0)
         materials = [material, top or material, material]
@@ -304,8 +308,9 @@ def _look(material: Material, width: float, height: float, texture: NDArray[np.i
 
 
 def _hierarchy(boxes: NDArray[np.float64]) -> tuple[NDArray[np.float32], list[int]]:
-    """Bounding-volume hierarchy over (P, 2, 3) boxes, depth first, each node with the node to go to when it is missed.
+    """Bounding-volume hierarchy over (P, 2, 3) boxes, depth first.
 
+    Each node knows the node to go to when it is missed, so that a loop without a stack walks the tree.
     Returns the table of nodes (M, 3, 4) and the order of the primitives in the leaves.
     """
     centres = boxes.mean(axis=1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.synthetic.camera_path import camera_path
-from modp_ti.synthetic.renderer import LIGHT_TEXEL, RoomRenderer
+from modp_ti.synthetic.renderer import RoomRenderer
 
 __all__ = ["FRAMES", "SMALLEST", "SyntheticTracker", "TrackerNoise"]
 
@@ -31,8 +31,8 @@ class TrackerNoise:
     """Errors of the simulated tracker, all Gaussian standard deviations.
 
     pixel: of each observation [px]. depth: of each point along its first viewing ray, relative to its depth.
-    translation: of the pose, relative to the scene's depth; rotation: of the pose [degrees]. Pose errors drift: they are
-    correlated over `drift` frames.
+    translation: of the pose, relative to the scene's depth; rotation: of the pose [degrees]. Pose errors
+    drift: they are correlated over `drift` frames, 0 for independent ones.
     """
 
     pixel: float = 0.3
@@ -50,13 +50,14 @@ class TrackerNoise:
 class SyntheticTracker:
     """Frames of the demo room with tracked poses and points, rendered as they are asked for.
 
-    Iterating yields `fields.tracked_frame.TrackedFrame` in order, the same ones each time. Taichi must be initialised
-    before. Poses and points are in units of `metres_per_unit` metres, as a monocular tracker's scale is arbitrary; ground
-    truth and depth are in metres. Points are anchored to the noisy pose of the frame that saw them first, as a tracker's are.
+    Iterating yields `fields.tracked_frame.TrackedFrame` in order, the same ones each time. Taichi must be
+    initialised before. Poses and points are in units of `metres_per_unit` metres, as a monocular tracker's
+    scale is arbitrary; ground truth and depth are in metres. A point is placed by the noisy pose of the frame
+    that saw it first, as a tracker's points are.
 
-    width, height: image size [px]. frames: number of views along the whole path. select: which of them are delivered.
-    holdout: frames whose index among the delivered ones is a multiple of it are held out, 0 for none. points: wanted
-    number in view. texel: light-map resolution [m].
+    width, height: image size [px]. frames: number of views along the whole path. select: which of them are
+    delivered. holdout: frames whose index among the delivered ones is a multiple of it are held out, 0 for
+    none. points: wanted number in view. room: one that is built already; otherwise the first frame builds it.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class SyntheticTracker:
         noise: TrackerNoise | None = None,
         metres_per_unit: float = 1.0,
         seed: int = 0,
-        texel: float = LIGHT_TEXEL,
+        room: RoomRenderer | None = None,
     ) -> None:
         if min(width, height) < SMALLEST:
             raise ValueError(f"frames must be at least {SMALLEST} pixels wide and high, got {width}x{height}")
@@ -86,14 +87,13 @@ class SyntheticTracker:
         self._fps = fps
         self._wanted = points
         self._seed = seed
-        self._texel = texel
         self._positions = range(frames)[select]
         if not self._positions:
             raise ValueError(f"{select} leaves none of the {frames} frames of the demo room")
         path = camera_path(frames)
         self._truth = [path[k] for k in self._positions]
         self._tracked = self._noisy_poses()
-        self._room: RoomRenderer | None = None
+        self._room = room
 
     def __len__(self) -> int:
         return len(self._truth)
@@ -103,7 +103,7 @@ class SyntheticTracker:
         """What a person should know about this input."""
         c = self.camera
         return [
-            f"embedded demo room, {len(self)} frames of {c.width}x{c.height} rendered on the fly, simulated tracker"
+            f"embedded demo room: {len(self)} frames of {c.width}x{c.height}, rendered as they are asked for"
         ]
 
     def ground_truth(self) -> list[NDArray[np.float64]]:
@@ -156,7 +156,7 @@ class SyntheticTracker:
 
     def _render(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         if self._room is None:
-            self._room = RoomRenderer(self._texel)
+            self._room = RoomRenderer()
         return self._room.render(self.camera, self._truth[index])
 
     def _noisy_poses(self) -> list[NDArray[np.float64]]:
@@ -180,7 +180,7 @@ class SyntheticTracker:
     def _observe(
         self, known: _Landmarks, index: int, grey: NDArray[np.float32], depth: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Which landmarks this frame sees, and where: in the image, not occluded, looking as they did at first."""
+        """Which landmarks this frame sees, and where: in the image, not occluded, looking as at first."""
         nothing = np.zeros(0, np.int64), np.zeros((0, 2))
         if len(known.truth) == 0:
             return nothing
@@ -208,8 +208,11 @@ class SyntheticTracker:
         taken: NDArray[np.float64],
         wanted: int,
     ) -> _Landmarks:
-        """Corners of this frame away from the points in view, lifted to 3D; not on depth edges, where a corner is no place."""
-        spacing = max(3.0, 0.6 * np.sqrt(grey.size / self._wanted))
+        """Corners of this frame away from the points in view, lifted to 3D.
+
+        None lies on an edge of depth: such a corner is no place in space.
+        """
+        spacing = max(3.0, 0.5 * np.sqrt(grey.size / self._wanted))
         usable = np.zeros(grey.shape, np.uint8)
         border = PATCH + 2
         usable[border:-border, border:-border] = 255
@@ -217,8 +220,8 @@ class SyntheticTracker:
         usable[cv2.dilate(depth, around) > 1.05 * cv2.erode(depth, around)] = 0
         usable[depth <= 0] = 0
         for x, y in taken:
-            cv2.circle(usable, (int(x), int(y)), int(round(spacing)), 0, -1)
-        corners = cv2.goodFeaturesToTrack(grey, wanted, 0.003, spacing, mask=usable, blockSize=5)
+            cv2.circle(usable, (int(x), int(y)), round(float(spacing)), 0, -1)
+        corners = cv2.goodFeaturesToTrack(grey, wanted, 0.002, spacing, mask=usable, blockSize=5)
         if corners is None:
             return _Landmarks.empty()
         column, row = np.rint(corners.reshape(-1, 2)).astype(int).T

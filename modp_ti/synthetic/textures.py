@@ -1,13 +1,17 @@
 """Procedural surfaces of the demo room: wood, brick, plaster, cloth, leaf and so on, as (H, W, 3) uint8 sRGB.
 
-The functions take a random generator; sizes are in metres where a surface has one, so that the detail is life-size.
+The functions take a random generator. Sizes are in metres where a surface has one: detail is life-size.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from modp_ti.synthetic.drawing import polygon
 from modp_ti.synthetic.noise import (
     Colour,
     Floats,
@@ -45,7 +49,7 @@ __all__ = [
 
 def _grain(rng: np.random.Generator, shape: tuple[int, int], rings: float) -> Floats:
     """Wood grain along x in about [-1, 1]: warped year rings and fine pores."""
-    x, y = grid(shape, (shape[1], shape[0]))
+    _x, y = grid(shape, (shape[1], shape[0]))
     warp = fractal(rng, shape, (shape[0] / 3, shape[1] / 2), 3)
     ring = np.sin((y / shape[0] + 0.09 * warp) * rings * 2 * np.pi)
     pores = smooth_noise(rng, shape, (1.0, 28.0))
@@ -65,7 +69,7 @@ def wood_floor(rng: np.random.Generator, width: float, height: float, texel: flo
     rows = round(height / 0.13)
     edges = np.linspace(0, shape[0], rows + 1).round().astype(int)
     light, dark = np.array([196, 152, 104]), np.array([120, 80, 48])
-    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+    for top, bottom in pairwise(edges):
         start = -rng.integers(0, round(0.9 / texel))
         while start < shape[1]:
             end = start + round(rng.uniform(0.9, 1.7) / texel)
@@ -135,15 +139,16 @@ def wallpaper(rng: np.random.Generator, size: int = 512) -> Image:
     image = filled(shape, (58, 84, 80)) * (1 + 0.03 * fractal(rng, shape, 60, 4))[..., None]
     inks = [(92, 124, 104), (122, 146, 112), (78, 112, 106), (156, 160, 120)]
 
-    def everywhere(draw: object, points: np.ndarray, colour: Colour) -> None:
-        """Draw at all nine shifts, so that motifs cross the border."""
-        for dx in (-size, 0, size):
-            for dy in (-size, 0, size):
-                p = np.rint((points + [dx, dy]) * 16).astype(np.int32)
-                if draw == "fill":
-                    cv2.fillPoly(image, [p], colour, cv2.LINE_AA, 4)
-                else:
-                    cv2.polylines(image, [p], False, colour, 2, cv2.LINE_AA, 4)
+    shifts = [np.array([dx, dy]) for dx in (-size, 0, size) for dy in (-size, 0, size)]
+
+    def fill(outline: NDArray[np.float64], colour: Colour) -> None:
+        for shift in shifts:  # all nine, so that twigs cross the border
+            polygon(image, outline + shift, colour)
+
+    def line(path: NDArray[np.float64], colour: Colour) -> None:
+        for shift in shifts:
+            points = np.rint((path + shift) * 16).astype(np.int32)
+            cv2.polylines(image, [points], False, tuple(colour), 2, cv2.LINE_AA, 4)
 
     s = np.linspace(0, 1, 14)
     for k in range(26):
@@ -153,25 +158,21 @@ def wallpaper(rng: np.random.Generator, size: int = 512) -> Image:
         angles = heading + bend * s
         path = base + np.cumsum(np.stack([np.cos(angles), np.sin(angles)], axis=1), axis=0) * length / len(s)
         ink = inks[k % len(inks)]
-        everywhere("line", path, tuple(0.8 * c for c in ink))
+        line(path, tuple(0.8 * c for c in ink))
         for n in range(2, 14, 3):
             for side in (-1, 1):
                 a = angles[n] + side * 0.85
                 long, wide = 30 * (1 - 0.45 * s[n]), 7.0
                 forward, across = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
-                outline = [
-                    path[n] + forward * long * t + across * wide * np.sin(np.pi * t) * e
-                    for e, ts in ((1, s), (-1, s[::-1]))
-                    for t in ts
-                ]
-                everywhere("fill", np.array(outline), ink)
-                everywhere(
-                    "line", path[n] + forward * np.outer([0, 0.9], [long]), tuple(0.72 * c for c in ink)
-                )
+                bulge = np.sin(np.pi * s)[:, None] * across * wide
+                spine = path[n] + np.outer(s, forward * long)
+                outline = np.concatenate([spine + bulge, (spine - bulge)[::-1]])
+                fill(outline, ink)
+                line(path[n] + np.outer([0, 0.9], forward * long), tuple(0.72 * c for c in ink))
         for _ in range(3):
             spot = path[-1] + rng.uniform(-14, 14, 2)
             ring = spot + 3.6 * np.stack([np.cos(2 * np.pi * s), np.sin(2 * np.pi * s)], axis=1)
-            everywhere("fill", ring, (196, 120, 88))
+            fill(ring, (196, 120, 88))
     return finish(image)
 
 
@@ -348,7 +349,7 @@ def leaf(rng: np.random.Generator, size: int = 192) -> Image:
 
 def pleats(rng: np.random.Generator, colour: Colour, count: int = 36, size: int = 256) -> Image:
     """Folded cloth or paper, folds along y; repeats across."""
-    x, y = grid((size, size), (count, 1.0))
+    x, _y = grid((size, size), (count, 1.0))
     tone = 0.86 + 0.14 * np.sin(2 * np.pi * x) + 0.03 * smooth_noise(rng, (size, size), (2, 30))
     return finish(filled((size, size), colour) * tone[..., None])
 

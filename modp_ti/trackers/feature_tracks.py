@@ -17,10 +17,10 @@ def feature_tracks(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """View, feature and track number, (M,) each, of every feature that belongs to a track.
 
-    pixels: (N, 2) per view. matches: (view a, view b, their matches). The clearest matches are joined first, and one
-    that would put two places of a view into one track is left out: it is wrong, or one before it was, and the
-    clearer is the better guess. SIFT gives a place several features where its direction is unclear; they count as
-    the first of them.
+    pixels: (N, 2) per view. matches: (view a, view b, their matches). The clearest matches are joined first,
+    and one that would put two places of a view into one track is left out: it is wrong, or one before it was,
+    and the clearer is the better guess. SIFT gives a place several features where its direction is unclear;
+    they count as the first of them.
     """
     offset = np.concatenate([[0], np.cumsum([len(each) for each in pixels])]).astype(np.int64)
     place = np.arange(offset[-1])

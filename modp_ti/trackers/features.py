@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 __all__ = ["Features", "Matches", "detect_features", "essential_matrix", "match_features"]
 
 MAX_SIDE = 1000
-MAX_FEATURES = 3000
+MAX_FEATURES = 2000
 RATIO = 0.8
 CONTRAST = 0.02
 
@@ -36,8 +36,8 @@ class Features:
 class Matches:
     """Features of two views that look alike.
 
-    pairs: (M, 2) int64, their numbers in both. ratio: (M,) squared distance of their descriptors over that to the
-    second best: the smaller, the clearer.
+    pairs: (M, 2) int64, their numbers in both. ratio: (M,) squared distance of their descriptors over that to
+    the second best: the smaller, the clearer.
     """
 
     pairs: NDArray[np.int64]

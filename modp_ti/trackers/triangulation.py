@@ -18,7 +18,7 @@ __all__ = ["Observations", "neighbouring_views", "solve_points", "triangulated_f
 
 # Pairs of views that are matched: these many frames apart, and as many of the nearest others by pose. The
 # growing gaps give parallax where the frames are those of a video.
-GAPS = (1, 2, 3, 5, 8)
+GAPS = (1, 2, 3, 5)
 NEIGHBOURS = 2
 MAX_TURN = 45.0  # degrees between the optical axes of views that are matched
 
@@ -77,7 +77,8 @@ def triangulated_frames(
 
     poses = np.stack([frame.T_camera_world for frame in frames])
     pairs = neighbouring_views(poses)
-    sigma = np.array([each.pixel / frame.undistorter.raw.focal for frame, each in zip(frames, features, strict=True)])
+    focal = np.array([frame.undistorter.raw.focal for frame in frames])
+    sigma = np.array([each.pixel for each in features]) / focal
     matches = []
     for done, (a, b) in enumerate(pairs):
         descriptors = features[a].descriptors, features[b].descriptors

@@ -19,9 +19,6 @@ from modp_ti.trackers.replay import PosedImage, ReplayedTracker
 from modp_ti.trackers.transforms import open_transforms
 
 
-FOX = range(22, 44)
-
-
 def reprojection_errors(frame: PosedImage) -> NDArray[np.float64]:
     """In pixels of the stored image."""
     T, camera = frame.T_camera_world, frame.undistorter.camera
@@ -62,17 +59,16 @@ def test_frames_of_redkitchen_without_pose_are_counted_and_keep_their_times(shar
 
 @pytest.fixture(scope="module")
 def fox_transforms() -> ReplayedTracker:
-    """The hardest part: the widest gaps between the views."""
     data = Path(__file__).resolve().parents[4] / "shared" / "data" / "fox"
     if not data.is_dir():
         pytest.skip("no ../shared/data/fox")
-    source = SourceSettings(path=data / "images", scale=0.25, holdout=8, start=FOX.start, stop=FOX.stop)
+    source = SourceSettings(path=data / "images", scale=0.25, holdout=8)
     return open_transforms(source, TrackerSettings(kind="transforms"))
 
 
 def test_fox_lists_seventeen_frames_without_image(fox_transforms):
     assert fox_transforms.notes == ["17 frames of transforms.json have no image file: skipped"]
-    assert len(fox_transforms) == len(FOX)
+    assert len(fox_transforms) == 50
 
 
 def test_fox_is_triangulated_densely_and_exactly(fox_transforms):
@@ -84,8 +80,7 @@ def test_fox_is_triangulated_densely_and_exactly(fox_transforms):
 
 def test_fox_poses_and_depths_of_both_files_agree(shared_data, fox_transforms):
     data = shared_data("fox")
-    source = SourceSettings(path=data / "images", scale=0.25, start=FOX.start, stop=FOX.stop)
-    colmap = open_colmap(source, TrackerSettings(kind="colmap"))
+    colmap = open_colmap(SourceSettings(path=data / "images", scale=0.25), TrackerSettings(kind="colmap"))
     assert [f.name for f in colmap.frames] == [f.name for f in fox_transforms.frames]
 
     # The worlds differ by a similarity: relative rotations do not depend on it.
@@ -109,6 +104,6 @@ def test_fox_poses_and_depths_of_both_files_agree(shared_data, fox_transforms):
         depth = [f.points.xyz @ f.T_camera_world[2, :3] + f.T_camera_world[2, 3] for f in (ours, theirs)]
         ratios.append(depth[0][close] / (scale * depth[1][same[close]]))
     deviation = np.abs(np.concatenate(ratios) - 1)
-    assert len(deviation) > 2_000
+    assert len(deviation) > 10_000
     assert np.median(deviation) < 0.01
     assert np.percentile(deviation, 98) < 0.1

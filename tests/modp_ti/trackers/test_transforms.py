@@ -259,6 +259,12 @@ def test_points_named_but_not_there_are_triangulated_with_a_note(plane_scene):
     assert len(tracker.frames[3].points) >= 100
 
 
+def test_of_a_single_image_there_are_no_points(plane_scene):
+    plane_scene.write_transforms()
+    (frame,) = opened(plane_scene, start=3, stop=4)
+    assert len(frame.points) == 0
+
+
 def test_held_out_images_do_not_decide_where_a_point_lies(plane_scene):
     plane_scene.write_transforms()
     before = opened(plane_scene, holdout=3)

@@ -49,8 +49,8 @@ def test_noise_of_half_a_pixel_moves_points_by_as_much_as_theory_says(poses, poi
     noise = np.random.default_rng(1).normal(scale=0.5 * SIGMA, size=seen.rays.shape)
     xyz, _ = solve_points(poses, Observations(seen.frame, seen.point, seen.rays + noise, seen.sigma), ALL)
     assert len(xyz) >= 0.95 * POINTS
-    # across: half a pixel at distance 5, six times: 0.5 * 5 / 500 / sqrt(6) = 0.002; along the rays, which are
-    # up to 20 degrees apart, some eight times that
+    # across: half a pixel at distance 5, six times: 0.5 * 5 / 500 / sqrt(6) = 0.002; along the rays, which
+    # are up to 20 degrees apart, some eight times that
     error = np.linalg.norm(xyz[:, None] - points, axis=2).min(axis=1)
     assert 0.002 < np.median(error) < 0.02
 
@@ -89,6 +89,12 @@ def test_points_without_parallax_or_behind_the_cameras_are_left_out(poses):
     assert len(solve_points(poses, behind, ALL)[0]) == 0
 
 
+def test_cameras_that_only_turn_give_no_points(poses, points):
+    poses[:, :3, 3] = 0
+    xyz, kept = solve_points(poses, observed(poses, np.add(points, (0, 0, 5))), ALL)
+    assert len(xyz) == len(kept) == 0
+
+
 def test_views_that_do_not_solve_are_only_told_what_they_see(poses, points):
     seen = observed(poses, points)
     rays = seen.rays.copy()
@@ -115,7 +121,7 @@ def test_views_are_paired_in_growing_gaps_and_with_those_that_come_back():
     T = np.tile(np.eye(4), (40, 1, 1))
     T[:, 0, 3] = -np.r_[np.arange(20), np.arange(20)[::-1] + 0.25]  # there and back
     pairs = neighbouring_views(T)
-    assert {(0, 1), (0, 2), (0, 3), (0, 5), (0, 8)} <= set(pairs)
+    assert {(0, 1), (0, 2), (0, 3), (0, 5)} <= set(pairs)
     assert (2, 37) in pairs, "frame 37 is back at the place of frame 2"
     assert all(a < b for a, b in pairs) and len(set(pairs)) == len(pairs)
     T[20:, :3, :3] = np.diag([-1, 1, -1])  # looking away on the way back

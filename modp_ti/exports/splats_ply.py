@@ -1,0 +1,97 @@
+"""`splats.ply`: the Gaussians in the layout of 3DGS, as every splat viewer reads it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.errors import InputError
+
+__all__ = ["read_splats", "write_splats"]
+
+# The pixel footprint that the map was optimised with; a renderer must use the same to show the same picture.
+COMMENT = "rendered with 0.3 px^2 blur and mip-splatting opacity compensation (antialiased)"
+
+
+def _names(sh_count: int) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(3 * (sh_count - 1))]
+    return [
+        *"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity",
+        "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+    ]  # fmt: skip
+
+
+def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> None:
+    """Write Gaussians as `GaussianField.to_numpy` gives them. The file appears whole or not at all.
+
+    Opacity as its logit, scale as its logarithm, quaternion with w first, `f_rest` with all of red first; all values as
+    they are, so that the file read back renders bit for bit alike.
+    """
+    n, sh_count, _ = state["sh"].shape
+    table = np.concatenate(
+        [
+            state["position"],
+            np.zeros((n, 3)),
+            state["sh"][:, 0],
+            state["sh"][:, 1:].transpose(0, 2, 1).reshape(n, -1),
+            state["opacity_logit"][:, None],
+            state["log_scale"],
+            state["quaternion"],
+        ],
+        axis=1,
+    ).astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}", f"element vertex {n}"]
+    header += [f"property float {name}" for name in _names(sh_count)]
+    target = Path(path)
+    partial = target.with_name(target.name + ".partial")
+    with partial.open("wb") as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        file.write(table.tobytes())
+    os.replace(partial, target)
+
+
+def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
+    """Gaussians of a 3DGS PLY file, as `GaussianField.load` takes them. Properties may come in any order.
+
+    Raises InputError (one line) for a file that is none, is cut short or lacks a property.
+    """
+    file = Path(path)
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from None
+    head, end, body = data.partition(b"end_header\n")
+    lines = head.decode("ascii", errors="replace").split("\n")
+    if lines[0].strip() != "ply" or not end or "format binary_little_endian 1.0" not in lines:
+        raise InputError(f"{file}: not a binary little-endian PLY file, which 3DGS splats are")
+    properties = [line.split() for line in lines if line.startswith("property")]
+    if any(p[1] not in ("float", "float32") for p in properties):
+        raise InputError(f"{file}: all properties of 3DGS splats are float")
+    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex")), 0)
+    names = [p[-1] for p in properties]
+    if len(body) < 4 * count * len(names):
+        raise InputError(f"{file}: cut short, {count} Gaussians are announced and fewer are there")
+    table = np.frombuffer(body, dtype="<f4", count=count * len(names)).reshape(count, len(names))
+    column = {name: i for i, name in enumerate(names)}
+    rest = sum(name.startswith("f_rest_") for name in names)
+    missing = [name for name in _names(1 + rest // 3) if name not in column and not name.startswith("n")]
+    if missing or 1 + rest // 3 not in (1, 4, 9, 16):
+        raise InputError(f"{file}: not 3DGS splats; {missing[0] if missing else f'{rest} f_rest'} does not fit")
+
+    def columns(*wanted: str) -> NDArray[np.float32]:
+        return np.ascontiguousarray(table[:, [column[name] for name in wanted]])
+
+    sh = np.empty((count, 1 + rest // 3, 3), dtype=np.float32)
+    sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
+    if rest:
+        sh[:, 1:] = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, -1).transpose(0, 2, 1)
+    return {
+        "position": columns("x", "y", "z"),
+        "log_scale": columns("scale_0", "scale_1", "scale_2"),
+        "quaternion": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        "opacity_logit": columns("opacity")[:, 0],
+        "sh": sh,
+    }

@@ -1,0 +1,86 @@
+"""The live line of a run: frames, keyframes, Gaussians, PSNR, frames per second."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pipelines.mapping import FrameReport
+
+__all__ = ["ProgressLine"]
+
+
+class ProgressLine:
+    """Shows what a run is at, on one line of `console`; on a console that is no terminal only the results."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self._progress: Progress | None = None
+        self._task = None
+        self._state = ""
+
+    @contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Show that something of unknown length is going on."""
+        with self.console.status(what):
+            yield
+
+    def prepare(self, what: str, done: int, total: int) -> None:
+        """Show a tracker's preparation; the Progress callback of trackers."""
+        if self._progress is None:
+            self._begin(what, total)
+        self._progress.update(self._task, description=what, completed=done, total=total)
+        if done >= total:
+            self.stop()
+
+    def start_mapping(self, frames: int | None) -> None:
+        self._begin("mapping", frames)
+
+    def frame(self, report: FrameReport | None) -> None:
+        """Show a frame that is done; None for one that is held out."""
+        if report is not None:
+            psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
+            self._state = f"{report.keyframes} keyframes  {report.gaussians:,} Gaussians{psnr}"
+        task = self._progress.tasks[0]
+        speed = f"  {task.speed:.2f} frames/s" if task.speed else ""
+        self._progress.update(self._task, advance=1, state=self._state + speed)
+
+    def start_refining(self, steps: int) -> None:
+        self._begin("refining", steps)
+
+    def refined(self, step: int, psnr: float) -> None:
+        self._progress.update(self._task, completed=step, state=f"{psnr:.2f} dB")
+
+    def stop(self) -> None:
+        """End the line, leaving its last state on the screen."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def summary(self, metrics: dict) -> None:
+        """Say in one line what the run came to."""
+        scores = metrics["refined"] or metrics["online"]
+        which = "held_out" if scores["held_out"]["count"] else "all"
+        self.console.print(
+            f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {metrics['gaussians']:,} Gaussians, "
+            f"{metrics['frames_per_second']:.2f} frames/s; {which.replace('_', '-')} PSNR {scores[which]['psnr']:.2f} dB, "
+            f"SSIM {scores[which]['ssim']:.3f}",
+            highlight=False,
+        )
+
+    def _begin(self, what: str, total: int | None) -> None:
+        self.stop()
+        self._state = ""
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[state]}"),
+            console=self.console,
+        )
+        self._task = self._progress.add_task(what, total=total, state="")
+        self._progress.start()

@@ -1,0 +1,209 @@
+"""One run: frames from the tracker through the mapper to the files of the output folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from fields.backend import initialise
+from fields.tracked_frame import TrackedFrame
+from modp_ti.config import SceneConfig, dump_scene
+from modp_ti.errors import InputError
+from modp_ti.evaluation import Scores, absolute_trajectory_error, score_frame
+from modp_ti.exports.splats_ply import read_splats, write_splats
+from modp_ti.exports.trajectory import write_trajectory
+from modp_ti.progress import ProgressLine
+from modp_ti.trackers import Tracker, frame_count, open_tracker
+from pipelines.mapping import OnlineMapper
+from pipelines.refinement import refine
+
+__all__ = ["run_scene"]
+
+STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
+# Frames that evaluation holds in memory at a time, to load each version of the map once for all of them.
+EVALUATED_TOGETHER = 32
+
+
+@dataclass
+class Poses:
+    """What is kept of every frame: its time and poses."""
+
+    index: list[int] = field(default_factory=list)
+    timestamp: list[float] = field(default_factory=list)
+    tracked: list[NDArray[np.float64]] = field(default_factory=list)
+
+    def add(self, frame: TrackedFrame) -> None:
+        self.index.append(frame.index)
+        self.timestamp.append(frame.timestamp)
+        self.tracked.append(frame.T_camera_world)
+
+
+def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
+    """Map the scene of `config` and write its output folder, which is returned.
+
+    Nothing is written before the map is finished; the files then appear together. Raises InputError for input that
+    cannot be used.
+    """
+    started = time.perf_counter()
+    console = console or Console(quiet=True)
+    try:
+        backend = initialise(config.device, config.threads, config.seed)
+    except RuntimeError as error:
+        raise InputError(str(error)) from None
+    line = ProgressLine(console)
+    tick = time.perf_counter()
+    tracker = open_tracker(config, line.prepare)
+    frames = iter(tracker)
+    first = next(frames, None)
+    if first is None:
+        raise InputError("the tracker delivered no frame: nothing to map")
+    prepared = time.perf_counter() - tick
+    for note in tracker.notes:
+        console.print(f"note: {note}", highlight=False)
+
+    mapper = OnlineMapper(config.mapping, first.camera.width, first.camera.height, config.seed)
+    watch = mapper.stopwatch
+    watch.seconds["track"] = prepared
+    with line.working("compiling kernels (the first time on this machine takes longest)"):
+        mapper.compile()
+
+    poses = Poses()
+    tick = time.perf_counter()
+    line.start_mapping(frame_count(tracker))
+    for frame in _chain(first, _timed(frames, watch)):
+        if (frame.camera.width, frame.camera.height) != (first.camera.width, first.camera.height):
+            raise InputError(
+                f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
+                f"{first.camera.width}x{first.camera.height}: all images of a scene must have one size"
+            )
+        poses.add(frame)
+        line.frame(None if frame.held_out else mapper.process(frame))
+    mapper.finish()
+    online_seconds = time.perf_counter() - tick
+    line.stop()
+    if len(mapper.keyframes) == 0:
+        raise InputError(
+            f"no frame became a keyframe: none has {config.mapping.keyframes.min_points} tracked points; "
+            "give a tracker with points or lower mapping.keyframes.min_points"
+        )
+
+    online = mapper.gaussians.to_numpy()
+    if config.refine.steps:
+        line.start_refining(config.refine.steps)
+        refine(mapper, config.refine, line.refined)
+        line.stop()
+
+    trajectory = [mapper.keyframes.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)]
+    staging = config.output.with_name(config.output.name + ".partial")
+    shutil.rmtree(staging, ignore_errors=True)
+    try:
+        (staging / "renders").mkdir(parents=True)
+        write_splats(staging / "splats.ply", mapper.gaussians.to_numpy())
+        write_trajectory(staging / "trajectory.txt", poses.timestamp, trajectory)
+        states = {"online": online}
+        if config.refine.steps:
+            states["refined"] = read_splats(staging / "splats.ply")
+        with watch.measure("evaluate"), line.working("evaluating the saved map"):
+            scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders")
+        truth = getattr(tracker, "ground_truth", list)()
+        metrics = {
+            "frames": len(poses.index),
+            "keyframes": len(mapper.keyframes),
+            "gaussians": len(mapper.gaussians),
+            "backend": backend,
+            "seed": config.seed,
+            "frames_per_second": round(len(poses.index) / online_seconds, 4),
+            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "online": scores["online"],
+            "refined": scores.get("refined"),
+            "seconds": _seconds(watch.seconds, time.perf_counter() - started),
+            "ate_rmse": round(absolute_trajectory_error(trajectory, truth), 6) if len(truth) else None,
+        }
+        (staging / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        _publish(staging, config)
+    except OSError as error:
+        raise InputError(f"{config.output}: cannot be written: {error.strerror}") from None
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    line.summary(metrics)
+    return config.output
+
+
+def _timed(frames: Iterator[TrackedFrame], watch) -> Iterator[TrackedFrame]:
+    """The frames, the time that each takes to come counted as reading."""
+    while True:
+        with watch.measure("read"):
+            frame = next(frames, None)
+        if frame is None:
+            return
+        yield frame
+
+
+def _chain(first: TrackedFrame, rest: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
+    yield first
+    yield from rest
+
+
+def _evaluate(
+    mapper: OnlineMapper,
+    tracker: Tracker,
+    trajectory: list[NDArray[np.float64]],
+    states: dict[str, dict[str, NDArray]],
+    renders: Path,
+) -> dict[str, dict]:
+    """Scores of every version of the map by name; pictures of the held-out frames from the last version.
+
+    The last version stays in `mapper.gaussians`.
+    """
+    near = mapper.settings.near * mapper.keyframes.scene_depth
+    sets = {name: {"all": Scores(), "held_out": Scores()} for name in states}
+    last = list(states)[-1]
+    frames = iter(tracker)
+    while batch := list(islice(frames, EVALUATED_TOGETHER)):
+        for name, state in states.items():
+            mapper.gaussians.load(state)
+            for frame in batch:
+                psnr, ssim, render = score_frame(
+                    mapper.renderer, mapper.optimiser.loss, frame, trajectory[frame.index], near
+                )
+                sets[name]["all"].add(psnr, ssim)
+                if frame.held_out:
+                    sets[name]["held_out"].add(psnr, ssim)
+                    if name == last:
+                        _write_pair(renders / f"{frame.index:06d}.png", frame.image, render)
+    return {name: {key: scores.summary() for key, scores in of.items()} for name, of in sets.items()}
+
+
+def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
+    """A PNG with the frame on the left and the render on the right."""
+    pair = np.hstack([image, render])
+    cv2.imwrite(str(path), np.round(pair[..., ::-1] * 255.0).astype(np.uint8))
+
+
+def _seconds(stages: dict[str, float], total: float) -> dict[str, float]:
+    """Seconds of each stage of metrics.json, and what is left of the total."""
+    seconds = {"total": round(total, 3)}
+    seconds |= {stage: round(stages.get(stage, 0.0), 3) for stage in STAGES}
+    seconds["other"] = round(total - sum(stages.get(stage, 0.0) for stage in STAGES), 3)
+    return seconds
+
+
+def _publish(staging: Path, config: SceneConfig) -> None:
+    """Move the finished files into the output folder, over those of an earlier run."""
+    config.output.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(config.output / "renders", ignore_errors=True)
+    for item in staging.iterdir():
+        os.replace(item, config.output / item.name)
+    dump_scene(config, config.output / "config.yaml")
