@@ -47,9 +47,7 @@ class PinholeCamera:
     def project(self, points_camera: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pixels (N, 2) as (x, y) of camera-frame points (N, 3) with z > 0."""
         p = np.asarray(points_camera, dtype=np.float64)
-        return np.stack(
-            [self.fx * p[:, 0] / p[:, 2] + self.cx, self.fy * p[:, 1] / p[:, 2] + self.cy], axis=1
-        )
+        return np.stack([self.fx * p[:, 0] / p[:, 2] + self.cx, self.fy * p[:, 1] / p[:, 2] + self.cy], axis=1)
 
     def unproject(self, pixels: NDArray[np.floating], depth: NDArray[np.floating]) -> NDArray[np.float64]:
         """Camera-frame points (N, 3) of pixels (N, 2) as (x, y) at depth z (N,)."""

@@ -86,7 +86,7 @@ class GaussianField:
         for array, shape, name in zip(arrays, shapes, _NAMES, strict=True):
             if array.shape != shape:
                 raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-            bad = ~np.isfinite(array.reshape(n, -1)).all(axis=1)
+            bad = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
             if bad.any():
                 raise ValueError(f"Gaussian {int(np.argmax(bad))}: {name} is not finite")
         zero = np.linalg.norm(arrays[2], axis=1) < 1e-12

@@ -138,9 +138,7 @@ class ImageBuffers:
         return out
 
     @ti.kernel
-    def _set_reference(
-        self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)
-    ):
+    def _set_reference(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):
         for y in range(height):
             row = (y + PAD) * self.stride + PAD
             for x in range(width):

@@ -1,4 +1,4 @@
-"""`OccupancyVoxels`: the paper's Multi-level Occupancy Hash Voxels (MOHV, Section 3.2.3) as a sparse SNode hierarchy."""
+"""`OccupancyVoxels`: the Multi-level Occupancy Hash Voxels (MOHV, Section 3.2.3) as a sparse SNode hierarchy."""
 
 import numpy as np
 import taichi as ti
@@ -27,7 +27,11 @@ class OccupancyVoxels:
     """
 
     def __init__(
-        self, coarsest: float = 1.0, levels: int = 8, resolution: int = 512, origin: ArrayLike = (0.0, 0.0, 0.0)
+        self,
+        coarsest: float = 1.0,
+        levels: int = 8,
+        resolution: int = 512,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         if levels < 1 or resolution << (levels - 1) > SIDE:
             raise ValueError(
@@ -60,7 +64,7 @@ class OccupancyVoxels:
         return np.clip(level, 0, self.levels - 1).astype(np.int32)
 
     def query(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:
-        """Whether each position (N, 3) is occupied at its target size (N,) or (): the AND from the coarsest level down."""
+        """Whether each position (N, 3) is occupied at its target size (N,) or (): AND from the coarsest level."""
         cells, level = self._cells(position, size)
         out = np.zeros(len(cells), dtype=np.uint8)
         if len(cells):
@@ -104,32 +108,27 @@ class OccupancyVoxels:
         return cells, np.minimum(level, self.levels - 1 - beyond).astype(np.int32)
 
     @ti.kernel
-    def _query(
-        self, cells: ti.types.ndarray(ndim=2), level: ti.types.ndarray(ndim=1), out: ti.types.ndarray(ndim=1)
-    ):
+    def _query(self, cells: ti.types.ndarray(ndim=2), level: ti.types.ndarray(ndim=1), out: ti.types.ndarray(ndim=1)):
         for i in range(level.shape[0]):
             # Beyond even the coarsest extent nothing can be told apart: such a place is never free.
             hit = 1
-            for l in ti.static(range(self.levels)):
-                if l <= level[i]:
-                    c = self._at(cells, i, l)
-                    if self.occupied[l][c] == 0:
+            for k in ti.static(range(self.levels)):
+                if k <= level[i]:
+                    if self.occupied[k][self._at(cells, i, k)] == 0:
                         hit = 0
             out[i] = ti.cast(hit, ti.u8)
 
     @ti.kernel
     def _update(self, cells: ti.types.ndarray(ndim=2), level: ti.types.ndarray(ndim=1)):
-        # One thread: nested pointers activated by two threads at once crashed (Taichi 1.7.4). A batch is a few thousand.
+        # One thread: nested pointers activated by two at once crashed (Taichi 1.7.4). A batch is a few thousand.
         ti.loop_config(serialize=True)
         for i in range(level.shape[0]):
-            for l in ti.static(range(self.levels)):
-                if l <= level[i]:
-                    self.occupied[l][self._at(cells, i, l)] = ti.u8(1)
+            for k in ti.static(range(self.levels)):
+                if k <= level[i]:
+                    self.occupied[k][self._at(cells, i, k)] = ti.u8(1)
 
     @ti.func
-    def _at(self, cells: ti.template(), i, l: ti.template()):
-        """Index of point i's cell in level l's sparse grid, its origin in the middle."""
-        shift = ti.static(self.levels - 1 - l)
-        return ti.Vector(
-            [ti.cast((cells[i, k] >> shift) + SIDE // 2, ti.i32) for k in ti.static(range(3))]
-        )
+    def _at(self, cells: ti.template(), i, level: ti.template()):
+        """Index of point i's cell in a level's sparse grid, its origin in the middle."""
+        shift = ti.static(self.levels - 1 - level)
+        return ti.Vector([ti.cast((cells[i, k] >> shift) + SIDE // 2, ti.i32) for k in ti.static(range(3))])

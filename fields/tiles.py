@@ -1,5 +1,6 @@
 """`TilePairs`: which Gaussians reach which tile of the image, nearest first."""
 
+import numpy as np
 import taichi as ti
 
 __all__ = ["TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
@@ -21,7 +22,9 @@ class TilePairs:
     `position[first_pair[s] + k]` is the place of slot s's k-th pair.
     """
 
-    def __init__(self, builder: ti.FieldsBuilder, max_tiles: int, chunks: int, max_pairs: int = 1 << 27, real=ti.f32) -> None:
+    def __init__(
+        self, builder: ti.FieldsBuilder, max_tiles: int, chunks: int, max_pairs: int = 1 << 27, real=ti.f32
+    ) -> None:
         self.max_tiles = max_tiles
         self.max_pairs = max_pairs
         self.count = 0
@@ -41,3 +44,15 @@ class TilePairs:
         blocks.dense(ti.i, BLOCK).place(self.slot, self.rows)
         blocks.dense(ti.i, BLOCK).place(self.position)
         blocks.dense(ti.i, BLOCK).place(self.gradient)
+
+    def rows_to_numpy(self) -> np.ndarray:
+        """`rows` of all pairs (count,) int32, in the order of the lists."""
+        out = np.zeros(self.count, dtype=np.int32)
+        if self.count:
+            self._read_rows(out)
+        return out
+
+    @ti.kernel
+    def _read_rows(self, out: ti.types.ndarray()):
+        for i in range(out.shape[0]):
+            out[i] = self.rows[i]

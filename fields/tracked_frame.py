@@ -66,7 +66,8 @@ class TrackedFrame:
         expected = (self.camera.height, self.camera.width)
         if self.image.shape != (*expected, 3) or self.image.dtype != np.float32:
             raise ValueError(
-                f"{self.name}: image is {self.image.shape} {self.image.dtype}, the camera asks for {(*expected, 3)} float32"
+                f"{self.name}: image is {self.image.shape} {self.image.dtype}, "
+                f"the camera asks for {(*expected, 3)} float32"
             )
         if self.mask is not None and self.mask.shape != expected:
             raise ValueError(f"{self.name}: mask is {self.mask.shape}, the image {expected}")

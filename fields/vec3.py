@@ -11,11 +11,13 @@ __all__ = ["cross", "dot", "rotate", "rotate_back"]
 
 @ti.func
 def dot(a, b):
+    """Inner product of two 3-vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @ti.func
 def cross(a, b):
+    """Cross product of two 3-vectors."""
     return ti.Vector([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 

@@ -30,9 +30,7 @@ class ViewField:
         self.limits = ti.Vector.field(4, real)
         self.near = ti.field(real)
         self.size = ti.Vector.field(2, ti.i32)
-        builder.place(
-            self.rotation, self.translation, self.focal, self.centre, self.limits, self.near, self.size
-        )
+        builder.place(self.rotation, self.translation, self.focal, self.centre, self.limits, self.near, self.size)
         self.width = 0
         self.height = 0
 

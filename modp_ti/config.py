@@ -75,9 +75,7 @@ class SceneConfig(StrictModel):
     source: SourceSettings = SourceSettings()
     tracker: TrackerSettings
     output: Path = Field(description="folder of the results, made where it is missing")
-    device: Literal["cpu", "cuda", "auto"] = Field(
-        "auto", description="`auto` takes CUDA where there is a GPU"
-    )
+    device: Literal["cpu", "cuda", "auto"] = Field("auto", description="`auto` takes CUDA where there is a GPU")
     seed: int = Field(0, ge=0, description="seed of all randomness")
     threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
     mapping: MappingSettings = MappingSettings()
@@ -355,9 +353,7 @@ def _nearest(place: str, prefix: str, model: type[BaseModel], whole_key: str | N
     if in_section:
         found = prefix + in_section[0]
         if whole_key is not None and whole_key != place:  # the wrong part is a section: name the key below it
-            below = difflib.get_close_matches(
-                whole_key, [k for k in every if k.startswith(found)], n=1, cutoff=0
-            )
+            below = difflib.get_close_matches(whole_key, [k for k in every if k.startswith(found)], n=1, cutoff=0)
             found = below[0] if below else found
     elif same_leaf:
         found = same_leaf[0]
@@ -384,9 +380,7 @@ def markdown_of_keys() -> str:
         text += ["", f"## {f'`{section}`' if section else 'Top level'}", ""]
         text += ["| key | type | default | meaning |", "|---|---|---|---|"]
         for entry in entries:
-            default = (
-                "required" if entry.default is None else f"`{entry.default}`" if entry.default else "empty"
-            )
+            default = "required" if entry.default is None else f"`{entry.default}`" if entry.default else "empty"
             cells = [f"`{entry.key}`", entry.type, default, entry.description]
             text.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(text) + "\n"

@@ -38,7 +38,11 @@ class Scores:
 
 
 def score_frame(
-    renderer: Renderer, loss: PhotometricLoss, frame: TrackedFrame, T_camera_world: NDArray[np.float64], near: float
+    renderer: Renderer,
+    loss: PhotometricLoss,
+    frame: TrackedFrame,
+    T_camera_world: NDArray[np.float64],
+    near: float,
 ) -> tuple[float, float, NDArray[np.float32]]:
     """(PSNR, SSIM, render (H, W, 3)) of `frame` seen from T_camera_world (4, 4).
 
@@ -54,7 +58,7 @@ def score_frame(
 def umeyama(
     source: NDArray[np.float64], target: NDArray[np.float64], with_scale: bool = True
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Scale s, rotation R (3, 3) and translation t (3,) with least sum of |s R source + t - target|^2 [Umeyama 1991]."""
+    """Scale s, rotation R (3, 3), translation t (3,) of least |s R source + t - target|^2 [Umeyama 1991]."""
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     a, b = source - mean_source, target - mean_target
     U, singular, Vt = np.linalg.svd(b.T @ a)

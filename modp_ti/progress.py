@@ -66,9 +66,10 @@ class ProgressLine:
         which = "held_out" if scores["held_out"]["count"] else "all"
         self.console.print(
             f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {metrics['gaussians']:,} Gaussians, "
-            f"{metrics['frames_per_second']:.2f} frames/s; {which.replace('_', '-')} PSNR {scores[which]['psnr']:.2f} dB, "
-            f"SSIM {scores[which]['ssim']:.3f}",
+            f"{metrics['frames_per_second']:.2f} frames/s; {which.replace('_', '-')} "
+            f"PSNR {scores[which]['psnr']:.2f} dB, SSIM {scores[which]['ssim']:.3f}",
             highlight=False,
+            soft_wrap=True,
         )
 
     def _begin(self, what: str, total: int | None) -> None:

@@ -18,9 +18,7 @@ def run(
     scene: Annotated[Path, typer.Argument(help="scene file (YAML); its paths are relative to it")],
     set_: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="overrides a key, for example --set source.scale=0.5"
-        ),
+        typer.Option("--set", metavar="KEY=VALUE", help="overrides a key, for example --set source.scale=0.5"),
     ] = None,
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:

@@ -71,7 +71,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         raise InputError("the tracker delivered no frame: nothing to map")
     prepared = time.perf_counter() - tick
     for note in tracker.notes:
-        console.print(f"note: {note}", highlight=False)
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
     mapper = OnlineMapper(config.mapping, first.camera.width, first.camera.height, config.seed)
     watch = mapper.stopwatch

@@ -31,9 +31,7 @@ ROW_BITS = TILE_WIDTH.bit_length() - 1
 class Compositing:
     """Composites `projected` by the lists in `pairs` into `images`, and takes gradients the other way."""
 
-    def __init__(
-        self, view: ViewField, projected: ProjectedGaussians, pairs: TilePairs, images: ImageBuffers
-    ) -> None:
+    def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: TilePairs, images: ImageBuffers) -> None:
         self.view = view
         self.projected = projected
         self.pairs = pairs
@@ -209,9 +207,7 @@ class Compositing:
                     g_xx += ux * dx
                     g_xy += ux * dy
                     g_yy += uy * dy
-                self.pairs.gradient[k] = ti.Vector(
-                    [g_red, g_green, g_blue, g_z, g_power, g_x, g_y, g_xx, g_xy, g_yy]
-                )
+                self.pairs.gradient[k] = ti.Vector([g_red, g_green, g_blue, g_z, g_power, g_x, g_y, g_xx, g_xy, g_yy])
             for k in range(first + reached, first + self.pairs.tile_count[tile]):
                 self.pairs.gradient[k].fill(0.0)
 

@@ -72,7 +72,7 @@ def error_pixels(
     settings: DensifySettings,
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """High error regions: pixel centres (N, 2) drawn without replacement where 1 - SSIM is high and no point is tracked.
+    """High error regions: pixel centres (N, 2), drawn where 1 - SSIM is high and no point is tracked.
 
     error: (H, W) 1 - SSIM of the map's render; None draws from all valid pixels (the warm-up).
     """
@@ -88,9 +88,7 @@ def error_pixels(
     return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
 
 
-def pixel_seeds(
-    view: Keyframe, pixels: NDArray[np.float64], estimator: DepthEstimator, max_deviation: float
-) -> Seeds:
+def pixel_seeds(view: Keyframe, pixels: NDArray[np.float64], estimator: DepthEstimator, max_deviation: float) -> Seeds:
     """Seeds at pixels (N, 2) whose depth the estimator knows well enough."""
     estimate = estimator.estimate(view, pixels)
     sure = estimate.deviation < max_deviation
@@ -107,7 +105,7 @@ def grow(
     target: float,
     settings: DensifySettings,
 ) -> int:
-    """Add isotropic Gaussians at the seeds that the voxels admit at the spacing `target` [scene units]; return how many."""
+    """Add isotropic Gaussians at the seeds that the voxels admit at spacing `target` [scene units]; return how many."""
     if voxels is not None:
         seeds = seeds[voxels.admit(seeds.xyz, target)]
     seeds = seeds[np.arange(len(seeds)) < gaussians.capacity - gaussians.count]

@@ -78,7 +78,7 @@ class GaussianProcessDepth:
         return max(n // self.FIT_POINTS, 1)
 
     def _fit(self, known: torch.Tensor, y: torch.Tensor) -> tuple[float, float, float]:
-        """(length scale, noise / signal, signal variance) of greatest marginal likelihood; the variance in closed form."""
+        """(length scale, noise / signal, signal variance) of greatest likelihood; the variance in closed form."""
         distance = torch.cdist(known, known)
         n = len(y)
         best = (-np.inf, self.LENGTHS[0], self.NOISE_RATIOS[0], 1.0)

@@ -41,7 +41,7 @@ class SeenPoints:
 
 
 def covisibility(a: SeenPoints, b: SeenPoints) -> float:
-    """Overlap of two views in [0, 1]: m / (m + only in a + only in b), m the mean number of one's points seen in the other.
+    """Overlap of two views in [0, 1]: m / (m + only in a + only in b), m the mean count of points seen in both.
 
     0.1 where either has no points.
     """

@@ -113,9 +113,7 @@ class Projection:
             counts[chunk] = seen
 
     @ti.kernel
-    def _compact(
-        self, n: ti.i32, depths: ti.types.ndarray(), first: ti.types.ndarray(), keys: ti.types.ndarray()
-    ):
+    def _compact(self, n: ti.i32, depths: ti.types.ndarray(), first: ti.types.ndarray(), keys: ti.types.ndarray()):
         ti.loop_config(block_dim=1)
         for chunk in range((n + CHUNK - 1) // CHUNK):
             slot = first[chunk]

@@ -20,7 +20,7 @@ __all__ = ["RenderedView", "Renderer"]
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A picture on the host: colour (H, W, 3) float32 not clipped, depth (H, W) as the weighted sum of z, opacity (H, W)."""
+    """A picture on the host: colour (H, W, 3) not clipped, depth (H, W) as the weighted sum of z, opacity (H, W)."""
 
     colour: np.ndarray
     depth: np.ndarray
@@ -81,6 +81,4 @@ class Renderer:
         self.images.background[None] = ti.Vector(background)
         self.forward(camera, T_camera_world, near)
         self.images.background[None] = ti.Vector((0.0, 0.0, 0.0))
-        return RenderedView(
-            self.images.colour_to_numpy(), self.images.depth_to_numpy(), self.images.opacity_to_numpy()
-        )
+        return RenderedView(self.images.colour_to_numpy(), self.images.depth_to_numpy(), self.images.opacity_to_numpy())

@@ -30,10 +30,20 @@ class StrictModel(BaseModel):
 class KeyframeSettings(StrictModel):
     """When a frame becomes a keyframe (Section 3.3.1)."""
 
-    covisibility: float = Field(0.95, ge=0, le=1, description="a frame that shares less with the last keyframe becomes one")
-    baseline: float = Field(0.05, gt=0, description="movement since the last keyframe, in its median depths, that makes one: an orbit keeps all points in view")
+    covisibility: float = Field(
+        0.95, ge=0, le=1, description="a frame that shares less with the last keyframe becomes one"
+    )
+    baseline: float = Field(
+        0.02,
+        gt=0,
+        description="movement since the last keyframe that makes one [its median depths]",
+    )
     max_gap: int = Field(5, ge=1, description="frames after which a keyframe is taken in any case (t_k)")
-    max_rotation: float = Field(10.0, gt=0, description="degrees since the last frame beyond which a frame of a video is blurred and no keyframe, unless max_gap is exceeded")
+    max_rotation: float = Field(
+        10.0,
+        gt=0,
+        description="degrees per frame beyond which a frame of a video counts as blurred, and is no keyframe",
+    )
     min_points: int = Field(10, ge=0, description="tracked points that a keyframe needs")
 
 
@@ -41,17 +51,29 @@ class DepthSettings(StrictModel):
     """Depth of pixels without a tracked point: Gaussian process on the log depths of the tracked points."""
 
     max_points: int = Field(500, ge=10, description="tracked points that condition the process, drawn at random beyond")
-    max_deviation: float = Field(0.06, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian")
+    max_deviation: float = Field(
+        0.06, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
+    )
 
 
 class DensifySettings(StrictModel):
     """Where new Gaussians go and how they begin (Section 3.2.2)."""
 
-    error_compensation: bool = Field(True, description="also add Gaussians at pixels of low SSIM, not only at tracked points")
-    pixels: int = Field(1600, ge=0, description="such pixels per keyframe of 640x480; other sizes by the power 3/4 of their area")
+    error_compensation: bool = Field(
+        True, description="also add Gaussians at pixels of low SSIM, not only at tracked points"
+    )
+    pixels: int = Field(
+        1600,
+        ge=0,
+        description="such pixels per keyframe of 640x480; other sizes by the power 3/4 of their area",
+    )
     dissimilarity: float = Field(0.08, ge=0, le=1, description="1 - SSIM from which a pixel is a candidate")
-    warm_up: int = Field(8, ge=0, description="frames at the start that take random pixels instead of those of low SSIM")
-    initial_scale: float = Field(0.5, gt=0, description="size of a new Gaussian in pixels of its view, before scale_offset")
+    warm_up: int = Field(
+        8, ge=0, description="frames at the start that take random pixels instead of those of low SSIM"
+    )
+    initial_scale: float = Field(
+        0.5, gt=0, description="size of a new Gaussian in pixels of its view, before scale_offset"
+    )
     scale_offset: float = Field(0.5, description="added to the log of that size (epsilon of Eq. 1)")
     initial_opacity: float = Field(0.5, gt=0, lt=1, description="opacity of a new Gaussian")
     prune_every: int = Field(100, ge=1, description="frames between removals of transparent Gaussians")
@@ -83,7 +105,9 @@ class PoseSettings(StrictModel):
 
     enabled: bool = Field(True, description="refine keyframe poses while mapping")
     steps: int = Field(8, ge=0, description="first steps of a keyframe that also refine poses")
-    learning_rate: float = Field(1e-5, ge=0, description="Adam step of rotation [rad] and of translation [scene depths]")
+    learning_rate: float = Field(
+        1e-5, ge=0, description="Adam step of rotation [rad] and of translation [scene depths]"
+    )
 
 
 class OptimiseSettings(StrictModel):
@@ -97,7 +121,9 @@ class OptimiseSettings(StrictModel):
     scale_rate: float = Field(3e-3, ge=0, description="Adam step of log-scales")
     rotation_rate: float = Field(1e-3, ge=0, description="Adam step of quaternions")
     opacity_rate: float = Field(0.05, ge=0, description="Adam step of opacity logits")
-    colour_rate: float = Field(2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth")
+    colour_rate: float = Field(
+        2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
+    )
 
 
 class MappingSettings(StrictModel):

@@ -58,9 +58,7 @@ class Distortion:
             ratio = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-12)
             return ratio * polynomial.polyval(theta * theta, (1.0, *self.numerator))
         r2 = r * r
-        return polynomial.polyval(r2, (1.0, *self.numerator)) / polynomial.polyval(
-            r2, (1.0, *self.denominator)
-        )
+        return polynomial.polyval(r2, (1.0, *self.numerator)) / polynomial.polyval(r2, (1.0, *self.denominator))
 
     def valid_radius(self, limit: float) -> float:
         """Radius of ideal coordinates up to which the radial part grows, at most `limit`.
@@ -87,9 +85,7 @@ class Distortion:
         valid = self.valid_radius(limit)
         r, distorted = self._radial_table(valid)
         radius = np.linalg.norm(points, axis=1)
-        ratio = np.divide(
-            np.interp(radius, distorted, r), radius, out=np.ones_like(radius), where=radius > 1e-12
-        )
+        ratio = np.divide(np.interp(radius, distorted, r), radius, out=np.ones_like(radius), where=radius > 1e-12)
         ideal = points * ratio[:, None]
         for _ in range(8):
             residual = self.distort(ideal) - points
@@ -112,9 +108,7 @@ class Distortion:
 NO_DISTORTION = Distortion()
 
 
-def colmap_intrinsics(
-    model: str, params: Sequence[float]
-) -> tuple[float, float, float, float, Distortion] | None:
+def colmap_intrinsics(model: str, params: Sequence[float]) -> tuple[float, float, float, float, Distortion] | None:
     """(fx, fy, cx, cy, distortion) of a COLMAP camera model; None for a model that is not supported."""
     p = [float(value) for value in params]
     one_focal = model in (

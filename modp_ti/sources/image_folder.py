@@ -119,9 +119,7 @@ class ImageFolder:
             raise self._unreadable(name, "the file is cut off")
         log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:  # silent: the one line that the user gets is ours
-            image = cv2.imdecode(
-                np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-            )
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         except cv2.error:
             image = None
         finally:
@@ -131,6 +129,4 @@ class ImageFolder:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def _unreadable(self, name: str, reason: str) -> InputError:
-        return InputError(
-            f"{self.path / name}: unreadable image: {reason}; replace it or take it out of the folder"
-        )
+        return InputError(f"{self.path / name}: unreadable image: {reason}; replace it or take it out of the folder")

@@ -25,15 +25,11 @@ class Undistorter:
     result.
     """
 
-    def __init__(
-        self, raw: PinholeCamera, distortion: Distortion = NO_DISTORTION, scale: float = 1.0
-    ) -> None:
+    def __init__(self, raw: PinholeCamera, distortion: Distortion = NO_DISTORTION, scale: float = 1.0) -> None:
         self.raw = raw
         self.distortion = distortion
         self.camera = raw.resized(max(1, round(raw.width * scale)), max(1, round(raw.height * scale)))
-        corners = np.array(
-            [[0, 0], [raw.width, 0], [0, raw.height], [raw.width, raw.height]], dtype=np.float64
-        )
+        corners = np.array([[0, 0], [raw.width, 0], [0, raw.height], [raw.width, raw.height]], dtype=np.float64)
         self._limit = SEARCH_MARGIN * float(np.linalg.norm(_normalised(raw, corners), axis=1).max())
 
     def points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -54,9 +50,7 @@ class Undistorter:
         import cv2
 
         if raw.shape != (self.raw.height, self.raw.width, 3) or raw.dtype != np.uint8:
-            raise ValueError(
-                f"image is {raw.shape} {raw.dtype}, the camera {self.raw.width}x{self.raw.height}"
-            )
+            raise ValueError(f"image is {raw.shape} {raw.dtype}, the camera {self.raw.width}x{self.raw.height}")
         size = (self.camera.width, self.camera.height)
         image = raw
         if size != (self.raw.width, self.raw.height):

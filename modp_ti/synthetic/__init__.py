@@ -30,6 +30,4 @@ def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> Syntheti
     select = slice(source.start, source.stop, source.step)
     if not range(FRAMES)[select]:
         raise InputError(f"source.start {source.start} lies behind the {FRAMES} frames of the demo room")
-    return SyntheticTracker(
-        width=width, height=height, select=select, holdout=source.holdout or 0, fps=source.fps
-    )
+    return SyntheticTracker(width=width, height=height, select=select, holdout=source.holdout or 0, fps=source.fps)

@@ -12,9 +12,7 @@ from modp_ti.synthetic.noise import Colour, Floats, blend
 __all__ = ["disc", "polygon", "text"]
 
 
-def text(
-    image: Floats, words: str, at: tuple[float, float], height: float, colour: Colour, thickness: int = 1
-) -> None:
+def text(image: Floats, words: str, at: tuple[float, float], height: float, colour: Colour, thickness: int = 1) -> None:
     """Letters of `height` pixels, their baseline starting at `at` (x, y)."""
     top = max(0, round(at[1] - 1.6 * height))
     line = image[top : round(at[1] + 0.6 * height)]

@@ -239,9 +239,7 @@ def curtain(s: Scene, width: float, height: float, folds: int) -> None:
         x = width * ((k + 0.5) / folds - 0.5)
         cloth = Material("curtain", (0.30, 0.6), offset=(0.37 * k, 0.21 * k))
         near = 0.012 * (-1) ** k
-        s.cylinder(
-            (x, near, height / 2), 0.62 * width / folds, height, cloth, top_radius=0.50 * width / folds
-        )
+        s.cylinder((x, near, height / 2), 0.62 * width / folds, height, cloth, top_radius=0.50 * width / folds)
 
 
 def floor_lamp(s: Scene) -> None:
@@ -262,9 +260,7 @@ def desk_lamp(s: Scene) -> None:
     s.cylinder((0, 0, 0.012), 0.075, 0.024, BLACK)
     s.rod((0, 0, 0.02), (-0.10, 0.02, 0.30), 0.008, BRASS)
     s.rod((-0.10, 0.02, 0.30), (0.10, 0.0, 0.46), 0.008, BRASS)
-    s.cylinder(
-        (0.12, 0, 0.42), 0.075, 0.11, Material("mustard", (0.3, 0.3)), rotation(0, 0, -25), top_radius=0.028
-    )
+    s.cylinder((0.12, 0, 0.42), 0.075, 0.11, Material("mustard", (0.3, 0.3)), rotation(0, 0, -25), top_radius=0.028)
 
 
 def laptop(s: Scene) -> None:
@@ -279,9 +275,7 @@ def laptop(s: Scene) -> None:
 
 def mug(s: Scene, glaze: str) -> None:
     """A mug of coffee with a handle."""
-    s.cylinder(
-        (0, 0, 0.045), 0.036, 0.09, Material(glaze, (0.11, 0.11)), top_radius=0.04, top=Material("coffee")
-    )
+    s.cylinder((0, 0, 0.045), 0.036, 0.09, Material(glaze, (0.11, 0.11)), top_radius=0.04, top=Material("coffee"))
     for a, b in (
         ((0.036, 0.072), (0.062, 0.066)),
         ((0.062, 0.066), (0.062, 0.034)),
@@ -312,9 +306,7 @@ def fruit_bowl(s: Scene) -> None:
     for k, (name, radius) in enumerate(fruit):
         a = 2 * np.pi * k / len(fruit)
         size = (radius, radius, radius * (1.25 if name == "lemon" else 0.95))
-        s.ellipsoid(
-            (0.082 * np.cos(a), 0.082 * np.sin(a), 0.088), size, Material(name), rotation(40 * k, 50 * k)
-        )
+        s.ellipsoid((0.082 * np.cos(a), 0.082 * np.sin(a), 0.088), size, Material(name), rotation(40 * k, 50 * k))
     s.ellipsoid((0.0, 0.005, 0.125), (0.041, 0.041, 0.039), Material("orange"))
 
 
@@ -334,9 +326,7 @@ def radio(s: Scene) -> None:
         s.cylinder((x, -0.1, 0.06), 0.018, 0.025, BLACK, rotation(pitch=90))
 
 
-def plant(
-    s: Scene, rng: np.random.Generator, height: float, stems: int, leaves: int, pot: str = "terracotta"
-) -> None:
+def plant(s: Scene, rng: np.random.Generator, height: float, stems: int, leaves: int, pot: str = "terracotta") -> None:
     """A pot plant with long leaves on arching stems."""
     rim = 0.17 * height / 1.5 + 0.05
     s.cylinder(
@@ -366,6 +356,4 @@ def plant(
             # The leaf's length is its local z, its width x; it starts at the stem.
             tip = turn @ np.array([0.0, 0.0, long])
             tint = np.array([0.75, 0.85, 0.6]) * rng.uniform(0.7, 1.15)
-            s.ellipsoid(
-                base + tip, (0.40 * long, 0.035 * long, long), Material("leaf", tint=tuple(tint)), turn
-            )
+            s.ellipsoid(base + tip, (0.40 * long, 0.035 * long, long), Material("leaf", tint=tuple(tint)), turn)

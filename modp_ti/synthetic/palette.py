@@ -35,9 +35,7 @@ MAKERS: dict[str, Callable[[np.random.Generator], Image]] = {
     "stripes": lambda rng: textures.stripes(
         rng, [(208, 92, 66), (232, 218, 192), (46, 66, 96), (232, 218, 192)], [3, 1, 1.5, 1]
     ),
-    "triangles": lambda rng: textures.triangles(
-        rng, [(228, 178, 84), (52, 92, 112), (230, 220, 204), (192, 92, 72)]
-    ),
+    "triangles": lambda rng: textures.triangles(rng, [(228, 178, 84), (52, 92, 112), (230, 220, 204), (192, 92, 72)]),
     "mustard": lambda rng: textures.weave(rng, (214, 160, 58), 48),
     "curtain": lambda rng: textures.pleats(rng, (214, 190, 158), 6),
     "lampshade": lambda rng: textures.pleats(rng, (255, 226, 176), 48),

@@ -25,9 +25,7 @@ __all__ = ["abstract_painting", "botanical_print", "landscape_painting", "photog
 def _canvas(rng: np.random.Generator, image: Floats, strength: float = 0.05) -> Image:
     """The picture with brush strokes and the grain of canvas."""
     shape = image.shape[:2]
-    tone = 1 + strength * (
-        0.6 * smooth_noise(rng, shape, (2, 14)) + 0.6 * rng.standard_normal(shape, np.float32)
-    )
+    tone = 1 + strength * (0.6 * smooth_noise(rng, shape, (2, 14)) + 0.6 * rng.standard_normal(shape, np.float32))
     return finish(image * tone[..., None])
 
 
@@ -49,10 +47,7 @@ def landscape_painting(rng: np.random.Generator) -> Image:
     ridges = ((0.46, 0.075, (132, 120, 154)), (0.52, 0.060, (96, 92, 128)), (0.58, 0.040, (58, 70, 92)))
     for level, tall, colour in ridges:
         line = level - tall * _ridge(rng, width)
-        rock = (
-            filled((height, width), colour)
-            * (1 + 0.13 * fractal(rng, (height, width), (22, 16), 5))[..., None]
-        )
+        rock = filled((height, width), colour) * (1 + 0.13 * fractal(rng, (height, width), (22, 16), 5))[..., None]
         inside = smoothstep(-0.004, 0.004, y - line)
         image = mix(image, rock, inside)
         snow = (
@@ -69,16 +64,11 @@ def landscape_painting(rng: np.random.Generator) -> Image:
     ]
     image[lake] = (0.72 * mirror + 0.28 * np.array([70, 92, 120]))[lake]
     glitter = (
-        smoothstep(0.9, 1.8, smooth_noise(rng, (height, width), (2, 18)))
-        * np.exp(-(((x - 1.02) / 0.16) ** 2))
-        * lake
+        smoothstep(0.9, 1.8, smooth_noise(rng, (height, width), (2, 18))) * np.exp(-(((x - 1.02) / 0.16) ** 2)) * lake
     )
     blend(image, (255, 220, 160), glitter.astype(np.float32))
     shore = y > 0.9 - 0.03 * _ridge(rng, width)
-    ground = (
-        filled((height, width), (52, 62, 38))
-        * (1 + 0.25 * fractal(rng, (height, width), (5, 12), 4))[..., None]
-    )
+    ground = filled((height, width), (52, 62, 38)) * (1 + 0.25 * fractal(rng, (height, width), (5, 12), 4))[..., None]
     image = mix(image, ground, smoothstep(0.4, 0.6, shore.astype(np.float32)))
     for _ in range(16):
         cx, base = (
@@ -137,10 +127,7 @@ def abstract_painting(rng: np.random.Generator) -> Image:
 def botanical_print(rng: np.random.Generator) -> Image:
     """A drawn fern with a caption, 3 : 4."""
     height, width = 320, 240
-    image = (
-        filled((height, width), (240, 234, 218))
-        * (1 + 0.02 * fractal(rng, (height, width), 60, 4))[..., None]
-    )
+    image = filled((height, width), (240, 234, 218)) * (1 + 0.02 * fractal(rng, (height, width), 60, 4))[..., None]
     s = np.linspace(0, 1, 40)
     stem = np.stack([120 + 26 * np.sin(2.4 * s), 268 - 226 * s], axis=1)
     cv2.polylines(image, [np.rint(stem * 16).astype(np.int32)], False, (70, 92, 52), 2, cv2.LINE_AA, 4)

@@ -68,9 +68,7 @@ def contour_map(rng: np.random.Generator) -> Image:
     blend(image, (164, 116, 72), 0.7 * smoothstep(1.0, 0.3, lines))
     blend(image, (140, 92, 56), 0.9 * smoothstep(1.4, 0.6, thick))
     blend(image, (120, 172, 206), smoothstep(-1.45, -1.55, level))
-    river = np.abs(
-        smooth_noise(rng, (height, width), (160, 220)) + 0.15 * fractal(rng, (height, width), 60, 3)
-    )
+    river = np.abs(smooth_noise(rng, (height, width), (160, 220)) + 0.15 * fractal(rng, (height, width), 60, 3))
     blend(image, (96, 150, 196), smoothstep(0.035, 0.02, river))
     for k in range(1, 8):
         image[:, k * 55 : k * 55 + 1] *= 0.82
@@ -127,9 +125,7 @@ def book_spine(rng: np.random.Generator) -> Image:
     _, y = grid((height, width), (1.0, 1.0))
     image *= (0.72 + 0.28 * np.sin(np.pi * y) ** 0.5)[..., None]
     image *= (
-        1
-        + 0.06 * fractal(rng, (height, width), 20, 4)
-        + 0.04 * rng.standard_normal((height, width), np.float32)
+        1 + 0.06 * fractal(rng, (height, width), 20, 4) + 0.04 * rng.standard_normal((height, width), np.float32)
     )[..., None]
     return np.ascontiguousarray(np.rot90(finish(image), -1))
 
@@ -231,9 +227,7 @@ def globe(rng: np.random.Generator) -> Image:
     land = fractal(rng, (height, width), 90, 6, 0.55)
     image = mix((52, 104, 150), (84, 140, 178), smoothstep(-1.6, 0.2, land))
     coast = smoothstep(0.30, 0.36, land)
-    ground = mix(
-        (196, 178, 112), (110, 140, 80), smoothstep(0.3, 1.2, np.sin(np.pi * v / 12) * 1.6 + 0.4 * land - 0.5)
-    )
+    ground = mix((196, 178, 112), (110, 140, 80), smoothstep(0.3, 1.2, np.sin(np.pi * v / 12) * 1.6 + 0.4 * land - 0.5))
     image = mix(image, ground, coast)
     blend(image, (240, 240, 236), smoothstep(1.15, 0.75, np.minimum(v, 12 - v) + 0.3 * land))
     lines = np.minimum(np.abs(u - np.round(u)), np.abs(v - np.round(v)))

@@ -76,9 +76,7 @@ def trace(primitives: ti.template(), nodes: ti.template(), o, d, limit, shadow: 
 def texel_colour(texels: ti.template(), start, width, height, x, y):
     """Linear colour of one texel, repeated in both directions."""
     code = texels[start + (y % height) * width + x % width]
-    root = vec3(
-        ti.cast(code & 255, ti.f32), ti.cast((code >> 8) & 255, ti.f32), ti.cast((code >> 16) & 255, ti.f32)
-    )
+    root = vec3(ti.cast(code & 255, ti.f32), ti.cast((code >> 8) & 255, ti.f32), ti.cast((code >> 16) & 255, ti.f32))
     root /= 255.0
     return root * root
 
@@ -206,9 +204,7 @@ def inside_another(primitives: ti.template(), nodes: ti.template(), own, p):
         if (p >= nodes[node, 0].xyz).all() and (p <= nodes[node, 1].xyz).all():
             first = integer(nodes[node, 0].w)
             for k in range(first, first + integer(nodes[node, 1].w)):
-                if k != own and inside(
-                    integer(primitives[k, 7].x), primitives[k, 6], map_point(primitives, k, 0, p)
-                ):
+                if k != own and inside(integer(primitives[k, 7].x), primitives[k, 6], map_point(primitives, k, 0, p)):
                     found = True
             node = ti.select(found, nodes.shape[0], node + 1)
         else:

@@ -51,9 +51,7 @@ class RoomRenderer:
         exposed = np.zeros((*shape, 3), np.float32)
         depth = np.zeros(shape, np.float32)
         for k, offset in enumerate(SAMPLES):
-            raytracer.camera_rays(
-                rotation, [camera.fx, camera.fy], [camera.cx, camera.cy], list(offset), directions
-            )
+            raytracer.camera_rays(rotation, [camera.fx, camera.fy], [camera.cx, camera.cy], list(offset), directions)
             rays = directions.reshape(-1, 3)
             colour, distance = _radiance(self.arrays, self._light, SUN, centre, rays, width, seen=True)
             exposed += np.minimum(EXPOSURE * colour, BRIGHTEST).reshape(exposed.shape)
@@ -73,18 +71,14 @@ def bake_light(arrays: SceneArrays, sun: NDArray[np.float32]) -> NDArray[np.floa
     places = np.zeros(count, np.int32)
     raytracer.find_open_places(a.primitives, a.nodes, a.patches, a.texel_owner, LIT_LOWER, LIT_UPPER, places)
     direct = np.zeros((count, 3), np.float32)
-    raytracer.bake_direct(
-        a.primitives, a.nodes, a.patches, a.texel_owner, places, a.lights, SHADOW_SIDE, direct
-    )
+    raytracer.bake_direct(a.primitives, a.nodes, a.patches, a.texel_owner, places, a.lights, SHADOW_SIDE, direct)
     direct = _smoothed(a, direct, places >= 0, 0.7)
     light = direct
     origins, directions = np.zeros_like(direct), np.zeros_like(direct)
     for side in GATHER_SIDES:
         gathered = np.zeros_like(direct)
         for sample in range(side * side):
-            raytracer.gather_rays(
-                a.primitives, a.patches, a.texel_owner, places, side, sample, origins, directions
-            )
+            raytracer.gather_rays(a.primitives, a.patches, a.texel_owner, places, side, sample, origins, directions)
             gathered += _radiance(a, light, sun, origins, directions, GATHER_WIDTH, seen=False)[0]
         light = direct + _smoothed(a, gathered / (side * side), places >= 0, 1.5)
     return light

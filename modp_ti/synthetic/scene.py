@@ -200,9 +200,7 @@ class Scene:
         self, at: Vector, radii: Vector | float, material: Material, turn: NDArray[np.float64] | float = 0.0
     ) -> None:
         """An ellipsoid, or a sphere where `radii` is one number."""
-        self._add(
-            SPHERE, at, np.diag(np.broadcast_to(np.asarray(radii, float), 3)), turn, (0, 0, 0, 0), [material]
-        )
+        self._add(SPHERE, at, np.diag(np.broadcast_to(np.asarray(radii, float), 3)), turn, (0, 0, 0, 0), [material])
 
     def cylinder(
         self,
@@ -244,9 +242,7 @@ class Scene:
         for material in materials:
             if material.texture not in self.textures:
                 raise ValueError(f"no texture named '{material.texture}'")
-        self._primitives.append(
-            _Primitive(kind, self._frame @ _affine(linear @ stretch, at), shape, materials)
-        )
+        self._primitives.append(_Primitive(kind, self._frame @ _affine(linear @ stretch, at), shape, materials))
 
     def arrays(self, texel: float) -> SceneArrays:
         """The tables, with about one light-map texel per `texel` metres."""
@@ -295,13 +291,9 @@ def _look(material: Material, width: float, height: float, texture: NDArray[np.i
     row = np.zeros((3, 4))
     if material.turned:
         width, height = height, width
-    across, down = (
-        (1.0, 1.0) if material.repeat is None else (width / material.repeat[0], height / material.repeat[1])
-    )
+    across, down = (1.0, 1.0) if material.repeat is None else (width / material.repeat[0], height / material.repeat[1])
     row[0, :3] = (0.0, across, material.offset[0]) if material.turned else (across, 0.0, material.offset[0])
-    row[1, :3] = (
-        (-down, 0.0, material.offset[1] + down) if material.turned else (0.0, down, material.offset[1])
-    )
+    row[1, :3] = (-down, 0.0, material.offset[1] + down) if material.turned else (0.0, down, material.offset[1])
     row[0, 3] = np.sqrt(across * texture[0] / width * down * texture[1] / height)
     row[2] = (*material.tint, material.emission)
     return row

@@ -102,9 +102,7 @@ class SyntheticTracker:
     def notes(self) -> list[str]:
         """What a person should know about this input."""
         c = self.camera
-        return [
-            f"embedded demo room: {len(self)} frames of {c.width}x{c.height}, rendered as they are asked for"
-        ]
+        return [f"embedded demo room: {len(self)} frames of {c.width}x{c.height}, rendered as they are asked for"]
 
     def ground_truth(self) -> list[NDArray[np.float64]]:
         """True T_camera_world (4, 4) of every frame, in metres."""
@@ -126,14 +124,10 @@ class SyntheticTracker:
             seen, pixels = self._observe(known, index, grey, depth)
             if len(seen) < NEW_POINTS_BELOW * self._wanted:
                 first = len(known.truth)
-                known = known.joined(
-                    self._new_landmarks(index, grey, depth, pixels, self._wanted - len(seen))
-                )
+                known = known.joined(self._new_landmarks(index, grey, depth, pixels, self._wanted - len(seen)))
                 added = np.arange(first, len(known.truth))
                 seen = np.concatenate([seen, added])
-                pixels = np.concatenate(
-                    [pixels, self.camera.project(_apply(self._truth[index], known.truth[added]))]
-                )
+                pixels = np.concatenate([pixels, self.camera.project(_apply(self._truth[index], known.truth[added]))])
             rng = np.random.default_rng([self._seed, 2, index])
             observed = pixels + self.noise.pixel * rng.standard_normal(pixels.shape)
             inside = self.camera.contains(observed)
@@ -268,8 +262,6 @@ def _patches(grey: NDArray[np.float32], pixels: NDArray[np.float64]) -> NDArray[
     y = (pixels[:, 1, None, None] - 0.5 + side[None, :, None]).astype(np.float32)
     x, y = np.broadcast_arrays(x, y)
     flat = (len(pixels), len(side) ** 2)
-    patches = cv2.remap(
-        grey, x.reshape(flat), y.reshape(flat), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    patches = cv2.remap(grey, x.reshape(flat), y.reshape(flat), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     patches = patches - patches.mean(axis=1, keepdims=True)
     return patches / np.maximum(np.linalg.norm(patches, axis=1, keepdims=True), 1e-6)

@@ -107,16 +107,10 @@ def brick(rng: np.random.Generator, width: float, height: float, texel: float) -
     joint = np.minimum(np.minimum(fx, 1 - fx) * 0.222, np.minimum(fy, 1 - fy) * 0.077)
     inside = smoothstep(0.0035, 0.0075, joint.astype(np.float32))
 
-    tones = np.array(
-        [[168, 92, 70], [150, 78, 60], [182, 108, 82], [138, 82, 68], [190, 124, 98], [120, 66, 56]]
-    )
-    palette = tones[rng.integers(0, len(tones), (rows, columns))] * (
-        1 + 0.07 * rng.standard_normal((rows, columns, 1))
-    )
+    tones = np.array([[168, 92, 70], [150, 78, 60], [182, 108, 82], [138, 82, 68], [190, 124, 98], [120, 66, 56]])
+    palette = tones[rng.integers(0, len(tones), (rows, columns))] * (1 + 0.07 * rng.standard_normal((rows, columns, 1)))
     face = palette[row, column].astype(np.float32)
-    face *= (1 + 0.10 * fractal(rng, shape, 0.03 / texel, 4) + 0.05 * rng.standard_normal(shape, np.float32))[
-        ..., None
-    ]
+    face *= (1 + 0.10 * fractal(rng, shape, 0.03 / texel, 4) + 0.05 * rng.standard_normal(shape, np.float32))[..., None]
     lime = smoothstep(0.9, 2.2, fractal(rng, shape, 0.25 / texel, 5))
     blend(face, (205, 192, 178), 0.5 * lime)
     face *= (0.86 + 0.14 * smoothstep(0.006, 0.016, joint.astype(np.float32)))[..., None]
@@ -189,16 +183,12 @@ def panelling(rng: np.random.Generator) -> Image:
     return finish(image * (1 - 0.3 * seam)[..., None])
 
 
-def weave(
-    rng: np.random.Generator, colour: Colour = (225, 225, 225), threads: int = 64, size: int = 384
-) -> Image:
+def weave(rng: np.random.Generator, colour: Colour = (225, 225, 225), threads: int = 64, size: int = 384) -> Image:
     """Plain weave with slubs; repeats."""
     x, y = grid((size, size), (threads, threads))
     over = (np.floor(x) + np.floor(y)) % 2
     bulge = np.where(over > 0, np.abs(np.sin(np.pi * y)), np.abs(np.sin(np.pi * x)))
-    slub = np.where(
-        over > 0, smooth_noise(rng, (size, size), (3, 50)), smooth_noise(rng, (size, size), (50, 3))
-    )
+    slub = np.where(over > 0, smooth_noise(rng, (size, size), (3, 50)), smooth_noise(rng, (size, size), (50, 3)))
     tone = 0.80 + 0.22 * bulge + 0.09 * slub + 0.05 * fractal(rng, (size, size), 60, 3)
     return finish(filled((size, size), colour) * tone[..., None])
 
@@ -307,9 +297,7 @@ def wicker(rng: np.random.Generator, size: int = 256) -> Image:
     return finish(mix((70, 44, 22), (206, 164, 108), np.clip(tone, 0, 1).astype(np.float32)))
 
 
-def speckle(
-    rng: np.random.Generator, ground: Colour, spots: Colour, share: float = 0.06, size: int = 256
-) -> Image:
+def speckle(rng: np.random.Generator, ground: Colour, spots: Colour, share: float = 0.06, size: int = 256) -> Image:
     """Stoneware glaze: a ground with small spots; repeats."""
     image = filled((size, size), ground) * (1 + 0.03 * fractal(rng, (size, size), 50, 4))[..., None]
     limit = float(np.quantile(field := fractal(rng, (size, size), 7, 2), 1 - share))
@@ -329,9 +317,7 @@ def terracotta(rng: np.random.Generator, size: int = 256) -> Image:
 def peel(rng: np.random.Generator, colour: Colour, size: int = 192) -> Image:
     """The skin of a fruit."""
     shape = (size, size)
-    tone = (
-        1 + 0.06 * fractal(rng, shape, 60, 3) - 0.10 * smoothstep(0.6, 1.6, smooth_noise(rng, shape, (4, 4)))
-    )
+    tone = 1 + 0.06 * fractal(rng, shape, 60, 3) - 0.10 * smoothstep(0.6, 1.6, smooth_noise(rng, shape, (4, 4)))
     return finish(filled(shape, colour) * tone[..., None])
 
 

@@ -51,9 +51,7 @@ def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTra
         if name is None:
             absent.append(image.name)
         elif name in posed:
-            raise InputError(
-                f"{folder}: images {posed[name].name} and {image.name} are both {images.path / name}"
-            )
+            raise InputError(f"{folder}: images {posed[name].name} and {image.name} are both {images.path / name}")
         else:
             posed[name] = image
     if not posed:
@@ -65,9 +63,7 @@ def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTra
             f"{folder}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
         )
     undistorters = {i: _undistorter(camera, source.scale, folder) for i, camera in model.cameras.items()}
-    require_fitting_sizes(
-        images, [(name, undistorters[posed[name].camera_id]) for name in names], str(folder)
-    )
+    require_fitting_sizes(images, [(name, undistorters[posed[name].camera_id]) for name in names], str(folder))
 
     positions = {i: np.asarray(point.xyz, dtype=np.float64) for i, point in model.points3D.items()}
     frames = []
@@ -108,17 +104,13 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
 
     stems = ("cameras", "images", "points3D")
     if not any(all((folder / f"{stem}{suffix}").exists() for stem in stems) for suffix in (".bin", ".txt")):
-        missing = [
-            stem for stem in stems if not any((folder / f"{stem}{s}").exists() for s in (".bin", ".txt"))
-        ]
+        missing = [stem for stem in stems if not any((folder / f"{stem}{s}").exists() for s in (".bin", ".txt"))]
         raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
     if all((folder / f"{stem}.bin").exists() for stem in stems):
         require_whole_binary_model(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))
-    except (
-        Exception
-    ) as error:  # pycolmap throws what its C++ does: ValueError, IndexError, MemoryError, RuntimeError
+    except Exception as error:  # pycolmap throws what its C++ does: ValueError, IndexError, MemoryError, RuntimeError
         reason = " ".join(str(error).split())
         raise InputError(f"{folder}: not a readable COLMAP model ({reason}); export it again") from None
     if not model.images:
@@ -139,19 +131,11 @@ def _undistorter(camera: pycolmap.Camera, scale: float, folder: Path) -> Undisto
     model = camera.model.name
     intrinsics = colmap_intrinsics(model, camera.params)
     if intrinsics is None:
-        raise InputError(
-            f"{folder}: camera model {model} is not supported; run `colmap image_undistorter` first"
-        )
+        raise InputError(f"{folder}: camera model {model} is not supported; run `colmap image_undistorter` first")
     fx, fy, cx, cy, distortion = intrinsics
-    if not (
-        np.isfinite(camera.params).all() and fx > 0 and fy > 0 and camera.width > 0 and camera.height > 0
-    ):
-        raise InputError(
-            f"{folder}: camera {camera.camera_id} has impossible intrinsics: {camera.params_to_string()}"
-        )
-    return Undistorter(
-        PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height)), distortion, scale
-    )
+    if not (np.isfinite(camera.params).all() and fx > 0 and fy > 0 and camera.width > 0 and camera.height > 0):
+        raise InputError(f"{folder}: camera {camera.camera_id} has impossible intrinsics: {camera.params_to_string()}")
+    return Undistorter(PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height)), distortion, scale)
 
 
 def _observed_points(
@@ -166,9 +150,7 @@ def _observed_points(
         return SparsePoints()
     ids = np.array([point.point3D_id for point in observed], dtype=np.int64)
     if not all(int(i) in positions for i in ids):
-        raise InputError(
-            f"{folder}: points3D is incomplete: image {image.name} observes points that it lacks"
-        )
+        raise InputError(f"{folder}: points3D is incomplete: image {image.name} observes points that it lacks")
     # A track may hold two observations in one image: the first one stands for the point.
     ids, first = np.unique(ids, return_index=True)
     pixels = undistorter.points(np.array([point.xy for point in observed])[first])

@@ -112,6 +112,4 @@ def require_whole_binary_model(folder: Path) -> None:
         except _DamagedError as error:
             raise InputError(f"{file}: {error}; the file is damaged or of a newer COLMAP") from None
         if cursor.at != len(cursor.data):
-            raise InputError(
-                f"{file}: {len(cursor.data) - cursor.at} bytes too long; export the COLMAP model again"
-            )
+            raise InputError(f"{file}: {len(cursor.data) - cursor.at} bytes too long; export the COLMAP model again")

@@ -93,9 +93,7 @@ def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
     return pose
 
 
-def require_fitting_sizes(
-    images: ImageFolder, frames: Sequence[tuple[str, Undistorter]], intrinsics: str
-) -> None:
+def require_fitting_sizes(images: ImageFolder, frames: Sequence[tuple[str, Undistorter]], intrinsics: str) -> None:
     """Raises InputError for the first image that is unreadable or not of its camera's size.
 
     intrinsics: where the cameras come from, for the message. Reads the headers only, so that a run fails at

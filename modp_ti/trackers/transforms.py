@@ -154,9 +154,7 @@ def _intrinsics(
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(
-                f"{file}: `{key}` must be a number, not {json.dumps(value)} (frame {values['file_path']})"
-            )
+            raise InputError(f"{file}: `{key}` must be a number, not {json.dumps(value)} (frame {values['file_path']})")
         return float(value)
 
     width, height = number("w"), number("h")
@@ -175,9 +173,7 @@ def _intrinsics(
     fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None or fx <= 0 or fy <= 0:
-        raise InputError(
-            f"{file}: no focal length for {values['file_path']}: give `fl_x` or `camera_angle_x`"
-        )
+        raise InputError(f"{file}: no focal length for {values['file_path']}: give `fl_x` or `camera_angle_x`")
     cx, cy = number("cx"), number("cy")
     camera = PinholeCamera(
         fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy, int(width), int(height)
@@ -191,7 +187,5 @@ def _intrinsics(
         return camera, Distortion((k1, k2, k3, k4), fisheye=True)
     if model not in PERSPECTIVE_MODELS:
         supported = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
-        raise InputError(
-            f"{file}: camera model {model} is not supported ({supported}); undistort the images first"
-        )
+        raise InputError(f"{file}: camera model {model} is not supported ({supported}); undistort the images first")
     return camera, Distortion((k1, k2, k3, k4), tangential=(p1, p2))

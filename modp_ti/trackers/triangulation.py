@@ -182,9 +182,9 @@ def _refined(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.flo
         p = np.einsum("mij,mj->mi", rotation, xyz[seen.point]) + translation
         z = np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
         residual = (p[:, :2] / z[:, None] - seen.rays) / seen.sigma[:, None]
-        jacobian = (rotation[:, :2] - (p[:, :2] / z[:, None])[:, :, None] * rotation[:, 2:]) / (
-            z * seen.sigma
-        )[:, None, None]
+        jacobian = (rotation[:, :2] - (p[:, :2] / z[:, None])[:, :, None] * rotation[:, 2:]) / (z * seen.sigma)[
+            :, None, None
+        ]
         weight = 1.0 / (1.0 + (residual**2).sum(axis=1))
         left, right = np.zeros((len(xyz), 3, 3)), np.zeros((len(xyz), 3))
         np.add.at(left, seen.point, np.einsum("m,mki,mkj->mij", weight, jacobian, jacobian))
@@ -209,9 +209,7 @@ def _error(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float
     return np.where(before & np.isfinite(error), error, np.inf)
 
 
-def _widest_angle(
-    poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _widest_angle(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angle [degrees] per point (P,) between two of its rays that are nearly the farthest apart.
 
     They are the ray farthest from the point's first one, and the one farthest from that.

@@ -78,10 +78,7 @@ class PlaneScene:
             p = points @ T[:3, :3].T + T[:3, 3]
             uv = (p / p[:, 2:]) @ self.K.T
             seen = np.flatnonzero(
-                (p[:, 2] > 0)
-                & (uv[:, :2] > 0).all(axis=1)
-                & (uv[:, 0] < self.size[0])
-                & (uv[:, 1] < self.size[1])
+                (p[:, 2] > 0) & (uv[:, :2] > 0).all(axis=1) & (uv[:, 0] < self.size[0]) & (uv[:, 1] < self.size[1])
             )
             image = pycolmap.Image(
                 name=name,

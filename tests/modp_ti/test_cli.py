@@ -121,9 +121,7 @@ def test_message_of_several_lines_is_put_on_one(scene, monkeypatch):
 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, check=True
-    )
+    return subprocess.run([sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, check=True)
 
 
 HEAVY = "('taichi', 'torch', 'open3d', 'cv2', 'pycolmap')"

@@ -42,9 +42,7 @@ def test_lines_hold_the_camera_in_the_world_with_the_quaternion_s_real_part_last
     assert (tmp_path / "t.txt").read_text().startswith("#")
     T_world_camera = np.linalg.inv(T)
     np.testing.assert_allclose(table[:, 1:4], T_world_camera[:, :3, 3], rtol=1e-12)
-    np.testing.assert_allclose(
-        Rotation.from_quat(table[:, 4:]).as_matrix(), T_world_camera[:, :3, :3], atol=1e-12
-    )
+    np.testing.assert_allclose(Rotation.from_quat(table[:, 4:]).as_matrix(), T_world_camera[:, :3, :3], atol=1e-12)
 
 
 def test_nothing_is_left_of_a_trajectory_with_a_bad_pose(tmp_path):

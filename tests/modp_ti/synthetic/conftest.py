@@ -26,6 +26,4 @@ def room(taichi_on_the_cpu: None) -> RoomRenderer:
 @pytest.fixture(scope="session")
 def perfect(room: RoomRenderer) -> SyntheticTracker:
     """160x120 frames of a tracker without errors."""
-    return SyntheticTracker(
-        width=160, height=120, frames=28, noise=TrackerNoise.none(), points=150, room=room
-    )
+    return SyntheticTracker(width=160, height=120, frames=28, noise=TrackerNoise.none(), points=150, room=room)

@@ -56,9 +56,7 @@ def look(
 def roots(a: float, b: float, c: float) -> list[float]:
     """Real and positive t with a t^2 + b t + c = 0."""
     under = b * b - 4 * a * c
-    return (
-        [] if under < 0 else [t for t in ((-b - under**0.5) / (2 * a), (-b + under**0.5) / (2 * a)) if t > 0]
-    )
+    return [] if under < 0 else [t for t in ((-b - under**0.5) / (2 * a), (-b + under**0.5) / (2 * a)) if t > 0]
 
 
 def hit_box(o: NDArray[np.float64], d: NDArray[np.float64], half: NDArray[np.float64]) -> float:
@@ -73,9 +71,7 @@ def hit_box(o: NDArray[np.float64], d: NDArray[np.float64], half: NDArray[np.flo
     return best
 
 
-def hit_ball(
-    o: NDArray[np.float64], d: NDArray[np.float64], centre: NDArray[np.float64], radius: float
-) -> float:
+def hit_ball(o: NDArray[np.float64], d: NDArray[np.float64], centre: NDArray[np.float64], radius: float) -> float:
     p = o - centre
     return min(roots(d @ d, 2 * d @ p, p @ p - radius**2), default=np.inf)
 
@@ -100,9 +96,7 @@ def hit_cone(
     return best
 
 
-def hit_rounded(
-    o: NDArray[np.float64], d: NDArray[np.float64], half: NDArray[np.float64], radius: float
-) -> float:
+def hit_rounded(o: NDArray[np.float64], d: NDArray[np.float64], half: NDArray[np.float64], radius: float) -> float:
     """The union of three boxes, twelve rods along the edges and eight balls at the corners."""
     core = half - radius
     best = min(hit_box(o, d, core + radius * np.eye(3)[k]) for k in range(3))

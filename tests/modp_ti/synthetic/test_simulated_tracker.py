@@ -52,14 +52,10 @@ def test_frames_warp_into_each_other_by_depth_and_pose(perfect: SyntheticTracker
     assert np.median(right) < 0.012
     wrong = truth[j].copy()
     wrong[0, 3] += 0.03
-    assert np.median(warp_error(perfect, i, j, wrong)) > 1.5 * np.median(right), (
-        "the pictures have no texture"
-    )
+    assert np.median(warp_error(perfect, i, j, wrong)) > 1.5 * np.median(right), "the pictures have no texture"
 
 
-def test_without_noise_points_and_poses_are_exact(
-    perfect: SyntheticTracker, frames: list[TrackedFrame]
-) -> None:
+def test_without_noise_points_and_poses_are_exact(perfect: SyntheticTracker, frames: list[TrackedFrame]) -> None:
     places: dict[int, NDArray[np.float64]] = {}
     for frame, truth in zip(frames, perfect.ground_truth(), strict=True):
         np.testing.assert_allclose(frame.T_camera_world, truth, atol=1e-12)
@@ -97,9 +93,7 @@ def make(room: RoomRenderer) -> Make:
     """Small trackers in the shared room."""
 
     def build(**options: object) -> SyntheticTracker:
-        return SyntheticTracker(
-            **{"width": 96, "height": 72, "frames": 24, "points": 80, "room": room, **options}
-        )
+        return SyntheticTracker(**{"width": 96, "height": 72, "frames": 24, "points": 80, "room": room, **options})
 
     return build
 
@@ -130,9 +124,7 @@ def test_pose_errors_drift_and_points_go_with_them(make: Make) -> None:
     """Neighbouring frames err alike, and a tracker's points fit its own poses better than the true ones."""
     noise = TrackerNoise(pixel=0.0, depth=0.0, translation=0.02, rotation=1.0, drift=10.0)
     noisy = make(noise=noise)
-    relative = [
-        T @ np.linalg.inv(truth) for T, truth in zip(noisy._tracked, noisy.ground_truth(), strict=True)
-    ]
+    relative = [T @ np.linalg.inv(truth) for T, truth in zip(noisy._tracked, noisy.ground_truth(), strict=True)]
     angles = np.array([Rotation.from_matrix(r[:3, :3]).as_rotvec(degrees=True) for r in relative])
     assert np.abs(np.diff(angles, axis=0)).max() < 0.5 * np.abs(angles).max()
     frame = next(iter(noisy))

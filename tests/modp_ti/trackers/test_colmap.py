@@ -21,9 +21,7 @@ def plane_points(count: int = 60) -> np.ndarray:
 
 
 def opened(scene, model=None, **source):
-    return open_colmap(
-        SourceSettings(path=scene.folder, **source), TrackerSettings(kind="colmap", path=model)
-    )
+    return open_colmap(SourceSettings(path=scene.folder, **source), TrackerSettings(kind="colmap", path=model))
 
 
 def failure(scene, model=None, **source) -> str:

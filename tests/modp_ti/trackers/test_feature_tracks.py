@@ -15,16 +15,13 @@ def matches(a: int, b: int, *found: tuple[int, int, float]) -> tuple[int, int, M
 
 def places(*counts: int) -> list[np.ndarray]:
     """Distinct pixels for the given number of features a view."""
-    return [
-        np.stack([np.arange(n), np.arange(n) + 100 * i], axis=1).astype(float) for i, n in enumerate(counts)
-    ]
+    return [np.stack([np.arange(n), np.arange(n) + 100 * i], axis=1).astype(float) for i, n in enumerate(counts)]
 
 
 def tracks(pixels, *found) -> set[frozenset[tuple[int, int]]]:
     view, number, track = feature_tracks(pixels, found)
     return {
-        frozenset(zip(view[track == t].tolist(), number[track == t].tolist(), strict=True))
-        for t in np.unique(track)
+        frozenset(zip(view[track == t].tolist(), number[track == t].tolist(), strict=True)) for t in np.unique(track)
     }
 
 

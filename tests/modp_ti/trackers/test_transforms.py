@@ -87,9 +87,7 @@ def test_no_image_at_all_is_an_error(with_cloud):
 
     edited(with_cloud, rename)
     message = failure(with_cloud)
-    assert (
-        "none of its 7 frames has an image" in message and "gone0.png" in message and "source.path" in message
-    )
+    assert "none of its 7 frames has an image" in message and "gone0.png" in message and "source.path" in message
 
 
 def test_names_without_suffix_or_from_another_folder_are_found(with_cloud):
@@ -135,11 +133,7 @@ def test_lens_keys_are_read(with_cloud):
     k = {"k1": 0.1, "k2": -0.05, "k3": 0.01, "k4": -0.002, "p1": 0.003, "p2": 0.004}
     with_cloud.write_transforms(ply_file_path="points.ply", **k)
     lens = opened(with_cloud).frames[0].undistorter.distortion
-    assert (
-        lens.numerator == (0.1, -0.05, 0.01, -0.002)
-        and lens.tangential == (0.003, 0.004)
-        and not lens.fisheye
-    )
+    assert lens.numerator == (0.1, -0.05, 0.01, -0.002) and lens.tangential == (0.003, 0.004) and not lens.fisheye
     with_cloud.write_transforms(ply_file_path="points.ply", camera_model="OPENCV_FISHEYE", **k)
     assert opened(with_cloud).frames[0].undistorter.distortion.fisheye
     with_cloud.write_transforms(ply_file_path="points.ply", is_fisheye=True, **k)
@@ -217,9 +211,7 @@ def test_file_is_found_beside_the_images_in_a_given_folder_or_by_name(with_cloud
     assert "set tracker.path" in failure(with_cloud)
 
 
-@pytest.mark.parametrize(
-    ("text", "part"), [("{\n\n oops", "transforms.json:3: not valid JSON"), ("[]", "no list of")]
-)
+@pytest.mark.parametrize(("text", "part"), [("{\n\n oops", "transforms.json:3: not valid JSON"), ("[]", "no list of")])
 def test_file_that_is_no_transforms_json_is_named(with_cloud, text, part):
     (with_cloud.folder.parent / "transforms.json").write_text(text)
     assert part in failure(with_cloud)
@@ -253,9 +245,7 @@ def test_triangulation_gives_the_same_points_bit_for_bit(plane_scene):
 def test_points_named_but_not_there_are_triangulated_with_a_note(plane_scene):
     plane_scene.write_transforms(ply_file_path="gone.ply")
     tracker = opened(plane_scene)
-    assert tracker.notes == [
-        "transforms.json names points that are not there (gone.ply): triangulated instead"
-    ]
+    assert tracker.notes == ["transforms.json names points that are not there (gone.ply): triangulated instead"]
     assert len(tracker.frames[3].points) >= 100
 
 
@@ -273,10 +263,7 @@ def test_held_out_images_do_not_decide_where_a_point_lies(plane_scene):
         file = str(plane_scene.folder / name)
         cv2.imwrite(file, np.roll(cv2.imread(file), 1, axis=1))
     after = opened(plane_scene, holdout=3)
-    places = [
-        {tuple(x) for frame in tracker.frames for x in frame.points.xyz.round(9)}
-        for tracker in (before, after)
-    ]
+    places = [{tuple(x) for frame in tracker.frames for x in frame.points.xyz.round(9)} for tracker in (before, after)]
     assert len(places[0]) > 150
     for tracker in (before, after):
         assert len(tracker.frames[3].points) >= 50, "held-out frames are told which of the points they see"
