@@ -119,18 +119,17 @@ class GaussianField:
 
     def to_numpy(self) -> dict[str, NDArray]:
         """Values of all Gaussians by name: position (N, 3), log_scale, quaternion, opacity_logit (N,), sh (N, K, 3)."""
-        n, k = self.count, self.sh_count
-        arrays = [np.zeros(s, dtype=self.dtype) for s in ((n, 3), (n, 3), (n, 4), (n,), (n, k, 3))]
-        if n:
-            self._read(n, *arrays)
-        return dict(zip(_NAMES, arrays, strict=True))
+        return self._to_numpy([getattr(self, name) for name in _NAMES])
 
     def gradients_to_numpy(self) -> dict[str, NDArray]:
         """Gradients of all Gaussians, by the names and shapes of `to_numpy`."""
+        return self._to_numpy([getattr(self, name).grad for name in _NAMES])
+
+    def _to_numpy(self, fields: list) -> dict[str, NDArray]:
         n, k = self.count, self.sh_count
         arrays = [np.zeros(s, dtype=self.dtype) for s in ((n, 3), (n, 3), (n, 4), (n,), (n, k, 3))]
         if n:
-            self._read_gradients(n, *arrays)
+            self._read(n, *fields, *arrays)
         return dict(zip(_NAMES, arrays, strict=True))
 
     def load(self, state: dict[str, NDArray]) -> None:
@@ -141,19 +140,6 @@ class GaussianField:
     def opacities(self) -> NDArray:
         """Opacity in (0, 1) of all Gaussians (N,)."""
         return 1.0 / (1.0 + np.exp(-self.to_numpy()["opacity_logit"]))
-
-    @ti.kernel
-    def clear_gradients(self, count: ti.i32):
-        """Zero the gradients and marks of the Gaussians that the last step touched."""
-        for i in range(count):
-            if self.touched[i] != 0:
-                self.touched[i] = 0
-                self.position.grad[i].fill(0.0)
-                self.log_scale.grad[i].fill(0.0)
-                self.quaternion.grad[i].fill(0.0)
-                self.opacity_logit.grad[i] = 0.0
-                for k in range(self.sh_count):
-                    self.sh.grad[i, k].fill(0.0)
 
     @ti.func
     def _forget(self, i):
@@ -204,43 +190,27 @@ class GaussianField:
     def _read(
         self,
         count: ti.i32,
-        position: ti.types.ndarray(),
-        log_scale: ti.types.ndarray(),
-        quaternion: ti.types.ndarray(),
-        opacity_logit: ti.types.ndarray(),
-        sh: ti.types.ndarray(),
+        position: ti.template(),
+        log_scale: ti.template(),
+        quaternion: ti.template(),
+        opacity_logit: ti.template(),
+        sh: ti.template(),
+        out_position: ti.types.ndarray(),
+        out_log_scale: ti.types.ndarray(),
+        out_quaternion: ti.types.ndarray(),
+        out_opacity_logit: ti.types.ndarray(),
+        out_sh: ti.types.ndarray(),
     ):
         for i in range(count):
             for c in ti.static(range(3)):
-                position[i, c] = self.position[i][c]
-                log_scale[i, c] = self.log_scale[i][c]
+                out_position[i, c] = position[i][c]
+                out_log_scale[i, c] = log_scale[i][c]
             for c in ti.static(range(4)):
-                quaternion[i, c] = self.quaternion[i][c]
-            opacity_logit[i] = self.opacity_logit[i]
+                out_quaternion[i, c] = quaternion[i][c]
+            out_opacity_logit[i] = opacity_logit[i]
             for k in range(self.sh_count):
                 for c in ti.static(range(3)):
-                    sh[i, k, c] = self.sh[i, k][c]
-
-    @ti.kernel
-    def _read_gradients(
-        self,
-        count: ti.i32,
-        position: ti.types.ndarray(),
-        log_scale: ti.types.ndarray(),
-        quaternion: ti.types.ndarray(),
-        opacity_logit: ti.types.ndarray(),
-        sh: ti.types.ndarray(),
-    ):
-        for i in range(count):
-            for c in ti.static(range(3)):
-                position[i, c] = self.position.grad[i][c]
-                log_scale[i, c] = self.log_scale.grad[i][c]
-            for c in ti.static(range(4)):
-                quaternion[i, c] = self.quaternion.grad[i][c]
-            opacity_logit[i] = self.opacity_logit.grad[i]
-            for k in range(self.sh_count):
-                for c in ti.static(range(3)):
-                    sh[i, k, c] = self.sh.grad[i, k][c]
+                    out_sh[i, k, c] = sh[i, k][c]
 
     @ti.kernel
     def _move(self, source: ti.types.ndarray(), target: ti.types.ndarray()):
