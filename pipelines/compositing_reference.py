@@ -6,35 +6,26 @@ Slower by far on a CPU (each pixel's loop is scalar), and so direct that it can 
 
 import taichi as ti
 
-from fields.images import PAD, ImageBuffers
-from fields.projected import ProjectedGaussians
-from fields.tiles import TILE_HEIGHT, TILE_WIDTH, TilePairs
-from fields.view import ViewField
-from pipelines.compositing import ALPHA_MAX, OPAQUE
+from fields.images import PAD
+from fields.tiles import TILE_HEIGHT, TILE_WIDTH
+from pipelines.compositing import ALPHA_MAX, OPAQUE, Compositing
 from pipelines.projection import ALPHA_MIN
 
 __all__ = ["ReferenceCompositing"]
 
 
 @ti.data_oriented
-class ReferenceCompositing:
-    """The interface of `Compositing`, without the gradient of depth."""
-
-    def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: TilePairs, images: ImageBuffers) -> None:
-        self.view = view
-        self.projected = projected
-        self.pairs = pairs
-        self.images = images
-        self.real = images.real
+class ReferenceCompositing(Compositing):
+    """Drop-in for `Compositing`, without the gradient of depth."""
 
     def forward(self) -> None:
         """Fill `images.colour`, `.depth` and `.opacity`."""
-        self._forward(self.view.width, self.view.height)
+        self._forward_pixels(self.view.width, self.view.height)
 
     def backward(self) -> None:
         """From `images.colour_grad` and `.opacity_grad` to the gradients in `projected`."""
         self._clear(self.projected.count)
-        self._backward(self.view.width, self.view.height)
+        self._backward_pixels(self.view.width, self.view.height)
 
     @ti.func
     def _alpha(self, s, x, y):
@@ -46,7 +37,7 @@ class ReferenceCompositing:
         return ti.select(alpha < ALPHA_MIN, 0.0, alpha), d
 
     @ti.kernel
-    def _forward(self, width: ti.i32, height: ti.i32):
+    def _forward_pixels(self, width: ti.i32, height: ti.i32):
         for y, x in ti.ndrange(height, width):
             tile = y // TILE_HEIGHT * ((width + TILE_WIDTH - 1) // TILE_WIDTH) + x // TILE_WIDTH
             T = ti.cast(1.0, self.real)
@@ -78,7 +69,7 @@ class ReferenceCompositing:
             self.projected.conic.grad[s].fill(0.0)
 
     @ti.kernel
-    def _backward(self, width: ti.i32, height: ti.i32):
+    def _backward_pixels(self, width: ti.i32, height: ti.i32):
         for y, x in ti.ndrange(height, width):
             tile = y // TILE_HEIGHT * ((width + TILE_WIDTH - 1) // TILE_WIDTH) + x // TILE_WIDTH
             at = (y + PAD) * self.images.stride + PAD + x

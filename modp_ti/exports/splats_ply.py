@@ -36,7 +36,7 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
             state["position"],
             np.zeros((n, 3)),
             state["sh"][:, 0],
-            state["sh"][:, 1:].transpose(0, 2, 1).reshape(n, -1),
+            state["sh"][:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh_count - 1)),
             state["opacity_logit"][:, None],
             state["log_scale"],
             state["quaternion"],
@@ -87,7 +87,7 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     sh = np.empty((count, 1 + rest // 3, 3), dtype=np.float32)
     sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
     if rest:
-        sh[:, 1:] = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, -1).transpose(0, 2, 1)
+        sh[:, 1:] = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, rest // 3).transpose(0, 2, 1)
     return {
         "position": columns("x", "y", "z"),
         "log_scale": columns("scale_0", "scale_1", "scale_2"),

@@ -1,0 +1,116 @@
+"""Whole runs of the demo room, small and short, as a user starts them: in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from modp_ti.exports.splats_ply import read_splats
+from modp_ti.exports.trajectory import read_trajectory
+
+SCENE = """
+source:  {scale: 0.25, holdout: 4, stop: 9, fps: 10}
+tracker: {kind: synthetic}
+output:  out
+device:  cpu
+seed:    3
+mapping: {optimise: {steps: 4, last_steps: 6}, densify: {warm_up: 3}}
+refine:  {steps: 5}
+"""
+
+
+def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "modp_ti.run", str(scene), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of one run."""
+    scene = tmp_path_factory.mktemp("session") / "scene.yaml"
+    scene.write_text(SCENE)
+    result = run(scene)
+    assert result.returncode == 0, result.stderr
+    assert "9 frames" in result.stdout
+    return scene.parent / "out"
+
+
+def test_a_run_leaves_all_its_files_and_nothing_half_written(folder: Path) -> None:
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "config.yaml",
+        "metrics.json",
+        "renders",
+        "splats.ply",
+        "trajectory.txt",
+    ]
+    assert sorted(p.name for p in folder.parent.iterdir()) == ["out", "scene.yaml"]
+    assert sorted(p.name for p in (folder / "renders").iterdir()) == ["000000.png", "000004.png", "000008.png"]
+
+
+def test_the_metrics_say_what_happened(folder: Path) -> None:
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["frames"] == 9
+    assert metrics["backend"] == "cpu"
+    assert metrics["seed"] == 3
+    assert 1 <= metrics["keyframes"] <= 6
+    assert metrics["gaussians"] == len(read_splats(folder / "splats.ply")["position"])
+    assert metrics["online"]["all"]["count"] == metrics["refined"]["all"]["count"] == 9
+    assert metrics["online"]["held_out"]["count"] == 3
+    assert metrics["refined"]["held_out"]["psnr"] > metrics["online"]["held_out"]["psnr"]
+    assert 0 <= metrics["ate_rmse"] < 0.05
+    seconds = metrics["seconds"]
+    assert list(seconds) == [
+        *("total", "compile", "read", "track", "select", "depth"),
+        *("occupancy", "optimise", "refine", "evaluate", "other"),
+    ]
+    parts = sum(value for stage, value in seconds.items() if stage != "total")
+    assert parts == pytest.approx(seconds["total"], abs=0.02)
+
+
+def test_the_scores_are_those_of_the_pictures(folder: Path) -> None:
+    errors = []
+    for path in sorted((folder / "renders").iterdir()):
+        frame, render = np.hsplit(cv2.imread(str(path)).astype(np.float64) / 255.0, 2)
+        errors.append(-10 * np.log10(((frame - render) ** 2).mean()))
+    held_out = json.loads((folder / "metrics.json").read_text())["refined"]["held_out"]
+    # The pictures hold 8 bits.
+    assert held_out["psnr"] == pytest.approx(np.mean(errors), abs=0.02)
+
+
+def test_every_frame_has_its_pose(folder: Path) -> None:
+    times, poses = read_trajectory(folder / "trajectory.txt")
+    np.testing.assert_allclose(times, np.arange(9) / 10)
+    rotations = poses[:, :3, :3]
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (9, 1, 1)), atol=1e-9)
+
+
+def test_the_written_configuration_gives_the_same_map_byte_for_byte(folder: Path, tmp_path: Path) -> None:
+    result = run(folder / "config.yaml", "--set", f"output={tmp_path / 'again'}")
+    assert result.returncode == 0, result.stderr
+    for name in ("splats.ply", "trajectory.txt"):
+        assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes()
+
+
+def test_bad_input_writes_nothing(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(SCENE.replace("stop: 9", "start: 900"))
+    result = run(scene)
+    assert result.returncode == 2
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.yaml"]
+
+
+def test_a_scene_without_points_says_so(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(SCENE)
+    result = run(scene, "--set", "mapping.keyframes.min_points=100000")
+    assert result.returncode == 2
+    assert "no frame became a keyframe" in result.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.yaml"]
