@@ -20,7 +20,7 @@ class GaussianField:
 
     position (3), log_scale (3), quaternion (4; w, x, y, z, any length but zero), opacity_logit (1),
     sh (K, 3) with K = (sh_degree + 1)^2 coefficients: the layout of 3DGS files. `steps` counts the updates that
-    a Gaussian has had. 236 bytes per Gaussian at degree 0 in float32.
+    a Gaussian has had. 232 bytes per Gaussian at degree 0 in float32.
     """
 
     def __init__(self, sh_degree: int = 0, max_gaussians: int = 1 << 22, real=ti.f32) -> None:

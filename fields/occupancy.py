@@ -7,46 +7,47 @@ from numpy.typing import ArrayLike, NDArray
 __all__ = ["OccupancyVoxels"]
 
 LEAF = 8
-# Fan-outs of the pointer levels above the bitmasked leaves: 32 * 16 * 16 * 8 cells a side. More (17 bits an axis) buys
-# nothing at 8 levels of 512, and fewer would make the finest level repeat or end inside the scene.
+# Fan-outs a side of the pointer levels above the leaves: 65,536 cells a side for every level of cell sizes.
 POINTERS = (32, 16, 16)
 SIDE = LEAF * int(np.prod(POINTERS))
+MAX_LEVELS = 16
 
 
 @ti.data_oriented
 class OccupancyVoxels:
     """Which places of the world already hold a Gaussian, at `levels` cell sizes `coarsest / 2^l`.
 
-    levels, resolution, coarsest: L, n and S_init of the paper. The finest level covers `resolution * coarsest` a side
-    around `origin` with cells of their own (floor of the offset by the cell size: the same width on both sides of the
-    origin, never repeated); a level twice as coarse covers twice that. A position outside a level's extent is answered
-    by the coarser levels. Memory follows the occupied places.
+    levels, resolution, coarsest: L, n and S_init of the paper. The finest level covers at least `resolution * coarsest`
+    a side around `origin`, a level twice as coarse twice that. Cells are the floor of the offset by the cell size: the
+    same width on both sides of the origin, never repeated. A position that a level does not reach is answered by the
+    coarser ones.
+
+    SNode tree: three pointer levels over bitmasked leaves of 8^3 cells; the levels of cell sizes lie behind one another
+    along the first axis, since every further tree costs address space, of which Taichi 1.7.4 manages the first GB well.
+    Memory follows the occupied places.
 
     A position is asked for with a target size: the levels used are those whose cells are no smaller than it, and
     always the coarsest, so that no target size goes unanswered.
     """
 
     def __init__(
-        self,
-        coarsest: float = 1.0,
-        levels: int = 8,
-        resolution: int = 512,
-        origin: ArrayLike = (0.0, 0.0, 0.0),
+        self, coarsest: float = 1.0, levels: int = 8, resolution: int = 512, origin: ArrayLike = (0.0, 0.0, 0.0)
     ) -> None:
-        if levels < 1 or resolution << (levels - 1) > SIDE:
+        if not 1 <= levels <= MAX_LEVELS or resolution < 1 or resolution << (levels - 1) > SIDE:
             raise ValueError(
-                f"voxels need a level and resolution * 2^(levels - 1) <= {SIDE}; got {levels=}, {resolution=}"
+                f"voxels need 1 to {MAX_LEVELS} levels and resolution * 2^(levels - 1) <= {SIDE}; "
+                f"got {levels=}, {resolution=}"
             )
         self.levels = levels
         self.resolution = resolution
         self.settle(coarsest, origin)
-        self.occupied = [ti.field(ti.u8) for _ in range(levels)]
+        self.occupied = ti.field(ti.u8)
+        outer, *inner = POINTERS
         builder = ti.FieldsBuilder()
-        for level in self.occupied:
-            node = builder
-            for fan_out in POINTERS:
-                node = node.pointer(ti.ijk, (fan_out,) * 3)
-            node.bitmasked(ti.ijk, (LEAF,) * 3).place(level)
+        node = builder.pointer(ti.ijk, (outer * MAX_LEVELS, outer, outer))
+        for fan_out in inner:
+            node = node.pointer(ti.ijk, (fan_out,) * 3)
+        node.bitmasked(ti.ijk, (LEAF,) * 3).place(self.occupied)
         builder.finalize()
 
     def settle(self, coarsest: float, origin: ArrayLike) -> None:
@@ -97,38 +98,45 @@ class OccupancyVoxels:
         return admitted
 
     def _cells(self, position: ArrayLike, size: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Cell indices (N, 3) at the finest level, and the level (N,) that is asked for and contains the position."""
+        """Cell indices (N, 3) at the finest level, and the finest level (N,) that is asked for and reaches there.
+
+        The level is -1 where not even the coarsest does.
+        """
         position = np.asarray(position, dtype=np.float64).reshape(-1, 3)
         finest = self.coarsest / 2 ** (self.levels - 1)
-        cells = np.floor((position - self.origin) / finest).astype(np.int64)
-        level = np.broadcast_to(self.level_of(size), len(cells)).copy()
-        # A level's cells are the finest cells shifted right, so that levels nest exactly. Its extent is SIDE cells.
+        cells = np.floor(np.clip((position - self.origin) / finest, -1e15, 1e15)).astype(np.int64)
+        level = np.broadcast_to(self.level_of(size), len(cells))
+        # A level's cells are the finest cells shifted right, so that levels nest exactly.
         reach = np.maximum(cells, -cells - 1).max(axis=1, initial=0)
-        beyond = np.ceil(np.log2((reach + 1) / (SIDE // 2))).astype(np.int64).clip(0)
-        return cells, np.minimum(level, self.levels - 1 - beyond).astype(np.int32)
+        too_fine = np.ceil(np.log2((reach + 1) / (SIDE // 2))).clip(0, self.levels)
+        return cells, np.minimum(level, self.levels - 1 - too_fine).astype(np.int32)
 
     @ti.kernel
     def _query(self, cells: ti.types.ndarray(ndim=2), level: ti.types.ndarray(ndim=1), out: ti.types.ndarray(ndim=1)):
         for i in range(level.shape[0]):
-            # Beyond even the coarsest extent nothing can be told apart: such a place is never free.
+            # Level -1 tests nothing: a place that no cell stands for is never free.
             hit = 1
-            for k in ti.static(range(self.levels)):
-                if k <= level[i]:
-                    if self.occupied[k][self._at(cells, i, k)] == 0:
-                        hit = 0
+            for k in range(level[i] + 1):
+                if self.occupied[self._at(cells, i, k)] == 0:
+                    hit = 0
             out[i] = ti.cast(hit, ti.u8)
 
     @ti.kernel
     def _update(self, cells: ti.types.ndarray(ndim=2), level: ti.types.ndarray(ndim=1)):
-        # One thread: nested pointers activated by two at once crashed (Taichi 1.7.4). A batch is a few thousand.
+        # One thread: a batch is a few thousand points, and activating shared nodes takes locks anyway.
         ti.loop_config(serialize=True)
         for i in range(level.shape[0]):
-            for k in ti.static(range(self.levels)):
-                if k <= level[i]:
-                    self.occupied[k][self._at(cells, i, k)] = ti.u8(1)
+            for k in range(level[i] + 1):
+                self.occupied[self._at(cells, i, k)] = ti.u8(1)
 
     @ti.func
-    def _at(self, cells: ti.template(), i, level: ti.template()):
-        """Index of point i's cell in a level's sparse grid, its origin in the middle."""
-        shift = ti.static(self.levels - 1 - level)
-        return ti.Vector([ti.cast((cells[i, k] >> shift) + SIDE // 2, ti.i32) for k in ti.static(range(3))])
+    def _at(self, cells: ti.template(), i, level):
+        """Index of point i's cell of a level in the sparse grid, the origin in the level's middle."""
+        shift = ti.cast(self.levels - 1 - level, ti.i64)
+        return ti.Vector(
+            [
+                ti.cast((cells[i, 0] >> shift) + SIDE // 2, ti.i32) + level * SIDE,
+                ti.cast((cells[i, 1] >> shift) + SIDE // 2, ti.i32),
+                ti.cast((cells[i, 2] >> shift) + SIDE // 2, ti.i32),
+            ]
+        )
