@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 
 import pytest
 import taichi as ti
 
+from fields.backend import initialise
 from fields.gaussians import GaussianField
 from pipelines.rendering import Renderer
 
 MAX_SIDE = 64
 
 
-@pytest.fixture(scope="session")
-def renderers() -> Callable[..., Renderer]:
-    """The renderer of an SH degree and a precision, of images up to 64x64; tests load their own Gaussians into it."""
+@pytest.fixture(scope="module")
+def renderers(taichi_on_the_cpu: None) -> Callable[..., Renderer]:
+    """The renderer of an SH degree and a precision, of images up to 64x64; tests load their own Gaussians into it.
 
-    @cache
+    One lives at a time: another one starts Taichi anew (see the fixture above).
+    """
+    living: dict[tuple[int, object], Renderer] = {}
+
     def renderer(degree: int = 0, real: object = ti.f32) -> Renderer:
-        return Renderer(GaussianField(degree, max_gaussians=1 << 16, real=real), MAX_SIDE, MAX_SIDE)
+        if (degree, real) not in living:
+            if living:
+                initialise("cpu")
+                living.clear()
+            living[degree, real] = Renderer(GaussianField(degree, max_gaussians=1 << 16, real=real), MAX_SIDE, MAX_SIDE)
+        return living[degree, real]
 
     return renderer
 
