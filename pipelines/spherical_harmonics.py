@@ -41,10 +41,9 @@ def evaluate_sh(degree: ti.template(), sh: ti.template(), i, d):
     One expression a degree: a colour summed step by step would cost the reverse kernel a stack.
     """
     x, y, z = d[0], d[1], d[2]
-    zero = ti.Vector([0.0, 0.0, 0.0])
-    band1 = zero
-    band2 = zero
-    band3 = zero
+    # Of the type of sh: a literal zero would make the bands float32 in a float64 render.
+    none = 0.0 * sh[i, 0]
+    band1, band2, band3 = none, none, none
     if ti.static(degree >= 1):
         band1 = _band1(sh, i, x, y, z)
     if ti.static(degree >= 2):

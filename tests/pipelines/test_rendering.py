@@ -61,9 +61,7 @@ def test_float64_picture_is_that_of_the_reference(renderers: Callable[..., Rende
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_float32_picture_is_that_of_the_reference(
-    renderers: Callable[..., Renderer], degree: int, seed: int
-) -> None:
+def test_float32_picture_is_that_of_the_reference(renderers: Callable[..., Renderer], degree: int, seed: int) -> None:
     state = random_gaussians(40, seed=10 * seed + degree, degree=degree)
     state = {name: value.astype(np.float32) for name, value in state.items()}
     picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)

@@ -1,0 +1,153 @@
+"""The online loop and its parts on a small wall: a picture on a slanted plane, seen by a camera that moves sideways."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fields.camera import PinholeCamera
+from fields.se3 import exp_se3
+from fields.tracked_frame import SparsePoints, TrackedFrame
+from pipelines.mapping import OnlineMapper
+from pipelines.refinement import decay, refine
+from pipelines.settings import MappingSettings, RefineSettings
+
+CAMERA = PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)
+NORMAL, OFFSET = np.array([0.2, 0.1, -1.0]), -4.0  # the plane n . x = d
+
+
+def pose(i: int) -> np.ndarray:
+    return exp_se3([0.12 * (3 - i), 0.03 * i, 0.0, 0.01 * i, 0.02 * (i - 3), 0.0])
+
+
+def texture(xyz: np.ndarray) -> np.ndarray:
+    """Smooth colours (N, 3) in [0, 1] over the plane."""
+    x, y = xyz[:, 0], xyz[:, 1]
+    waves = [np.sin(3 * x + 1) * np.cos(2 * y), np.sin(2 * x - 3 * y), np.cos(4 * x) * np.sin(3 * y + 2)]
+    return 0.5 + 0.4 * np.stack(waves, axis=1)
+
+
+def on_the_plane(pixels: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Where the rays of pixels (N, 2) meet the plane, in the world."""
+    rays = CAMERA.unproject(pixels, np.ones(len(pixels))) @ T[:3, :3]
+    centre = -T[:3, :3].T @ T[:3, 3]
+    return centre + rays * ((OFFSET - NORMAL @ centre) / (rays @ NORMAL))[:, None]
+
+
+def frame(i: int, held_out: bool = False, scale: float = 1.0) -> TrackedFrame:
+    T = pose(i)
+    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    image = texture(on_the_plane(np.stack([x.ravel(), y.ravel()], axis=1), T)).reshape(48, 64, 3)
+    pixels = np.random.default_rng(i).uniform([1, 1], [63, 47], (120, 2))
+    points = SparsePoints(scale * on_the_plane(pixels, T), pixels, np.arange(120) + 1000 * i)
+    T = T.copy()
+    T[:3, 3] *= scale
+    return TrackedFrame(i, i / 30, f"{i}", image.astype(np.float32), CAMERA, T, points, held_out=held_out)
+
+
+SETTINGS = MappingSettings(optimise={"steps": 20, "last_steps": 30}, densify={"warm_up": 2})
+
+
+@pytest.fixture(scope="module")
+def mapped(taichi_on_the_cpu: None) -> OnlineMapper:
+    """A map of seven frames, and the mapper that made it."""
+    mapper = OnlineMapper(SETTINGS, 64, 48, seed=1)
+    mapper.compile()
+    for i in range(7):
+        mapper.process(frame(i))
+    mapper.finish()
+    return mapper
+
+
+def psnr(mapper: OnlineMapper, i: int) -> float:
+    f = frame(i)
+    near = mapper.settings.near * mapper.keyframes.scene_depth
+    T = mapper.keyframes.corrected(i, f.T_camera_world)
+    colour = np.clip(mapper.renderer.render(f.camera, T, near).colour, 0, 1)
+    return -10 * np.log10(((colour - f.image) ** 2).mean())
+
+
+def test_compiling_leaves_no_trace_in_the_map(mapped: OnlineMapper) -> None:
+    assert mapped.keyframes[0].index == 0
+    assert len(mapped.keyframes) == 7
+    lifted = mapped.gaussians.to_numpy()["position"] @ NORMAL
+    np.testing.assert_allclose(lifted, OFFSET, rtol=0.1)  # all of them lie at the wall
+
+
+def test_frames_that_were_mapped_are_seen_again(mapped: OnlineMapper) -> None:
+    assert min(psnr(mapped, i) for i in range(7)) > 24
+
+
+def test_depth_is_that_of_the_wall(mapped: OnlineMapper) -> None:
+    T = pose(3)
+    view = mapped.renderer.render(CAMERA, T, 0.01)
+    depth = view.expected_depth()[5:-5, 5:-5]
+    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    xyz = on_the_plane(np.stack([x.ravel(), y.ravel()], axis=1), T)
+    truth = (xyz @ T[2, :3] + T[2, 3]).reshape(48, 64)[5:-5, 5:-5]
+    assert np.median(np.abs(depth / truth - 1)) < 0.03
+
+
+def test_held_out_frames_are_refused(mapped: OnlineMapper) -> None:
+    before = mapped.gaussians.to_numpy()
+    with pytest.raises(ValueError, match="frame 7 is held out"):
+        mapped.process(frame(7, held_out=True))
+    np.testing.assert_array_equal(mapped.gaussians.to_numpy()["position"], before["position"])
+
+
+def test_refinement_improves_the_map_and_leaves_the_poses(mapped: OnlineMapper) -> None:
+    poses = [k.T_camera_world.copy() for k in mapped.keyframes]
+    before = np.mean([psnr(mapped, i) for i in range(7)])
+    seen = []
+    refine(mapped, RefineSettings(steps=40), lambda step, _: seen.append(step))
+    assert np.mean([psnr(mapped, i) for i in range(7)]) > before
+    assert seen == list(range(1, 41))
+    for keyframe, T in zip(mapped.keyframes, poses, strict=True):
+        np.testing.assert_array_equal(keyframe.T_camera_world, T)
+
+
+def test_a_perturbed_pose_comes_back(mapped: OnlineMapper) -> None:
+    keyframe = mapped.keyframes[3]
+    truth = keyframe.T_camera_world.copy()
+    poses = mapped.optimiser.poses
+    faster = poses.settings.model_copy(update={"learning_rate": 3e-4})
+    mapped.optimiser.poses = type(poses)(faster)
+    state = mapped.gaussians.to_numpy()
+    keyframe.T_camera_world = exp_se3([0.02, -0.015, 0.01, 0.004, -0.006, 0.005]) @ truth
+    still = mapped.optimiser.rates(0.0)
+    rates = type(still)(0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def pixels(T: np.ndarray) -> np.ndarray:
+        return CAMERA.project(keyframe.points.xyz @ T[:3, :3].T + T[:3, 3])
+
+    def error() -> float:
+        """Pixels by which the wall's points are displaced; on a wall, moving and turning look nearly alike."""
+        return float(np.linalg.norm(pixels(keyframe.T_camera_world) - pixels(truth), axis=1).mean())
+
+    before = error()
+    for _ in range(60):
+        mapped.optimiser.step(mapped.keyframes, [3], rates, refine_poses=True)
+    assert error() < 0.5 * before
+    for name, value in mapped.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(value, state[name])
+    keyframe.T_camera_world = truth
+    mapped.optimiser.poses = poses
+
+
+def test_the_first_pose_stays(mapped: OnlineMapper) -> None:
+    np.testing.assert_array_equal(mapped.keyframes[0].T_camera_world, mapped.keyframes[0].T_tracked)
+
+
+def test_transparent_gaussians_are_pruned(mapped: OnlineMapper) -> None:
+    state = mapped.gaussians.to_numpy()
+    state["opacity_logit"][:5] = -6.0
+    mapped.gaussians.load(state)
+    assert mapped.prune() == 5
+    assert (mapped.gaussians.opacities() >= SETTINGS.densify.prune_opacity).all()
+
+
+def test_the_rates_of_refinement_decay_to_their_share() -> None:
+    assert decay(0, 100, 0.01) == 1.0
+    assert decay(99, 100, 0.01) == pytest.approx(0.01)
+    assert decay(49, 99, 0.01) == pytest.approx(0.1)
+    assert decay(0, 1, 0.5) == 1.0
