@@ -112,9 +112,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         (staging / "renders").mkdir(parents=True)
         write_splats(staging / "splats.ply", mapper.gaussians.to_numpy())
         write_trajectory(staging / "trajectory.txt", poses.timestamp, trajectory)
-        states = {"online": online}
-        if config.refine.steps:
-            states["refined"] = read_splats(staging / "splats.ply")
+        saved = read_splats(staging / "splats.ply")
+        states = {"online": online, "refined": saved} if config.refine.steps else {"online": saved}
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
             scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders")
         truth = getattr(tracker, "ground_truth", list)()
@@ -132,7 +131,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "ate_rmse": round(absolute_trajectory_error(trajectory, truth), 6) if len(truth) else None,
         }
         (staging / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-        _publish(staging, config)
+        dump_scene(config, staging / "config.yaml")
+        _publish(staging, config.output)
     except OSError as error:
         raise InputError(f"{config.output}: cannot be written: {error.strerror}") from None
     finally:
@@ -200,10 +200,9 @@ def _seconds(stages: dict[str, float], total: float) -> dict[str, float]:
     return seconds
 
 
-def _publish(staging: Path, config: SceneConfig) -> None:
+def _publish(staging: Path, output: Path) -> None:
     """Move the finished files into the output folder, over those of an earlier run."""
-    config.output.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(config.output / "renders", ignore_errors=True)
+    output.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(output / "renders", ignore_errors=True)
     for item in staging.iterdir():
-        os.replace(item, config.output / item.name)
-    dump_scene(config, config.output / "config.yaml")
+        os.replace(item, output / item.name)

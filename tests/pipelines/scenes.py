@@ -38,7 +38,7 @@ def random_gaussians(
     sh[:, 0] = rng.uniform(-1.0, 1.5, (n, 3))
     return {
         "position": camera.unproject(pixels, z) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3],
-        "log_scale": np.log(np.exp(rng.uniform(*np.log(size), (n, 3))) * z[:, None] / camera.focal),
+        "log_scale": np.log(np.exp(rng.uniform(*np.log(size), (n, 3))) * np.abs(z)[:, None] / camera.focal),
         "quaternion": rng.normal(size=(n, 4)) * rng.uniform(0.5, 2.0, (n, 1)),
         "opacity_logit": rng.uniform(*logit, n),
         "sh": sh,
