@@ -9,7 +9,10 @@ import io
 import taichi as ti
 import torch
 
-__all__ = ["initialise"]
+__all__ = ["initialise", "refuse_too_many_fields"]
+
+# Arrays of Taichi's runtime have this many entries, and it does not look.
+MAX_SNODES = 1024
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
@@ -49,3 +52,12 @@ def _has_cuda_driver() -> bool:
 def _start(arch: object, options: dict) -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=arch, **options)
+
+
+def refuse_too_many_fields(last_placed: object) -> None:
+    """Raise RuntimeError where this scalar field, the last one placed, is beyond what a Taichi process holds."""
+    if last_placed.snode.ptr.id >= MAX_SNODES:
+        raise RuntimeError(
+            "more maps and renderers than one Taichi process holds; call initialise() before making another, "
+            "which frees those made so far"
+        )

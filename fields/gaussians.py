@@ -4,6 +4,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from fields.backend import refuse_too_many_fields
+
 __all__ = ["SH_C0", "GaussianField"]
 
 # The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[0].
@@ -23,7 +25,7 @@ class GaussianField:
     a Gaussian has had. 232 bytes per Gaussian at degree 0 in float32.
     """
 
-    def __init__(self, sh_degree: int = 0, max_gaussians: int = 1 << 22, real=ti.f32) -> None:
+    def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:
         self.sh_degree = sh_degree
         self.sh_count = (sh_degree + 1) ** 2
         self.real = real
@@ -58,6 +60,7 @@ class GaussianField:
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
         blocks.dense(ti.i, BLOCK).place(self.steps, self.touched)
         builder.finalize()
+        refuse_too_many_fields(self.touched)
 
     def __len__(self) -> int:
         return self.count
@@ -133,9 +136,16 @@ class GaussianField:
         return dict(zip(_NAMES, arrays, strict=True))
 
     def load(self, state: dict[str, NDArray]) -> None:
-        """Replace the content by the values of `state`, as `to_numpy` gives them. Raises as `append` does."""
-        self.count = 0
-        self.append(**{name: state[name] for name in _NAMES})
+        """Replace the content by the values of `state`, as `to_numpy` gives them.
+
+        Raises as `append` does, the content then being what it was.
+        """
+        before, self.count = self.count, 0
+        try:
+            self.append(**{name: state[name] for name in _NAMES})
+        except ValueError:
+            self.count = before
+            raise
 
     def opacities(self) -> NDArray:
         """Opacity in (0, 1) of all Gaussians (N,)."""

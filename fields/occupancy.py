@@ -4,6 +4,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from fields.backend import refuse_too_many_fields
+
 __all__ = ["OccupancyVoxels"]
 
 LEAF = 8
@@ -49,6 +51,7 @@ class OccupancyVoxels:
             node = node.pointer(ti.ijk, (fan_out,) * 3)
         node.bitmasked(ti.ijk, (LEAF,) * 3).place(self.occupied)
         builder.finalize()
+        refuse_too_many_fields(self.occupied)
 
     def settle(self, coarsest: float, origin: ArrayLike) -> None:
         """Choose the coarsest cell's size and the middle of the extent, while nothing is marked yet."""
@@ -78,8 +81,8 @@ class OccupancyVoxels:
         if len(cells):
             self._update(cells, level)
 
-    def admit(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:
-        """Which of the positions (N, 3) may hold a new Gaussian: in free cells, and of several in one cell the first.
+    def admit(self, position: ArrayLike, size: float) -> NDArray[np.bool_]:
+        """Which of the positions (N, 3) may hold a new Gaussian at a target size: the first of each free cell.
 
         The admitted ones are marked. The order of the batch decides, so that every run decides alike.
         """

@@ -17,7 +17,7 @@ class ProjectedGaussians:
     and in a fixed order. first_pair: index of the slot's first tile pair.
     """
 
-    def __init__(self, builder: ti.FieldsBuilder, capacity: int = 1 << 22, real=ti.f32) -> None:
+    def __init__(self, builder: ti.FieldsBuilder, capacity: int, real=ti.f32) -> None:
         self.real = real
         self.capacity = -(-capacity // BLOCK) * BLOCK
         self.count = 0

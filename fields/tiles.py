@@ -23,7 +23,7 @@ class TilePairs:
     """
 
     def __init__(
-        self, builder: ti.FieldsBuilder, max_tiles: int, chunks: int, max_pairs: int = 1 << 27, real=ti.f32
+        self, builder: ti.FieldsBuilder, max_tiles: int, chunks: int, max_pairs: int = 1 << 23, real=ti.f32
     ) -> None:
         self.max_tiles = max_tiles
         self.max_pairs = max_pairs

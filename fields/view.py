@@ -8,7 +8,7 @@ from fields.camera import PinholeCamera
 
 __all__ = ["ViewField"]
 
-# Projection linearises at most this share of the image width outside the frame (as 3DGS and gsplat do).
+# Projection linearises at most this share of half the image outside the frame (1.3 tan(fov / 2), as 3DGS does).
 FRUSTUM_MARGIN = 0.3
 
 

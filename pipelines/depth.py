@@ -45,6 +45,7 @@ class GaussianProcessDepth:
     """
 
     LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
+    # Three numbers need no more points than this.
     FIT_POINTS = 150
     NOISE_RATIOS = (1e-3, 1e-2, 1e-1)
 
@@ -64,7 +65,8 @@ class GaussianProcessDepth:
         asked = torch.from_numpy(np.asarray(pixels, dtype=np.float64) / side)
         y = torch.from_numpy(np.log(z[usable]))
         mean = y.mean()
-        length, ratio, variance = self._fit(known[:: self._stride(len(y))], (y - mean)[:: self._stride(len(y))])
+        some = slice(None, None, max(len(y) // self.FIT_POINTS, 1))
+        length, ratio, variance = self._fit(known[some], (y - mean)[some])
         K = matern32(torch.cdist(known, known) / length)
         L = torch.linalg.cholesky(K + ratio * torch.eye(len(y), dtype=torch.float64))
         k = matern32(torch.cdist(asked, known) / length)
@@ -72,10 +74,6 @@ class GaussianProcessDepth:
         half = torch.linalg.solve_triangular(L, k.T, upper=False)
         deviation = torch.sqrt(variance * (1.0 - (half * half).sum(0)).clamp_min(0.0))
         return DepthEstimate(torch.exp(log_depth).numpy(), deviation.numpy())
-
-    def _stride(self, n: int) -> int:
-        """Every how manieth point the fit looks at: three numbers need no more than some 150 of them."""
-        return max(n // self.FIT_POINTS, 1)
 
     def _fit(self, known: torch.Tensor, y: torch.Tensor) -> tuple[float, float, float]:
         """(length scale, noise / signal, signal variance) of greatest likelihood; the variance in closed form."""

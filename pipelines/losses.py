@@ -58,7 +58,7 @@ class PhotometricLoss:
         self._mask(self.images.width, self.images.height)
         self._sums[:] = 0.0
         self._compare(self.images.width, self.images.height, self._sums)
-        l1, ssim, square, count = self._sums.sum(axis=0)
+        l1, ssim, square, count = (float(v) for v in self._sums.sum(axis=0))
         count = max(count, 1.0)
         return LossValues(l1 / count, ssim / count, square / count)
 

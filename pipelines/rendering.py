@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from fields.backend import refuse_too_many_fields
 from fields.camera import PinholeCamera
 from fields.gaussians import GaussianField
 from fields.images import ImageBuffers
@@ -49,6 +50,7 @@ class Renderer:
         self.images = ImageBuffers(builder, max_width, max_height, real)
         self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
         builder.finalize()
+        refuse_too_many_fields(self.pairs.gradient.get_scalar_field(9))
         self.projection = Projection(gaussians, self.view, self.projected)
         self.binning = Binning(self.view, self.projected, self.pairs)
         self.compositing = Compositing(self.view, self.projected, self.pairs, self.images)

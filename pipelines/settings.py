@@ -130,7 +130,12 @@ class MappingSettings(StrictModel):
     """The online loop."""
 
     sh_degree: int = Field(0, ge=0, le=3, description="degree of the spherical harmonics of colour")
-    max_gaussians: int = Field(4_000_000, ge=1024, description="size of the pool; further Gaussians are not added")
+    max_gaussians: int = Field(
+        1_500_000,
+        ge=1024,
+        le=1_500_000,
+        description="size of the pool; further Gaussians are not added. Taichi's allocator sets the limit",
+    )
     near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     keyframes: KeyframeSettings = KeyframeSettings()
     densify: DensifySettings = DensifySettings()

@@ -118,3 +118,19 @@ def test_nothing_can_be_appended_and_removed(gaussians: GaussianField) -> None:
     gaussians.append(**state(0))
     assert gaussians.remove(np.zeros(0, dtype=bool)) == 0
     assert gaussians.to_numpy()["sh"].shape == (0, 4, 3)
+
+
+def test_a_refused_state_leaves_the_content(gaussians: GaussianField) -> None:
+    gaussians.append(**state(5))
+    before = gaussians.to_numpy()
+    bad = state(9, 1)
+    bad["quaternion"][2] = 0
+    with pytest.raises(ValueError, match="Gaussian 2"):
+        gaussians.load(bad)
+    assert_equal(gaussians.to_numpy(), before)
+
+
+def test_fields_beyond_what_taichi_holds_are_refused(gaussians: GaussianField, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fields.backend.MAX_SNODES", gaussians.touched.snode.ptr.id + 1)
+    with pytest.raises(RuntimeError, match="call initialise\\(\\) before making another"):
+        GaussianField(0, max_gaussians=1024)

@@ -13,9 +13,8 @@ from fields.se3 import exp_se3
 from pipelines.compositing_reference import ReferenceCompositing
 from pipelines.rendering import Renderer
 
+from .differences import STEP, central_differences
 from .scenes import CAMERA, NEAR, POSE, random_gaussians
-
-STEP = 1e-6
 
 
 def scene(degree: int) -> dict[str, NDArray[np.float64]]:
@@ -65,15 +64,7 @@ def test_the_gradient_of_every_parameter_is_that_of_finite_differences(
     functional = Functional(renderers(degree, ti.f64))
     state = scene(degree)
     analytic = functional.gradients(state)[0][name]
-    numeric = np.zeros_like(analytic)
-    for index in np.ndindex(*analytic.shape):
-        values = []
-        for sign in (1, -1):
-            moved = {key: value.copy() for key, value in state.items()}
-            moved[name][index] += sign * STEP
-            values.append(functional.value(moved))
-        numeric[index] = (values[0] - values[1]) / (2 * STEP)
-    assert_agree(analytic, numeric)
+    assert_agree(analytic, central_differences(functional.value, state, name))
 
 
 @pytest.mark.parametrize("degree", [0, 3])

@@ -14,11 +14,11 @@ from pipelines.optimisation import MapOptimiser
 from pipelines.rendering import Renderer
 from pipelines.settings import MappingSettings
 
+from .differences import STEP, central_differences
 from .scenes import CAMERA, POSE, random_gaussians
 
 SETTINGS = MappingSettings(near=0.01, optimise={"aspect_weight": 0.0}, poses={"learning_rate": 1e-3})
 WEIGHT = 0.2
-STEP = 1e-6
 MOTION = [0.2, -0.1, 0.1, 0.02, 0.05, -0.03]
 
 
@@ -69,14 +69,7 @@ def test_gradients_of_the_photometric_loss_are_those_of_finite_differences(exact
     exact.renderer.backward()
     gradients, camera = exact.gaussians.gradients_to_numpy(), exact.renderer.camera_gradient()
     for name, analytic in gradients.items():
-        numeric = np.zeros_like(analytic)
-        for index in np.ndindex(*analytic.shape):
-            values = []
-            for sign in (1, -1):
-                moved = {key: value.copy() for key, value in state.items()}
-                moved[name][index] += sign * STEP
-                values.append(loss_of(exact, store, moved, POSE))
-            numeric[index] = (values[0] - values[1]) / (2 * STEP)
+        numeric = central_differences(lambda moved: loss_of(exact, store, moved, POSE), state, name)
         assert np.abs(analytic - numeric).max() < 1e-4 * np.abs(numeric).max(), name
     numeric = np.zeros(6)
     for k in range(6):
