@@ -25,6 +25,8 @@ OPAQUE = 1e-5
 # Gaussians between two tests of whether the whole tile is opaque.
 TEST_EVERY = 16
 ROW_BITS = TILE_WIDTH.bit_length() - 1
+# Taichi hands out 512 iterations of a parallel loop at a time: one tile every 64 makes tasks of eight tiles.
+SPREAD = 64
 
 
 @ti.data_oriented
@@ -52,66 +54,71 @@ class Compositing:
 
     @ti.kernel
     def _forward(self, width: ti.i32, height: ti.i32):
-        ti.loop_config(block_dim=1)
-        for tile in range(((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)):
-            tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-            base = tile * TILE_PIXELS
-            for p in range(TILE_PIXELS):
-                self.images.transmittance[base + p] = 1.0
-                self.images.red[base + p] = 0.0
-                self.images.green[base + p] = 0.0
-                self.images.blue[base + p] = 0.0
-                self.images.z[base + p] = 0.0
-            # Pixel centres relative to the mean, without the half pixel.
-            left = ti.cast(tile % tiles_x * TILE_WIDTH, self.real) + 0.5
-            top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
-            first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
-            reached = 0
-            clearest = ti.cast(1.0, self.real)
-            for block in range((count + TEST_EVERY - 1) // TEST_EVERY):
-                # An empty range rather than a `while` or `break`: with those Taichi fetches every field's root anew at
-                # each pixel, and LLVM gives the inner loop up.
-                start = block * TEST_EVERY
-                end = ti.select(clearest > OPAQUE, ti.min(start + TEST_EVERY, count), start)
-                for k in range(first + start, first + end):
-                    s, rows = self.pairs.slot[k], self.pairs.rows[k]
-                    mean, conic = self.projected.mean[s], self.projected.conic[s]
-                    opacity, colour = self.projected.opacity[s], self.projected.colour[s]
-                    z = self.projected.depth[s]
-                    x0, y0 = left - mean[0], top - mean[1]
-                    a, b, c = -0.5 * conic[0], -conic[1], -0.5 * conic[2]
-                    for p in range((rows & 0xFFFF) << ROW_BITS, (rows >> 16) << ROW_BITS):
-                        dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
-                        dy = y0 + ti.cast(p >> ROW_BITS, self.real)
-                        power = (a * dx + b * dy) * dx + c * dy * dy
-                        alpha = ti.min(opacity * fast_exp(power, self.real), ALPHA_MAX)
-                        T = self.images.transmittance[base + p]
-                        alpha = ti.select((alpha >= ALPHA_MIN) & (T > OPAQUE), alpha, 0.0)
-                        weight = alpha * T
-                        self.images.red[base + p] = self.images.red[base + p] + weight * colour[0]
-                        self.images.green[base + p] = self.images.green[base + p] + weight * colour[1]
-                        self.images.blue[base + p] = self.images.blue[base + p] + weight * colour[2]
-                        self.images.z[base + p] = self.images.z[base + p] + weight * z
-                        self.images.transmittance[base + p] = T - weight
-                reached = ti.select(end > start, end, reached)
-                clearest = ti.cast(0.0, self.real)
-                for p in range(TILE_PIXELS):
-                    clearest = ti.max(clearest, self.images.transmittance[base + p])
-            self.pairs.reached[tile] = reached
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        for spread in range(tiles * SPREAD):
+            if spread % SPREAD == 0:
+                self._forward_tile(spread // SPREAD, width, height)
 
-            stride, plane = ti.static(self.images.stride, self.images.plane)
-            columns = ti.min(TILE_WIDTH, width - tile % tiles_x * TILE_WIDTH)
-            background = self.images.background[None]
-            for row in range(ti.min(TILE_HEIGHT, height - tile // tiles_x * TILE_HEIGHT)):
-                source = base + row * TILE_WIDTH
-                target = (tile // tiles_x * TILE_HEIGHT + row + PAD) * stride + tile % tiles_x * TILE_WIDTH + PAD
-                for x in range(columns):
-                    T = self.images.transmittance[source + x]
-                    self.images.colour[target + x] = self.images.red[source + x] + T * background[0]
-                    self.images.colour[target + plane + x] = self.images.green[source + x] + T * background[1]
-                    self.images.colour[target + 2 * plane + x] = self.images.blue[source + x] + T * background[2]
-                    self.images.depth[target + x] = self.images.z[source + x]
-                    self.images.opacity[target + x] = 1.0 - T
+    @ti.func
+    def _forward_tile(self, tile, width, height):
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        base = tile * TILE_PIXELS
+        for p in range(TILE_PIXELS):
+            self.images.transmittance[base + p] = 1.0
+            self.images.red[base + p] = 0.0
+            self.images.green[base + p] = 0.0
+            self.images.blue[base + p] = 0.0
+            self.images.z[base + p] = 0.0
+        # Pixel centres relative to the mean, without the half pixel.
+        left = ti.cast(tile % tiles_x * TILE_WIDTH, self.real) + 0.5
+        top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
+        first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
+        reached = 0
+        clearest = ti.cast(1.0, self.real)
+        for block in range((count + TEST_EVERY - 1) // TEST_EVERY):
+            # An empty range rather than a `while` or `break`: with those Taichi fetches every field's root anew at
+            # each pixel, and LLVM gives the inner loop up.
+            start = block * TEST_EVERY
+            end = ti.select(clearest > OPAQUE, ti.min(start + TEST_EVERY, count), start)
+            for k in range(first + start, first + end):
+                s, rows = self.pairs.slot[k], self.pairs.rows[k]
+                mean, conic = self.projected.mean[s], self.projected.conic[s]
+                opacity, colour = self.projected.opacity[s], self.projected.colour[s]
+                z = self.projected.depth[s]
+                x0, y0 = left - mean[0], top - mean[1]
+                a, b, c = -0.5 * conic[0], -conic[1], -0.5 * conic[2]
+                for p in range((rows & 0xFFFF) << ROW_BITS, (rows >> 16) << ROW_BITS):
+                    dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
+                    dy = y0 + ti.cast(p >> ROW_BITS, self.real)
+                    power = (a * dx + b * dy) * dx + c * dy * dy
+                    alpha = ti.min(opacity * fast_exp(power, self.real), ALPHA_MAX)
+                    T = self.images.transmittance[base + p]
+                    alpha = ti.select((alpha >= ALPHA_MIN) & (T > OPAQUE), alpha, 0.0)
+                    weight = alpha * T
+                    self.images.red[base + p] = self.images.red[base + p] + weight * colour[0]
+                    self.images.green[base + p] = self.images.green[base + p] + weight * colour[1]
+                    self.images.blue[base + p] = self.images.blue[base + p] + weight * colour[2]
+                    self.images.z[base + p] = self.images.z[base + p] + weight * z
+                    self.images.transmittance[base + p] = T - weight
+            reached = ti.select(end > start, end, reached)
+            clearest = ti.cast(0.0, self.real)
+            for p in range(TILE_PIXELS):
+                clearest = ti.max(clearest, self.images.transmittance[base + p])
+        self.pairs.reached[tile] = reached
+
+        stride, plane = ti.static(self.images.stride, self.images.plane)
+        columns = ti.min(TILE_WIDTH, width - tile % tiles_x * TILE_WIDTH)
+        background = self.images.background[None]
+        for row in range(ti.min(TILE_HEIGHT, height - tile // tiles_x * TILE_HEIGHT)):
+            source = base + row * TILE_WIDTH
+            target = (tile // tiles_x * TILE_HEIGHT + row + PAD) * stride + tile % tiles_x * TILE_WIDTH + PAD
+            for x in range(columns):
+                T = self.images.transmittance[source + x]
+                self.images.colour[target + x] = self.images.red[source + x] + T * background[0]
+                self.images.colour[target + plane + x] = self.images.green[source + x] + T * background[1]
+                self.images.colour[target + 2 * plane + x] = self.images.blue[source + x] + T * background[2]
+                self.images.depth[target + x] = self.images.z[source + x]
+                self.images.opacity[target + x] = 1.0 - T
 
     @ti.kernel
     def _backward(self, width: ti.i32, height: ti.i32):
@@ -125,91 +132,96 @@ class Compositing:
     def _backward_tiles(self, width, height, with_depth: ti.template()):
         # Front to back again, as the forward pass went, so that the same Gaussians are masked and left out. What lies
         # behind a Gaussian enters as one number a pixel: `behind` = <gradient, all that is still to be composited>.
-        ti.loop_config(block_dim=1)
-        for tile in range(((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)):
-            tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-            base = tile * TILE_PIXELS
-            for p in range(TILE_PIXELS):
-                self.images.transmittance[base + p] = 1.0
-                self.images.behind[base + p] = 0.0
-                self.images.red_grad[base + p] = 0.0
-                self.images.green_grad[base + p] = 0.0
-                self.images.blue_grad[base + p] = 0.0
-                if ti.static(with_depth):
-                    self.images.z_grad[base + p] = 0.0
-            stride, plane = ti.static(self.images.stride, self.images.plane)
-            columns = ti.min(TILE_WIDTH, width - tile % tiles_x * TILE_WIDTH)
-            for row in range(ti.min(TILE_HEIGHT, height - tile // tiles_x * TILE_HEIGHT)):
-                target = base + row * TILE_WIDTH
-                source = (tile // tiles_x * TILE_HEIGHT + row + PAD) * stride + tile % tiles_x * TILE_WIDTH + PAD
-                for x in range(columns):
-                    red_grad = self.images.colour_grad[source + x]
-                    green_grad = self.images.colour_grad[source + plane + x]
-                    blue_grad = self.images.colour_grad[source + 2 * plane + x]
-                    behind = (
-                        red_grad * self.images.colour[source + x]
-                        + green_grad * self.images.colour[source + plane + x]
-                        + blue_grad * self.images.colour[source + 2 * plane + x]
-                        - self.images.opacity_grad[source + x] * (1.0 - self.images.opacity[source + x])
-                    )
-                    if ti.static(with_depth):
-                        z_grad = self.images.depth_grad[source + x]
-                        self.images.z_grad[target + x] = z_grad
-                        behind = behind + z_grad * self.images.depth[source + x]
-                    self.images.red_grad[target + x] = red_grad
-                    self.images.green_grad[target + x] = green_grad
-                    self.images.blue_grad[target + x] = blue_grad
-                    self.images.behind[target + x] = behind
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        for spread in range(tiles * SPREAD):
+            if spread % SPREAD == 0:
+                self._backward_tile(spread // SPREAD, width, height, with_depth)
 
-            left = ti.cast(tile % tiles_x * TILE_WIDTH, self.real) + 0.5
-            top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
-            first, reached = self.pairs.first[tile], self.pairs.reached[tile]
-            for k in range(first, first + reached):
-                s, rows = self.pairs.slot[k], self.pairs.rows[k]
-                mean, conic = self.projected.mean[s], self.projected.conic[s]
-                opacity, colour = self.projected.opacity[s], self.projected.colour[s]
-                z = self.projected.depth[s]
-                x0, y0 = left - mean[0], top - mean[1]
-                a, b, c = -0.5 * conic[0], -conic[1], -0.5 * conic[2]
-                zero = ti.cast(0.0, self.real)
-                g_red, g_green, g_blue, g_z, g_power = zero, zero, zero, zero, zero
-                g_x, g_y, g_xx, g_xy, g_yy = zero, zero, zero, zero, zero
-                for p in range((rows & 0xFFFF) << ROW_BITS, (rows >> 16) << ROW_BITS):
-                    dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
-                    dy = y0 + ti.cast(p >> ROW_BITS, self.real)
-                    power = (a * dx + b * dy) * dx + c * dy * dy
-                    unclamped = opacity * fast_exp(power, self.real)
-                    T = self.images.transmittance[base + p]
-                    alpha = ti.min(unclamped, ALPHA_MAX)
-                    alpha = ti.select((alpha >= ALPHA_MIN) & (T > OPAQUE), alpha, 0.0)
-                    weight = alpha * T
-                    red_grad = self.images.red_grad[base + p]
-                    green_grad = self.images.green_grad[base + p]
-                    blue_grad = self.images.blue_grad[base + p]
-                    shade = colour[0] * red_grad + colour[1] * green_grad + colour[2] * blue_grad
-                    if ti.static(with_depth):
-                        shade = shade + z * self.images.z_grad[base + p]
-                        g_z += weight * self.images.z_grad[base + p]
-                    contribution = weight * shade
-                    behind = self.images.behind[base + p] - contribution
-                    self.images.behind[base + p] = behind
-                    self.images.transmittance[base + p] = T - weight
-                    # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
-                    power_grad = contribution - behind * alpha / (1.0 - alpha)
-                    power_grad = ti.select(unclamped > ALPHA_MAX, 0.0, power_grad)
-                    g_red += weight * red_grad
-                    g_green += weight * green_grad
-                    g_blue += weight * blue_grad
-                    g_power += power_grad
-                    ux, uy = power_grad * dx, power_grad * dy
-                    g_x += ux
-                    g_y += uy
-                    g_xx += ux * dx
-                    g_xy += ux * dy
-                    g_yy += uy * dy
-                self.pairs.gradient[k] = ti.Vector([g_red, g_green, g_blue, g_z, g_power, g_x, g_y, g_xx, g_xy, g_yy])
-            for k in range(first + reached, first + self.pairs.tile_count[tile]):
-                self.pairs.gradient[k].fill(0.0)
+    @ti.func
+    def _backward_tile(self, tile, width, height, with_depth: ti.template()):
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        base = tile * TILE_PIXELS
+        for p in range(TILE_PIXELS):
+            self.images.transmittance[base + p] = 1.0
+            self.images.behind[base + p] = 0.0
+            self.images.red_grad[base + p] = 0.0
+            self.images.green_grad[base + p] = 0.0
+            self.images.blue_grad[base + p] = 0.0
+            if ti.static(with_depth):
+                self.images.z_grad[base + p] = 0.0
+        stride, plane = ti.static(self.images.stride, self.images.plane)
+        columns = ti.min(TILE_WIDTH, width - tile % tiles_x * TILE_WIDTH)
+        for row in range(ti.min(TILE_HEIGHT, height - tile // tiles_x * TILE_HEIGHT)):
+            target = base + row * TILE_WIDTH
+            source = (tile // tiles_x * TILE_HEIGHT + row + PAD) * stride + tile % tiles_x * TILE_WIDTH + PAD
+            for x in range(columns):
+                red_grad = self.images.colour_grad[source + x]
+                green_grad = self.images.colour_grad[source + plane + x]
+                blue_grad = self.images.colour_grad[source + 2 * plane + x]
+                behind = (
+                    red_grad * self.images.colour[source + x]
+                    + green_grad * self.images.colour[source + plane + x]
+                    + blue_grad * self.images.colour[source + 2 * plane + x]
+                    - self.images.opacity_grad[source + x] * (1.0 - self.images.opacity[source + x])
+                )
+                if ti.static(with_depth):
+                    z_grad = self.images.depth_grad[source + x]
+                    self.images.z_grad[target + x] = z_grad
+                    behind = behind + z_grad * self.images.depth[source + x]
+                self.images.red_grad[target + x] = red_grad
+                self.images.green_grad[target + x] = green_grad
+                self.images.blue_grad[target + x] = blue_grad
+                self.images.behind[target + x] = behind
+
+        left = ti.cast(tile % tiles_x * TILE_WIDTH, self.real) + 0.5
+        top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
+        first, reached = self.pairs.first[tile], self.pairs.reached[tile]
+        for k in range(first, first + reached):
+            s, rows = self.pairs.slot[k], self.pairs.rows[k]
+            mean, conic = self.projected.mean[s], self.projected.conic[s]
+            opacity, colour = self.projected.opacity[s], self.projected.colour[s]
+            z = self.projected.depth[s]
+            x0, y0 = left - mean[0], top - mean[1]
+            a, b, c = -0.5 * conic[0], -conic[1], -0.5 * conic[2]
+            zero = ti.cast(0.0, self.real)
+            g_red, g_green, g_blue, g_z, g_power = zero, zero, zero, zero, zero
+            g_x, g_y, g_xx, g_xy, g_yy = zero, zero, zero, zero, zero
+            for p in range((rows & 0xFFFF) << ROW_BITS, (rows >> 16) << ROW_BITS):
+                dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
+                dy = y0 + ti.cast(p >> ROW_BITS, self.real)
+                power = (a * dx + b * dy) * dx + c * dy * dy
+                unclamped = opacity * fast_exp(power, self.real)
+                T = self.images.transmittance[base + p]
+                alpha = ti.min(unclamped, ALPHA_MAX)
+                alpha = ti.select((alpha >= ALPHA_MIN) & (T > OPAQUE), alpha, 0.0)
+                weight = alpha * T
+                red_grad = self.images.red_grad[base + p]
+                green_grad = self.images.green_grad[base + p]
+                blue_grad = self.images.blue_grad[base + p]
+                shade = colour[0] * red_grad + colour[1] * green_grad + colour[2] * blue_grad
+                if ti.static(with_depth):
+                    shade = shade + z * self.images.z_grad[base + p]
+                    g_z += weight * self.images.z_grad[base + p]
+                contribution = weight * shade
+                behind = self.images.behind[base + p] - contribution
+                self.images.behind[base + p] = behind
+                self.images.transmittance[base + p] = T - weight
+                # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
+                power_grad = contribution - behind * alpha / (1.0 - alpha)
+                power_grad = ti.select(unclamped > ALPHA_MAX, 0.0, power_grad)
+                g_red += weight * red_grad
+                g_green += weight * green_grad
+                g_blue += weight * blue_grad
+                g_power += power_grad
+                ux, uy = power_grad * dx, power_grad * dy
+                g_x += ux
+                g_y += uy
+                g_xx += ux * dx
+                g_xy += ux * dy
+                g_yy += uy * dy
+            self.pairs.gradient[k] = ti.Vector([g_red, g_green, g_blue, g_z, g_power, g_x, g_y, g_xx, g_xy, g_yy])
+        for k in range(first + reached, first + self.pairs.tile_count[tile]):
+            self.pairs.gradient[k].fill(0.0)
 
     @ti.kernel
     def _gather(self, slots: ti.i32, pairs: ti.i32):
