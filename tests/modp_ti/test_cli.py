@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 import types
 from pathlib import Path
 
@@ -127,10 +126,9 @@ def python(code: str) -> subprocess.CompletedProcess[str]:
 HEAVY = "('taichi', 'torch', 'open3d', 'cv2', 'pycolmap')"
 
 
-def test_help_imports_nothing_heavy_and_is_quick():
+def test_help_imports_nothing_heavy():
     code = f"import sys, modp_ti.cli; print([name for name in {HEAVY} if name in sys.modules])"
     assert python(code).stdout.strip() == "[]"
-    start = time.perf_counter()
     result = subprocess.run(
         [sys.executable, "-m", "modp_ti.cli", "--help"],
         cwd=PROJECT,
@@ -138,7 +136,6 @@ def test_help_imports_nothing_heavy_and_is_quick():
         text=True,
         check=True,
     )
-    assert time.perf_counter() - start < 3.0  # 0.25 s on an idle machine
     assert "run" in result.stdout
 
 
