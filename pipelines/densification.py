@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -88,9 +89,15 @@ def error_pixels(
     return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
 
 
-def pixel_seeds(view: Keyframe, pixels: NDArray[np.float64], estimator: DepthEstimator, max_deviation: float) -> Seeds:
+def pixel_seeds(
+    view: Keyframe,
+    neighbours: Sequence[Keyframe],
+    pixels: NDArray[np.float64],
+    estimator: DepthEstimator,
+    max_deviation: float,
+) -> Seeds:
     """Seeds at pixels (N, 2) whose depth the estimator knows well enough."""
-    estimate = estimator.estimate(view, pixels)
+    estimate = estimator.estimate(view, neighbours, pixels)
     sure = estimate.deviation < max_deviation
     camera_points = view.camera.unproject(pixels[sure], estimate.depth[sure])
     T_world_camera = inverse_se3(view.T_camera_world)

@@ -128,7 +128,7 @@ class OnlineMapper:
                 self.optimiser.compare(view, self.keyframes.scene_depth)
                 error = dissimilarity(self.renderer.images.colour_to_numpy(), view.rgba)
             pixels = error_pixels(view, error, self.settings.densify, self.rng)
-            seeds = pixel_seeds(view, pixels, self.depth, self.settings.depth.max_deviation)
+            seeds = pixel_seeds(view, (), pixels, self.depth, self.settings.depth.max_deviation)
         self._grow(seeds, view)
 
     def _grow(self, seeds, view: Keyframe) -> None:

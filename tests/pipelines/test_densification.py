@@ -38,7 +38,7 @@ def view(count: int = 40, mask: np.ndarray | None = None) -> Keyframe:
 class Wall:
     """A depth estimator that knows a wall at depth 5, on the left half only."""
 
-    def estimate(self, view: Keyframe, pixels: np.ndarray) -> DepthEstimate:
+    def estimate(self, view: Keyframe, neighbours, pixels: np.ndarray) -> DepthEstimate:
         return DepthEstimate(np.full(len(pixels), 5.0), np.where(pixels[:, 0] < 80, 0.01, 1.0))
 
 
@@ -116,7 +116,7 @@ def test_the_warm_up_draws_from_the_whole_image() -> None:
 
 def test_pixel_seeds_lie_on_their_rays_at_the_estimated_depth_where_it_is_known() -> None:
     pixels = np.array([[10.5, 20.5], [70.5, 100.5], [120.5, 60.5]])
-    seeds = pixel_seeds(view(), pixels, Wall(), 0.06)
+    seeds = pixel_seeds(view(), [], pixels, Wall(), 0.06)
     local = seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3]
     np.testing.assert_allclose(local[:, 2], 5.0)
     np.testing.assert_allclose(CAMERA.project(local), pixels[:2])

@@ -36,7 +36,7 @@ def grid() -> np.ndarray:
 
 def test_a_smooth_surface_is_found_between_its_points(grid: np.ndarray) -> None:
     asked = np.random.default_rng(1).uniform([5, 5], [155, 115], (200, 2))
-    estimate = estimator().estimate(view(grid, surface(grid)), asked)
+    estimate = estimator().estimate(view(grid, surface(grid)), [], asked)
     error = np.abs(np.log(estimate.depth / surface(asked)))
     assert np.median(error) < 0.003
     assert (estimate.deviation < 0.06).all()
@@ -48,8 +48,8 @@ def test_points_are_met_and_far_from_them_nothing_is_known(grid: np.ndarray) -> 
     rng = np.random.default_rng(2)
     depth = surface(corner) * np.exp(rng.normal(0, 0.3, len(corner)))  # rough: short correlation
     v = view(corner, depth)
-    at = estimator().estimate(v, corner)
-    away = estimator().estimate(v, np.array([[155.0, 115.0]]))
+    at = estimator().estimate(v, [], corner)
+    away = estimator().estimate(v, [], np.array([[155.0, 115.0]]))
     assert at.deviation.max() < 0.7 * away.deviation[0]
     assert away.deviation[0] == pytest.approx(0.3, rel=0.5)
 
@@ -59,7 +59,7 @@ def test_the_process_is_the_closed_form(grid: np.ndarray) -> None:
     process = estimator()
     process.LENGTHS, process.NOISE_RATIOS = (0.3,), (1e-2,)  # nothing to choose
     asked = np.array([[33.0, 44.0], [99.0, 12.0]])
-    estimate = process.estimate(view(few, surface(few)), asked)
+    estimate = process.estimate(view(few, surface(few)), [], asked)
 
     def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         r = np.sqrt(3) * np.linalg.norm(a[:, None] - b[None], axis=2) / 160 / 0.3
@@ -77,26 +77,26 @@ def test_the_process_is_the_closed_form(grid: np.ndarray) -> None:
 
 def test_scale_changes_the_depth_and_not_its_deviation(grid: np.ndarray) -> None:
     asked = np.array([[33.0, 44.0], [99.0, 12.0]])
-    one = estimator().estimate(view(grid, surface(grid)), asked)
-    hundred = estimator().estimate(view(grid, 100 * surface(grid)), asked)
+    one = estimator().estimate(view(grid, surface(grid)), [], asked)
+    hundred = estimator().estimate(view(grid, 100 * surface(grid)), [], asked)
     np.testing.assert_allclose(hundred.depth, 100 * one.depth, rtol=1e-9)
     np.testing.assert_allclose(hundred.deviation, one.deviation, rtol=1e-6)
 
 
 def test_points_behind_the_camera_or_outside_the_image_have_no_say(grid: np.ndarray) -> None:
     asked = np.array([[33.0, 44.0]])
-    clean = estimator().estimate(view(grid, surface(grid)), asked)
+    clean = estimator().estimate(view(grid, surface(grid)), [], asked)
     wrong = np.array([[40.0, 40.0], [-30.0, 50.0]])
     mixed = view(np.concatenate([grid, wrong]), np.concatenate([surface(grid), [-3.0, 9.0]]))
-    np.testing.assert_array_equal(estimator().estimate(mixed, asked).depth, clean.depth)
+    np.testing.assert_array_equal(estimator().estimate(mixed, [], asked).depth, clean.depth)
 
 
 def test_no_more_points_than_allowed_condition_it(grid: np.ndarray) -> None:
-    estimate = estimator(max_points=20).estimate(view(grid, surface(grid)), grid)
+    estimate = estimator(max_points=20).estimate(view(grid, surface(grid)), [], grid)
     assert np.count_nonzero(estimate.deviation < 0.02) < len(grid)
     assert np.median(np.abs(np.log(estimate.depth / surface(grid)))) < 0.05
 
 
 def test_without_points_nothing_is_known() -> None:
-    estimate = estimator().estimate(view(np.zeros((0, 2)), np.zeros(0)), np.array([[3.0, 3.0]]))
+    estimate = estimator().estimate(view(np.zeros((0, 2)), np.zeros(0)), [], np.array([[3.0, 3.0]]))
     assert np.isinf(estimate.deviation).all()

@@ -1,39 +1,19 @@
-"""Depth of pixels that no tracked point covers (Section 3.2.2, high error regions)."""
+"""Gaussian process on the log depths of a view's tracked points, with a constant kernel."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from fields.keyframes import Keyframe
+from pipelines.depth.covariance import matern32
+from pipelines.depth.estimate import DepthEstimate, point_depths, unknown_depth
 from pipelines.settings import DepthSettings
 
-__all__ = ["DepthEstimate", "DepthEstimator", "GaussianProcessDepth", "matern32"]
-
-
-@dataclass(frozen=True)
-class DepthEstimate:
-    """depth (N,) [scene units] and the standard deviation of its logarithm (N,), of N pixels."""
-
-    depth: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-
-
-class DepthEstimator(Protocol):
-    """Estimates depth where it is asked for."""
-
-    def estimate(self, view: Keyframe, pixels: NDArray[np.float64]) -> DepthEstimate:
-        """Depth of the pixels (N, 2) as (x, y) of `view`; infinite deviation where nothing is known."""
-
-
-def matern32(distance: torch.Tensor) -> torch.Tensor:
-    """Matern 3/2 correlation of distances in units of the length scale."""
-    r = np.sqrt(3.0) * distance
-    return (1.0 + r) * torch.exp(-r)
+__all__ = ["GaussianProcessDepth"]
 
 
 class GaussianProcessDepth:
@@ -53,17 +33,18 @@ class GaussianProcessDepth:
         self.settings = settings
         self._rng = rng
 
-    def estimate(self, view: Keyframe, pixels: NDArray[np.float64]) -> DepthEstimate:
-        z = view.points.xyz @ view.T_camera_world[2, :3] + view.T_camera_world[2, 3]
-        usable = np.flatnonzero((z > 0) & view.camera.contains(view.points.pixels))
-        if len(usable) > self.settings.max_points:
-            usable = np.sort(self._rng.choice(usable, self.settings.max_points, replace=False))
-        if len(usable) < 3 or len(pixels) == 0:
-            return DepthEstimate(np.ones(len(pixels)), np.full(len(pixels), np.inf))
+    def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
+        """See `DepthEstimator`. Three tracked points are the least that it works with."""
+        places, z = point_depths(view)
+        if len(z) > self.settings.max_points:
+            some = np.sort(self._rng.choice(len(z), self.settings.max_points, replace=False))
+            places, z = places[some], z[some]
+        if len(z) < 3 or len(pixels) == 0:
+            return unknown_depth(len(pixels))
         side = max(view.camera.width, view.camera.height)
-        known = torch.from_numpy(view.points.pixels[usable] / side)
+        known = torch.from_numpy(places / side)
         asked = torch.from_numpy(np.asarray(pixels, dtype=np.float64) / side)
-        y = torch.from_numpy(np.log(z[usable]))
+        y = torch.from_numpy(np.log(z))
         mean = y.mean()
         some = slice(None, None, max(len(y) // self.FIT_POINTS, 1))
         length, ratio, variance = self._fit(known[some], (y - mean)[some])
