@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from fields.keyframes import Keyframe
 from pipelines.depth.covariance import matern32
-from pipelines.depth.estimate import DepthEstimate, point_depths, unknown_depth
+from pipelines.depth.estimate import DepthEstimate, unknown_depth
+from pipelines.depth.regression import MIN_POINTS, conditioning_points, regress_log_depth
 from pipelines.settings import DepthSettings
 
 __all__ = ["GaussianProcessDepth"]
@@ -34,27 +35,19 @@ class GaussianProcessDepth:
         self._rng = rng
 
     def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
-        """See `DepthEstimator`. Three tracked points are the least that it works with."""
-        places, z = point_depths(view)
-        if len(z) > self.settings.max_points:
-            some = np.sort(self._rng.choice(len(z), self.settings.max_points, replace=False))
-            places, z = places[some], z[some]
-        if len(z) < 3 or len(pixels) == 0:
+        """See `DepthEstimator`. Fewer than MIN_POINTS tracked points leave every pixel unknown."""
+        places, z = conditioning_points(view, self.settings.max_points, self._rng)
+        if len(z) < MIN_POINTS or len(pixels) == 0:
             return unknown_depth(len(pixels))
         side = max(view.camera.width, view.camera.height)
         known = torch.from_numpy(places / side)
         asked = torch.from_numpy(np.asarray(pixels, dtype=np.float64) / side)
         y = torch.from_numpy(np.log(z))
-        mean = y.mean()
         some = slice(None, None, max(len(y) // self.FIT_POINTS, 1))
-        length, ratio, variance = self._fit(known[some], (y - mean)[some])
-        K = matern32(torch.cdist(known, known) / length)
-        L = torch.linalg.cholesky(K + ratio * torch.eye(len(y), dtype=torch.float64))
-        k = matern32(torch.cdist(asked, known) / length)
-        log_depth = mean + k @ torch.cholesky_solve((y - mean)[:, None], L)[:, 0]
-        half = torch.linalg.solve_triangular(L, k.T, upper=False)
-        deviation = torch.sqrt(variance * (1.0 - (half * half).sum(0)).clamp_min(0.0))
-        return DepthEstimate(torch.exp(log_depth).numpy(), deviation.numpy())
+        length, ratio, variance = self._fit(known[some], (y - y.mean())[some])
+        K = variance * matern32(torch.cdist(known, known) / length)
+        k = variance * matern32(torch.cdist(asked, known) / length)
+        return regress_log_depth(z, K, ratio * variance, k, variance)
 
     def _fit(self, known: torch.Tensor, y: torch.Tensor) -> tuple[float, float, float]:
         """(length scale, noise / signal, signal variance) of greatest likelihood; the variance in closed form."""
