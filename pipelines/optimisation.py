@@ -38,29 +38,36 @@ class MapOptimiser:
             colour=o.colour_rate,
         )
 
-    def compare(self, view: Keyframe, scene_depth: float) -> LossValues:
-        """Render a keyframe into the renderer's images and evaluate the loss against its image."""
-        self.renderer.forward(view.camera, view.T_camera_world, self.settings.near * scene_depth)
-        self.renderer.images.set_reference(view.rgba)
+    def compare(self, view: Keyframe, scene_depth: float, level: int = 0) -> LossValues:
+        """Render a keyframe into the renderer's images and evaluate the loss against its image of a pyramid level."""
+        image = view.pyramid[min(level, len(view.pyramid) - 1)]
+        self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth)
+        self.renderer.images.set_reference(image.rgba)
         return self.loss.forward()
 
     def step(
-        self,
-        store: KeyframeStore,
-        views: list[int],
-        rates: LearningRates,
-        refine_poses: bool,
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, refine_poses: bool, level: int = 0
     ) -> float:
-        """One Adam step on the mean loss of the views (indices into `store`); return their mean PSNR.
+        """Adam steps on the mean loss of the views (indices into `store`), in batches; return their mean PSNR.
 
         The keyframes' errors are brought up to date. Poses move only where `refine_poses`.
         """
+        size = self.settings.optimise.batch
+        total = 0.0
+        for first in range(0, len(views), size):
+            batch = views[first : first + size]
+            total += len(batch) * self._step(store, batch, rates, refine_poses, level)
+        return total / len(views)
+
+    def _step(
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, refine_poses: bool, level: int
+    ) -> float:
         o = self.settings.optimise
         psnr = 0.0
         pose_gradients: dict[int, np.ndarray] = {}
         for j in views:
             view = store[j]
-            values = self.compare(view, store.scene_depth)
+            values = self.compare(view, store.scene_depth, level)
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
             self.renderer.backward()
             view.error = values.l1

@@ -5,12 +5,16 @@ a `view scale` is the median of depth / focal length over a view's tracked point
 out there; the `scene depth` is the median depth of the tracked points over all keyframes.
 """
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = [
     "DensifySettings",
     "DepthSettings",
+    "EpipolarSettings",
     "KeyframeSettings",
+    "LevelSettings",
     "MappingSettings",
     "OptimiseSettings",
     "PoseSettings",
@@ -47,13 +51,36 @@ class KeyframeSettings(StrictModel):
     min_points: int = Field(10, ge=0, description="tracked points that a keyframe needs")
 
 
-class DepthSettings(StrictModel):
-    """Depth of pixels without a tracked point: Gaussian process on the log depths of the tracked points."""
+class EpipolarSettings(StrictModel):
+    """Search along epipolar lines in neighbour keyframes."""
 
+    views: int = Field(4, ge=1, description="neighbours that are searched")
+    parallax: float = Field(0.1, gt=0, description="baseline to them that is preferred [the view's median depths]")
+    max_samples: int = Field(96, ge=8, description="samples of inverse depth along a line at most")
+    min_score: float = Field(0.8, ge=-1, le=1, description="correlation (ZNCC) that a match must have")
+    min_lead: float = Field(0.05, ge=0, le=2, description="by how much it must beat all others along the line")
+    pixel_noise: float = Field(0.2, ge=0, description="standard deviation of a sharp match [px]")
+
+
+DepthSource = Literal["constant", "image", "depthcov", "epipolar", "map"]
+
+
+class DepthSettings(StrictModel):
+    """Depth of pixels without a tracked point (Section 3.2.2)."""
+
+    sources: tuple[DepthSource, ...] = Field(
+        ("image", "epipolar", "map"),
+        min_length=1,
+        description="estimators that are fused by inverse variance: Gaussian processes on the tracked points with a "
+        "constant kernel (constant), one that follows the image (image) or DepthCov's (depthcov); matches in other "
+        "keyframes (epipolar); the render of the map (map)",
+    )
     max_points: int = Field(500, ge=10, description="tracked points that condition the process, drawn at random beyond")
     max_deviation: float = Field(
         0.06, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
     )
+    neighbours: int = Field(10, ge=0, description="latest other keyframes among which matches are looked for")
+    epipolar: EpipolarSettings = EpipolarSettings()
 
 
 class DensifySettings(StrictModel):
@@ -110,8 +137,23 @@ class PoseSettings(StrictModel):
     )
 
 
+class LevelSettings(StrictModel):
+    """Image pyramid: the level that a new keyframe is optimised and densified on."""
+
+    probabilities: tuple[float, ...] = Field(
+        (0.4, 0.3, 0.2, 0.1),
+        min_length=1,
+        max_length=8,
+        description="of drawing the full size, the half, the quarter, ...; [1] for full size only",
+    )
+
+
 class OptimiseSettings(StrictModel):
     """Loss and learning rates."""
+
+    batch: int = Field(
+        6, ge=1, description="views whose gradients make one Adam step; the views of a step are shared out"
+    )
 
     steps: int = Field(25, ge=0, description="steps per keyframe")
     last_steps: int = Field(40, ge=0, description="steps after the last frame")
@@ -141,6 +183,7 @@ class MappingSettings(StrictModel):
     densify: DensifySettings = DensifySettings()
     depth: DepthSettings = DepthSettings()
     voxels: VoxelSettings = VoxelSettings()
+    levels: LevelSettings = LevelSettings()
     views: ViewSettings = ViewSettings()
     poses: PoseSettings = PoseSettings()
     optimise: OptimiseSettings = OptimiseSettings()
