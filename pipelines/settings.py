@@ -133,8 +133,10 @@ class PoseSettings(StrictModel):
     enabled: bool = Field(True, description="refine keyframe poses while mapping")
     steps: int = Field(8, ge=0, description="first steps of a keyframe that also refine poses")
     learning_rate: float = Field(
-        1e-5, ge=0, description="Adam step of rotation [rad] and of translation [scene depths]"
+        1e-5, gt=0, description="Adam step of rotation [rad] and of translation [scene depths]"
     )
+    align_steps: int = Field(0, ge=0, description="steps that first align a new keyframe with the map as it stands")
+    align_rate: float = Field(1e-3, gt=0, description="first Adam step of that, as learning_rate; falls to a twentieth")
 
 
 class LevelSettings(StrictModel):

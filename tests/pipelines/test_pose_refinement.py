@@ -12,7 +12,7 @@ from fields.keyframes import Keyframe, KeyframeStore
 from fields.se3 import exp_se3, inverse_se3, log_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from pipelines.losses import PhotometricLoss
-from pipelines.pose_refinement import PoseRefinement
+from pipelines.pose_refinement import PoseAlignment, PoseRefinement
 from pipelines.rendering import Renderer
 from pipelines.settings import PoseSettings
 
@@ -47,6 +47,39 @@ def test_a_moved_pose_comes_back_when_only_poses_are_stepped(renderers: Callable
     assert np.linalg.norm(left[3:]) < 0.5 * np.linalg.norm(offset[3:])
     for name, value in renderer.gaussians.to_numpy().items():
         np.testing.assert_array_equal(value, before[name])
+
+
+def test_a_new_view_is_aligned_with_the_map_and_the_map_stays(renderers: Callable[..., Renderer]) -> None:
+    renderer = renderers(0, ti.f32)
+    renderer.gaussians.load(random_gaussians(400, seed=21, size=(3.0, 8.0), logit=(2.0, 4.0)))
+    before = renderer.gaussians.to_numpy()
+    offset = np.array([1.0, -1.0, 1.0, -1.0, 1.0, 1.0]) * np.repeat([0.01 * 4, 0.005], 3)
+    view = keyframe(renderer.render(CAMERA, POSE, NEAR).colour, exp_se3(offset) @ POSE)
+    settings = PoseSettings(align_steps=60, align_rate=1e-3)
+    PoseAlignment(settings, renderer, PhotometricLoss(renderer.images)).align(view, NEAR, scene_depth=4.0)
+
+    def pixels(T: NDArray) -> NDArray:
+        return CAMERA.project(before["position"] @ T[:3, :3].T + T[:3, 3])
+
+    def displaced(T: NDArray) -> float:
+        return float(np.median(np.linalg.norm(pixels(T) - pixels(POSE), axis=1)))
+
+    assert displaced(view.T_camera_world) < 0.3 * displaced(exp_se3(offset) @ POSE)
+    assert view.pose_steps == 0
+    for name, value in renderer.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(value, before[name])
+    for gradient in renderer.gaussians.gradients_to_numpy().values():
+        assert not gradient.any()
+
+
+def test_a_view_of_what_the_map_does_not_hold_is_not_aligned(renderers: Callable[..., Renderer]) -> None:
+    renderer = renderers(0, ti.f32)
+    renderer.gaussians.load(random_gaussians(20, seed=21, size=(0.5, 1.0)))
+    T = exp_se3([0.04, 0.0, 0.0, 0.0, 0.0, 0.0]) @ POSE
+    view = keyframe(renderer.render(CAMERA, POSE, NEAR).colour, T)
+    settings = PoseSettings(align_steps=10)
+    PoseAlignment(settings, renderer, PhotometricLoss(renderer.images)).align(view, NEAR, scene_depth=4.0)
+    np.testing.assert_array_equal(view.T_camera_world, T)
 
 
 def test_the_first_step_is_the_rate_against_the_gradient_with_translation_in_scene_depths() -> None:
