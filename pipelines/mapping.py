@@ -83,8 +83,7 @@ class OnlineMapper:
             view = self.keyframes.append(frame)
             if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align_steps:
                 with self.stopwatch.measure("optimise"):
-                    depth = self.keyframes.scene_depth
-                    self.alignment.align(view, self.settings.near * depth, depth)
+                    self.alignment.align(view, self.settings.near * self.keyframes.scene_depth)
             level = self._draw_level()
             self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
             psnr = self.optimise(self.settings.optimise.steps, level)
@@ -111,7 +110,7 @@ class OnlineMapper:
         """
         if len(self.keyframes) == 0 or len(self.gaussians) == 0:
             return None
-        psnr = None
+        psnr, poses = None, self.settings.poses
         with self.stopwatch.measure("select"):
             self.views.begin(self.keyframes)
         for step in range(steps):
@@ -122,7 +121,7 @@ class OnlineMapper:
                     self.keyframes,
                     views,
                     self.optimiser.rates(self.keyframes.scene_depth),
-                    refine_poses=self.settings.poses.enabled and step < self.settings.poses.steps,
+                    pose_rate=poses.learning_rate if poses.enabled and step < poses.steps else 0.0,
                     level=level,
                 )
         return psnr
@@ -170,7 +169,7 @@ class OnlineMapper:
                 self.voxels.query(view.points.xyz, 1.0)
                 self.voxels.update(np.zeros((0, 3)), 1.0)
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
-            self.optimiser.step(store, [0], self.optimiser.rates(1.0), refine_poses=False)
+            self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()
             self.gaussians.remove(np.zeros(1, dtype=bool))

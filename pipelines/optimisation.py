@@ -46,21 +46,21 @@ class MapOptimiser:
         return self.loss.forward()
 
     def step(
-        self, store: KeyframeStore, views: list[int], rates: LearningRates, refine_poses: bool, level: int = 0
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int = 0
     ) -> float:
         """Adam steps on the mean loss of the views (indices into `store`), in batches; return their mean PSNR.
 
-        The keyframes' errors are brought up to date. Poses move only where `refine_poses`.
+        The keyframes' errors are brought up to date, and their poses but the first are stepped at `pose_rate` [px].
         """
         size = self.settings.optimise.batch
         total = 0.0
         for first in range(0, len(views), size):
             batch = views[first : first + size]
-            total += len(batch) * self._step(store, batch, rates, refine_poses, level)
+            total += len(batch) * self._step(store, batch, rates, pose_rate, level)
         return total / len(views)
 
     def _step(
-        self, store: KeyframeStore, views: list[int], rates: LearningRates, refine_poses: bool, level: int
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int
     ) -> float:
         o = self.settings.optimise
         psnr = 0.0
@@ -72,10 +72,10 @@ class MapOptimiser:
             self.renderer.backward()
             view.error = values.l1
             psnr += values.psnr / len(views)
-            if refine_poses and j > 0:
+            if pose_rate > 0 and j > 0:
                 pose_gradients[j] = pose_gradients.get(j, 0.0) + self.renderer.camera_gradient()
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         self.adam.step(rates, len(views))
         for j, gradient in pose_gradients.items():
-            self.poses.step(store[j], gradient, store.scene_depth)
+            self.poses.step(store[j], gradient, pose_rate)
         return psnr

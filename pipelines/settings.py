@@ -5,9 +5,12 @@ a `view scale` is the median of depth / focal length over a view's tracked point
 out there; the `scene depth` is the median depth of the tracked points over all keyframes.
 """
 
+from __future__ import annotations
+
+from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = [
     "DensifySettings",
@@ -79,8 +82,17 @@ class DepthSettings(StrictModel):
     max_deviation: float = Field(
         0.06, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
     )
+    checkpoint: Path | None = Field(
+        None, description="DepthCov's weights (`scannet.ckpt` or `nyu.ckpt`), a file of the user's own; for depthcov"
+    )
     neighbours: int = Field(10, ge=0, description="latest other keyframes among which matches are looked for")
     epipolar: EpipolarSettings = EpipolarSettings()
+
+    @model_validator(mode="after")
+    def _checkpoint_is_given(self) -> DepthSettings:
+        if "depthcov" in self.sources and self.checkpoint is None:
+            raise ValueError("depthcov needs its weights: set checkpoint")
+        return self
 
 
 class DensifySettings(StrictModel):
@@ -133,10 +145,13 @@ class PoseSettings(StrictModel):
     enabled: bool = Field(True, description="refine keyframe poses while mapping")
     steps: int = Field(8, ge=0, description="first steps of a keyframe that also refine poses")
     learning_rate: float = Field(
-        1e-5, gt=0, description="Adam step of rotation [rad] and of translation [scene depths]"
+        0.01, ge=0, description="Adam step of a pose, as the movement of its tracked points in the image [px]"
+    )
+    prior: float = Field(
+        0.0, ge=0, description="weight of half the squared movement away from the tracked pose [px^2] in the loss"
     )
     align_steps: int = Field(0, ge=0, description="steps that first align a new keyframe with the map as it stands")
-    align_rate: float = Field(1e-3, gt=0, description="first Adam step of that, as learning_rate; falls to a twentieth")
+    align_rate: float = Field(0.3, gt=0, description="first Adam step of that [px]; it falls to a twentieth")
 
 
 class LevelSettings(StrictModel):
@@ -196,5 +211,6 @@ class RefineSettings(StrictModel):
 
     steps: int = Field(1000, ge=0, description="steps over all keyframes after the last frame; 0 for none")
     views: int = Field(4, ge=1, description="views per step, drawn as the global views are")
+    poses: bool = Field(False, description="also refine poses, at a rate that decays as that of positions does")
     position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
     scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")

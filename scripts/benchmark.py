@@ -117,7 +117,7 @@ def measure(width: int, height: int, count: int, threads: int, repeats: int) -> 
         optimiser.adam.step(rates)
 
     figures["projection backward, Adam"] = milliseconds(backward_and_adam)
-    figures["step"] = milliseconds(lambda: optimiser.step(store, [0], rates, refine_poses=False))
+    figures["step"] = milliseconds(lambda: optimiser.step(store, [0], rates, pose_rate=0.0))
     return figures
 
 

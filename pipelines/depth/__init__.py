@@ -1,5 +1,7 @@
 """Depth of pixels that no tracked point covers: one Protocol, several sources, and their fusion."""
 
+from pipelines.depth.depthcov import DepthCov
+from pipelines.depth.depthcov_checkpoint import load_depthcov
 from pipelines.depth.epipolar import EpipolarDepth
 from pipelines.depth.estimate import DepthEstimate, DepthEstimator
 from pipelines.depth.fusion import FusedDepth
@@ -8,6 +10,7 @@ from pipelines.depth.map_depth import MapDepth
 from pipelines.depth.sources import build_depth
 
 __all__ = [
+    "DepthCov",
     "DepthEstimate",
     "DepthEstimator",
     "EpipolarDepth",
@@ -16,4 +19,5 @@ __all__ = [
     "ImageGuidedDepth",
     "MapDepth",
     "build_depth",
+    "load_depthcov",
 ]

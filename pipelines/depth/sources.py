@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipelines.depth.depthcov import DepthCov
+from pipelines.depth.depthcov_checkpoint import load_depthcov
 from pipelines.depth.epipolar import EpipolarDepth
 from pipelines.depth.estimate import DepthEstimator
 from pipelines.depth.fusion import FusedDepth
@@ -16,10 +18,14 @@ __all__ = ["build_depth"]
 
 
 def build_depth(settings: DepthSettings, renderer: Renderer, near: float, rng: np.random.Generator) -> DepthEstimator:
-    """The one estimator of `settings.sources`, or the fusion of several. near: as of `MapDepth`."""
+    """The one estimator of `settings.sources`, or the fusion of several. near: as of `MapDepth`.
+
+    Raises ValueError where DepthCov's checkpoint cannot be used.
+    """
     makers = {
         "constant": lambda: GaussianProcessDepth(settings, rng),
         "image": lambda: ImageGuidedDepth(settings, rng),
+        "depthcov": lambda: DepthCov(settings, load_depthcov(settings.checkpoint), rng),
         "epipolar": lambda: EpipolarDepth(settings.epipolar),
         "map": lambda: MapDepth(renderer, near),
     }
