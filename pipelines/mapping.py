@@ -166,8 +166,7 @@ class OnlineMapper:
             store = KeyframeStore()
             view = store.append(TrackedFrame(0, 0.0, "compile", image, camera, np.eye(4), points))
             if self.voxels is not None:
-                self.voxels.query(view.points.xyz, 1.0)
-                self.voxels.update(np.zeros((0, 3)), 1.0)
+                self.voxels.admit(np.zeros((0, 3)), 1.0)
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.renderer.camera_gradient()
