@@ -79,7 +79,7 @@ class OnlineMapper:
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
-            if self.settings.poses.enabled and self.settings.poses.align:
+            if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
                 self.optimiser.poses.align(view)
             level = self._draw_level()
             self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
