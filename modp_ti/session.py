@@ -27,6 +27,7 @@ from modp_ti.exports.trajectory import write_trajectory
 from modp_ti.progress import ProgressLine
 from modp_ti.trackers import Tracker, frame_count, open_tracker
 from pipelines.mapping import OnlineMapper
+from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
 
 __all__ = ["run_scene"]
@@ -73,7 +74,13 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     for note in tracker.notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
-    mapper = OnlineMapper(config.mapping, first.camera.width, first.camera.height, config.seed)
+    offline = config.mode == "offline"
+    size = (first.camera.width, first.camera.height)
+    mapper: OnlineMapper | OfflineMapper
+    if offline:
+        mapper = OfflineMapper(config.offline, *size, config.seed)
+    else:
+        mapper = OnlineMapper(config.mapping, *size, config.seed)
     watch = mapper.stopwatch
     watch.seconds["track"] = prepared
     with line.working("compiling kernels (the first time on this machine takes longest)"):
@@ -81,17 +88,20 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
 
     poses = Poses()
     tick = time.perf_counter()
-    line.start_mapping(frame_count(tracker))
+    line.start_mapping(frame_count(tracker), "reading" if offline else "mapping")
     for frame in _chain(first, _timed(frames, watch)):
-        if (frame.camera.width, frame.camera.height) != (first.camera.width, first.camera.height):
+        if (frame.camera.width, frame.camera.height) != size:
             raise InputError(
                 f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
                 f"{first.camera.width}x{first.camera.height}: all images of a scene must have one size"
             )
         poses.add(frame)
         line.frame(None if frame.held_out else mapper.process(frame))
-    mapper.finish()
-    online_seconds = time.perf_counter() - tick
+    if offline:
+        _optimise_offline(mapper, line)
+    else:
+        mapper.finish()
+    mapping_seconds = time.perf_counter() - tick
     line.stop()
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -99,8 +109,9 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "give a tracker with points or lower mapping.keyframes.min_points"
         )
 
-    online = mapper.gaussians.to_numpy()
-    if config.refine.steps:
+    unrefined = mapper.gaussians.to_numpy()
+    refined = config.refine.steps > 0 and not offline
+    if refined:
         line.start_refining(config.refine.steps)
         refine(mapper, config.refine, line.refined)
         line.stop()
@@ -113,7 +124,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         write_splats(staging / "splats.ply", mapper.gaussians.to_numpy())
         write_trajectory(staging / "trajectory.txt", poses.timestamp, trajectory)
         saved = read_splats(staging / "splats.ply")
-        states = {"online": online, "refined": saved} if config.refine.steps else {"online": saved}
+        states = {config.mode: unrefined, "refined": saved} if refined else {config.mode: saved}
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
             scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders")
         truth = getattr(tracker, "ground_truth", list)()
@@ -123,10 +134,12 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "gaussians": len(mapper.gaussians),
             "backend": backend,
             "seed": config.seed,
-            "frames_per_second": round(len(poses.index) / online_seconds, 4),
+            "frames_per_second": round(len(poses.index) / mapping_seconds, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "online": scores["online"],
+            "view_renders": mapper.view_renders,
+            "online": scores.get("online"),
             "refined": scores.get("refined"),
+            "offline": scores.get("offline"),
             "seconds": _seconds(watch.seconds, time.perf_counter() - started),
             "ate_rmse": round(absolute_trajectory_error(trajectory, truth), 6) if len(truth) else None,
         }
@@ -139,6 +152,15 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         shutil.rmtree(staging, ignore_errors=True)
     line.summary(metrics)
     return config.output
+
+
+def _optimise_offline(mapper: OfflineMapper, line: ProgressLine) -> None:
+    try:
+        mapper.initialise()
+    except ValueError as error:
+        raise InputError(f"`mode: offline` starts from tracked points: {error}") from None
+    line.start_offline(mapper.settings.steps)
+    mapper.optimise(line.optimised)
 
 
 def _timed(frames: Iterator[TrackedFrame], watch) -> Iterator[TrackedFrame]:
@@ -157,7 +179,7 @@ def _chain(first: TrackedFrame, rest: Iterable[TrackedFrame]) -> Iterator[Tracke
 
 
 def _evaluate(
-    mapper: OnlineMapper,
+    mapper: OnlineMapper | OfflineMapper,
     tracker: Tracker,
     trajectory: list[NDArray[np.float64]],
     states: dict[str, dict[str, NDArray]],
@@ -175,9 +197,7 @@ def _evaluate(
         for name, state in states.items():
             mapper.gaussians.load(state)
             for frame in batch:
-                psnr, ssim, render = score_frame(
-                    mapper.renderer, mapper.optimiser.loss, frame, trajectory[frame.index], near
-                )
+                psnr, ssim, render = score_frame(mapper.renderer, mapper.loss, frame, trajectory[frame.index], near)
                 sets[name]["all"].add(psnr, ssim)
                 if frame.held_out:
                     sets[name]["held_out"].add(psnr, ssim)

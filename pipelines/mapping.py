@@ -57,6 +57,7 @@ class OnlineMapper:
         self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
         self.renderer = Renderer(self.gaussians, max_width, max_height)
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
+        self.loss = self.optimiser.loss
         self.keyframes = KeyframeStore()
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
@@ -64,6 +65,11 @@ class OnlineMapper:
         self.depth = depth or GaussianProcessDepth(settings.depth, self.rng)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self._frames = 0
+
+    @property
+    def view_renders(self) -> int:
+        """Views rendered and differentiated so far, the measure of work that the modes are compared at."""
+        return self.optimiser.view_renders
 
     # ---- the loop --------------------------------------------------------------------------------------------
 
@@ -156,4 +162,5 @@ class OnlineMapper:
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), refine_poses=False)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()
+            self.optimiser.view_renders = 0
             self.gaussians.remove(np.zeros(1, dtype=bool))

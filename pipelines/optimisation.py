@@ -16,7 +16,10 @@ __all__ = ["MapOptimiser"]
 
 
 class MapOptimiser:
-    """Renders with `renderer`, and keeps Gaussians and keyframes in step with their images."""
+    """Renders with `renderer`, and keeps Gaussians and keyframes in step with their images.
+
+    view_renders: views rendered and differentiated so far, the measure of work that the modes are compared at.
+    """
 
     def __init__(self, gaussians: GaussianField, renderer: Renderer, settings: MappingSettings) -> None:
         self.gaussians = gaussians
@@ -26,6 +29,7 @@ class MapOptimiser:
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
         self.poses = PoseRefinement(settings.poses)
+        self.view_renders = 0
 
     def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
         """The settings' learning rates, positions in scene units."""
@@ -56,6 +60,7 @@ class MapOptimiser:
         The keyframes' errors are brought up to date. Poses move only where `refine_poses`.
         """
         o = self.settings.optimise
+        self.view_renders += len(views)
         psnr = 0.0
         pose_gradients: dict[int, np.ndarray] = {}
         for j in views:

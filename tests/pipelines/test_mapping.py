@@ -70,6 +70,8 @@ def psnr(mapper: OnlineMapper, i: int) -> float:
 def test_compiling_leaves_no_trace_in_the_map(mapped: OnlineMapper) -> None:
     assert mapped.keyframes[0].index == 0
     assert len(mapped.keyframes) == 7
+    # One view with the first keyframe, six with each other: 20 steps each and 10 at the end.
+    assert mapped.view_renders == 20 + 6 * (6 * 20 + 10)
     lifted = mapped.gaussians.to_numpy()["position"] @ NORMAL
     np.testing.assert_allclose(lifted, OFFSET, rtol=0.1)  # all of them lie at the wall
 
@@ -99,7 +101,9 @@ def test_refinement_improves_the_map_and_leaves_the_poses(mapped: OnlineMapper) 
     poses = [k.T_camera_world.copy() for k in mapped.keyframes]
     before = np.mean([psnr(mapped, i) for i in range(7)])
     seen = []
-    refine(mapped, RefineSettings(steps=40), lambda step, _: seen.append(step))
+    renders = mapped.view_renders
+    refine(mapped, RefineSettings(steps=40, views=4), lambda step, _: seen.append(step))
+    assert mapped.view_renders == renders + 40 * 4
     assert np.mean([psnr(mapped, i) for i in range(7)]) > before
     assert seen == list(range(1, 41))
     for keyframe, T in zip(mapped.keyframes, poses, strict=True):
