@@ -183,7 +183,9 @@ class OfflineSettings(StrictModel):
     colour_rate: float = Field(
         2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
     )
-    densify_from: int = Field(500, ge=0, description="step after which Gaussians are cloned and split; a twelfth of shorter runs")
+    densify_from: int = Field(
+        500, ge=0, description="step after which Gaussians are cloned and split; at most a twelfth of the run"
+    )
     densify_until: int = Field(15_000, ge=0, description="step of 30,000 at which that ends")
     densify_every: int = Field(100, ge=1, description="steps between; at most a twelfth of the run")
     gradient_threshold: float = Field(

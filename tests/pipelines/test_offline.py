@@ -60,6 +60,24 @@ def test_the_published_run_has_the_published_steps() -> None:
     assert [schedule.sh_degree(step) for step in (1, 999, 1000, 1999, 2000, 3000, 30_000)] == [0, 0, 1, 1, 2, 3, 3]
 
 
+def test_a_shorter_run_keeps_its_shares_but_not_its_waits() -> None:
+    schedule = Schedule.of(OfflineSettings(steps=6000))
+    assert rounds(schedule) == list(range(600, 3000, 100))
+    assert resets(schedule) == [1500]  # not after 600 steps each
+    assert schedule.sh_degree(600) == 3
+    schedule = Schedule.of(OfflineSettings(steps=1500))
+    assert rounds(schedule) == [200, 300, 400, 500, 600, 700]
+    assert resets(schedule) == []
+    assert rounds(Schedule.of(OfflineSettings(steps=120))) == [20, 30, 40, 50]
+    assert Schedule.of(OfflineSettings(steps=1)).sh_degree(1) <= 3
+
+
+def test_a_longer_run_lasts_longer_in_all_its_parts() -> None:
+    schedule = Schedule.of(OfflineSettings(steps=60_000))
+    assert rounds(schedule) == list(range(600, 30_000, 100))
+    assert resets(schedule) == [6000, 12_000, 18_000, 24_000]
+
+
 # ---- a map ---------------------------------------------------------------------------------------------------
 
 
