@@ -111,7 +111,6 @@ class OfflineMapper:
         self.adam = Adam(self.gaussians)
         self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
         self.keyframes = KeyframeStore()
-        self.view_renders = 0
 
     def process(self, frame: TrackedFrame) -> FrameReport:
         """Keep the next frame. Held-out frames must not come here: ValueError."""
@@ -163,11 +162,8 @@ class OfflineMapper:
         renderer.images.set_reference(view.rgba)
         values = self.loss.forward()
         self.loss.backward(self.settings.ssim_weight)
-        renderer.compositing.backward()
-        self.density.statistics.observe(renderer.projected, renderer.view)
-        renderer.projection.backward()
+        renderer.backward(observe=self.density.statistics.observe)
         self.adam.step(rates, sh_degree=sh_degree)
-        self.view_renders += 1
         return values.psnr
 
     def compile(self) -> None:
@@ -185,4 +181,4 @@ class OfflineMapper:
             self.density.statistics.clear()
             self.renderer.images.colour_to_numpy()
             self.gaussians.remove(np.zeros(4, dtype=bool))
-            self.view_renders = 0
+            self.renderer.view_renders = 0

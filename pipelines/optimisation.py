@@ -16,10 +16,7 @@ __all__ = ["MapOptimiser"]
 
 
 class MapOptimiser:
-    """Renders with `renderer`, and keeps Gaussians and keyframes in step with their images.
-
-    view_renders: views rendered and differentiated so far, the measure of work that the modes are compared at.
-    """
+    """Renders with `renderer`, and keeps Gaussians and keyframes in step with their images."""
 
     def __init__(self, gaussians: GaussianField, renderer: Renderer, settings: MappingSettings) -> None:
         self.gaussians = gaussians
@@ -29,7 +26,6 @@ class MapOptimiser:
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
         self.poses = PoseRefinement(settings.poses)
-        self.view_renders = 0
 
     def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
         """The settings' learning rates, positions in scene units."""
@@ -42,38 +38,44 @@ class MapOptimiser:
             colour=o.colour_rate,
         )
 
-    def compare(self, view: Keyframe, scene_depth: float) -> LossValues:
-        """Render a keyframe into the renderer's images and evaluate the loss against its image."""
-        self.renderer.forward(view.camera, view.T_camera_world, self.settings.near * scene_depth)
-        self.renderer.images.set_reference(view.rgba)
+    def compare(self, view: Keyframe, scene_depth: float, level: int = 0) -> LossValues:
+        """Render a keyframe into the renderer's images and evaluate the loss against its image of a pyramid level."""
+        image = view.pyramid[min(level, len(view.pyramid) - 1)]
+        self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth)
+        self.renderer.images.set_reference(image.rgba)
         return self.loss.forward()
 
     def step(
-        self,
-        store: KeyframeStore,
-        views: list[int],
-        rates: LearningRates,
-        refine_poses: bool,
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int = 0
     ) -> float:
-        """One Adam step on the mean loss of the views (indices into `store`); return their mean PSNR.
+        """Adam steps on the mean loss of the views (indices into `store`), in batches; return their mean PSNR.
 
-        The keyframes' errors are brought up to date. Poses move only where `refine_poses`.
+        The keyframes' errors are brought up to date, and their poses but the first are stepped at `pose_rate` [px].
         """
+        size = self.settings.optimise.batch
+        total = 0.0
+        for first in range(0, len(views), size):
+            batch = views[first : first + size]
+            total += len(batch) * self._step(store, batch, rates, pose_rate, level)
+        return total / len(views)
+
+    def _step(
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int
+    ) -> float:
         o = self.settings.optimise
-        self.view_renders += len(views)
         psnr = 0.0
         pose_gradients: dict[int, np.ndarray] = {}
         for j in views:
             view = store[j]
-            values = self.compare(view, store.scene_depth)
+            values = self.compare(view, store.scene_depth, level)
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
             self.renderer.backward()
             view.error = values.l1
             psnr += values.psnr / len(views)
-            if refine_poses and j > 0:
+            if pose_rate > 0 and j > 0:
                 pose_gradients[j] = pose_gradients.get(j, 0.0) + self.renderer.camera_gradient()
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         self.adam.step(rates, len(views))
         for j, gradient in pose_gradients.items():
-            self.poses.step(store[j], gradient, store.scene_depth)
+            self.poses.step(store[j], gradient, pose_rate)
         return psnr

@@ -39,6 +39,7 @@ def test_a_run_leaves_the_files_that_an_online_run_leaves(folder: Path) -> None:
         "config.yaml",
         "metrics.json",
         "renders",
+        "scores.csv",
         "splats.ply",
         "trajectory.txt",
     ]

@@ -117,7 +117,7 @@ def test_it_begins_with_the_tracked_points_and_grows(mapped: tuple[OfflineMapper
     m, before = mapped
     assert before["gaussians"] == 6 * 120
     assert len(m.gaussians) > 1.3 * before["gaussians"]
-    assert m.view_renders == before["steps"] == STEPS
+    assert m.renderer.view_renders == before["steps"] == STEPS
     assert before["last"] == len(m.gaussians)
     assert np.abs(m.gaussians.to_numpy()["sh"][:, 9:]).max() > 0  # the third band was reached
 
