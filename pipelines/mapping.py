@@ -16,7 +16,6 @@ from pipelines.densification import dissimilarity, error_pixels, grow, pixel_see
 from pipelines.depth import DepthEstimator, build_depth
 from pipelines.keyframe_selection import KeyframeSelector
 from pipelines.optimisation import MapOptimiser
-from pipelines.pose_refinement import PoseAlignment
 from pipelines.rendering import Renderer
 from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
@@ -59,7 +58,6 @@ class OnlineMapper:
         self.renderer = Renderer(self.gaussians, max_width, max_height)
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
         self.loss = self.optimiser.loss
-        self.alignment = PoseAlignment(settings.poses, self.renderer, self.loss)
         self.keyframes = KeyframeStore(len(settings.levels.probabilities))
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
@@ -82,9 +80,8 @@ class OnlineMapper:
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
-            if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align_steps:
-                with self.stopwatch.measure("optimise"):
-                    self.alignment.align(view, self.settings.near * self.keyframes.scene_depth)
+            if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
+                self.optimiser.poses.align(view)
             level = self._draw_level()
             self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
             psnr = self.optimise(self.settings.optimise.steps, level)

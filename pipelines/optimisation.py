@@ -25,7 +25,7 @@ class MapOptimiser:
         self.loss = PhotometricLoss(renderer.images)
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
-        self.poses = PoseRefinement(settings.poses)
+        self.poses = PoseRefinement()
 
     def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
         """The settings' learning rates, positions in scene units."""

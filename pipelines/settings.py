@@ -148,11 +148,7 @@ class PoseSettings(StrictModel):
     learning_rate: float = Field(
         0.01, ge=0, description="Adam step of a pose, as the movement of its tracked points in the image [px]"
     )
-    prior: float = Field(
-        0.0, ge=0, description="weight of half the squared movement away from the tracked pose [px^2] in the loss"
-    )
-    align_steps: int = Field(0, ge=0, description="steps that first align a new keyframe with the map as it stands")
-    align_rate: float = Field(0.3, gt=0, description="first Adam step of that [px]; it falls to a twentieth")
+    align: bool = Field(True, description="first move a new keyframe to where its tracked points project rightly")
 
 
 class LevelSettings(StrictModel):
