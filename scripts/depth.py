@@ -1,0 +1,133 @@
+"""Depth estimators against a depth sensor, on the pixels that a run asks them for, as a Markdown table.
+
+The scene is mapped online; at every keyframe each estimator is asked for the same pixels as the fused one. The
+sensor's depth images are 16-bit millimetres, named after the digits of their frame's name, from a camera beside the
+colour camera: `--offset` carries them over. The map's one scale is the median ratio of sensor and tracked depth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.backend import initialise
+from fields.camera import PinholeCamera
+from fields.tracked_frame import TrackedFrame
+from modp_ti.config import load_scene
+from modp_ti.trackers import open_tracker
+from pipelines.depth import DepthEstimate, DepthEstimator, FusedDepth, GaussianProcessDepth
+from pipelines.mapping import OnlineMapper
+
+
+class Recorder:
+    """Answers as the fused estimator does, and keeps what each of its sources and the constant process say."""
+
+    def __init__(self, fused: FusedDepth, constant: GaussianProcessDepth) -> None:
+        self.fused = fused
+        self.sources: dict[str, DepthEstimator] = {"constant process": constant}
+        self.sources |= {type(e).__name__: e for e in fused.estimators}
+        self.records: list[tuple[int, int, NDArray, dict[str, DepthEstimate]]] = []
+
+    def estimate(self, view, neighbours, pixels) -> DepthEstimate:
+        """See `DepthEstimator`."""
+        answer = self.fused.estimate(view, neighbours, pixels)
+        said = {name: e.estimate(view, neighbours, pixels) for name, e in self.sources.items()}
+        self.records.append((view.index, view.camera.width, pixels, said | {"fused": answer}))
+        return answer
+
+
+def sensor_depth(folder: Path, frame: TrackedFrame, focal: float, offset: NDArray) -> NDArray | None:
+    """Sensor depth (H, W) [m] in the frame's camera, NaN where there is none; None without a file."""
+    digits = re.search(r"\d+", Path(frame.name).name)
+    files = sorted(folder.glob(f"*{digits.group()}*")) if digits else []
+    raw = cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED) if files else None
+    if raw is None:
+        return None
+    height, width = raw.shape
+    camera = PinholeCamera(focal, focal, width / 2, height / 2, width, height)
+    # 65535 is the sensor's "nothing".
+    row, column = np.nonzero((raw > 0) & (raw < 20_000))
+    points = camera.unproject(np.stack([column, row], axis=1) + 0.5, raw[row, column] / 1000.0) + offset
+    pixels = frame.camera.project(points)
+    inside = frame.camera.contains(pixels)
+    column, row = np.floor(pixels[inside]).astype(int).T
+    depth = np.full((frame.camera.height, frame.camera.width), np.inf)
+    np.minimum.at(depth, (row, column), points[inside, 2])
+    return np.where(np.isfinite(depth), depth, np.nan)
+
+
+def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
+    """Sensor depth over tracked depth at the frame's points."""
+    z = frame.points.xyz @ frame.T_camera_world[2, :3] + frame.T_camera_world[2, 3]
+    inside = frame.camera.contains(frame.points.pixels) & (z > 0)
+    column, row = np.floor(frame.points.pixels[inside]).astype(int).T
+    ratio = depth[row, column] / z[inside]
+    return ratio[np.isfinite(ratio)]
+
+
+def main() -> None:
+    """Map, compare, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, help="scene.yaml")
+    parser.add_argument("sensor", type=Path, help="folder of depth images")
+    parser.add_argument("--focal", type=float, default=585.0, help="of the depth camera [px] (default 585)")
+    offset = (-0.0125, 0.005, 0.0)  # where redkitchen's tracked points fit best
+    parser.add_argument("--offset", type=float, nargs=3, default=offset, help="depth to colour camera [m]")
+    parser.add_argument("--frames", type=int, default=10**9, help="map only so many")
+    parser.add_argument("--set", action="append", default=[], help="override a setting, key=value")
+    arguments = parser.parse_args()
+    config = load_scene(arguments.scene, arguments.set)
+    initialise(config.device, config.threads, config.seed)
+    frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
+    mapper = OnlineMapper(config.mapping, frames[0].camera.width, frames[0].camera.height, config.seed)
+    constant = GaussianProcessDepth(config.mapping.depth, np.random.default_rng(config.seed))
+    mapper.depth = recorder = Recorder(mapper.depth, constant)
+    for n, frame in enumerate(frames):
+        mapper.process(frame)
+        print(f"\r{n + 1} of {len(frames)} frames", end="", flush=True)
+    print()
+
+    by_index = {f.index: f for f in frames}
+    truth, ratios = {}, []
+    for index, *_ in recorder.records:
+        depth = sensor_depth(arguments.sensor, by_index[index], arguments.focal, np.array(arguments.offset))
+        if depth is not None:
+            truth[index] = depth
+            ratios.append(tracked_ratio(by_index[index], depth))
+    scale = np.median(np.concatenate(ratios))
+    floor = np.median(np.abs(np.concatenate(ratios) / scale - 1))
+
+    names = list(recorder.records[0][3])
+    error: dict[str, list[NDArray]] = {name: [] for name in names}
+    deviation: dict[str, list[NDArray]] = {name: [] for name in names}
+    for index, width, pixels, said in recorder.records:
+        if index not in truth:
+            continue
+        depth = truth[index]
+        column, row = np.floor(pixels * depth.shape[1] / width).astype(int).T
+        there = depth[np.minimum(row, depth.shape[0] - 1), np.minimum(column, depth.shape[1] - 1)]
+        seen = np.isfinite(there)
+        for name in names:
+            error[name].append(np.abs(said[name].depth[seen] * scale / there[seen] - 1))
+            deviation[name].append(said[name].deviation[seen])
+    limit = config.mapping.depth.max_deviation
+    sure = np.concatenate(deviation["fused"]) < limit
+    print(f"{len(sure)} pixels of {len(truth)} keyframes; tracked points themselves: {100 * floor:.2f} %\n")
+    print(f"| estimator | deviation < {limit:g} | median error there | 90th percentile | where fused is sure |")
+    print("|---|---|---|---|---|")
+    for name in names:
+        e, known = np.concatenate(error[name]), np.concatenate(deviation[name])
+        own, both = known < limit, sure & np.isfinite(known)
+        print(
+            f"| {name} | {100 * own.mean():.0f} % | {100 * np.median(e[own]):.2f} % | "
+            f"{100 * np.percentile(e[own], 90):.1f} % | {100 * np.median(e[both]):.2f} % |"
+        )
+
+
+if __name__ == "__main__":
+    main()
