@@ -43,12 +43,14 @@ def score_frame(
     frame: TrackedFrame,
     T_camera_world: NDArray[np.float64],
     near: float,
+    exposure: NDArray[np.float64] | None = None,
 ) -> tuple[float, float, NDArray[np.float32]]:
-    """(PSNR, SSIM, render (H, W, 3)) of `frame` seen from T_camera_world (4, 4).
+    """(PSNR, SSIM, render (H, W, 3)) of `frame` seen from T_camera_world (4, 4), developed with exposure (3, 4).
 
     The render is clipped to [0, 1]. Masked pixels do not count and are shown as in the frame.
     """
     renderer.forward(frame.camera, T_camera_world, near)
+    renderer.develop(exposure, frame.vignette)
     renderer.images.clip_colour()
     renderer.images.set_reference(frame.rgba())
     values = loss.forward()

@@ -22,6 +22,7 @@ from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
 from modp_ti.errors import InputError
 from modp_ti.evaluation import Scores, absolute_trajectory_error, score_frame
+from modp_ti.exports.exposure import write_exposures
 from modp_ti.exports.splats_ply import read_splats, write_splats
 from modp_ti.exports.trajectory import write_trajectory
 from modp_ti.progress import ProgressLine
@@ -100,20 +101,27 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         )
 
     online = mapper.gaussians.to_numpy()
+    online_exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
     if config.refine.steps:
         line.start_refining(config.refine.steps)
         refine(mapper, config.refine, line.refined)
         line.stop()
 
     trajectory = [mapper.keyframes.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)]
+    exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
     staging = config.output.with_name(config.output.name + ".partial")
     shutil.rmtree(staging, ignore_errors=True)
     try:
         (staging / "renders").mkdir(parents=True)
         write_splats(staging / "splats.ply", mapper.gaussians.to_numpy())
         write_trajectory(staging / "trajectory.txt", poses.timestamp, trajectory)
+        if config.mapping.exposure.enabled:
+            keyframes = {k.index for k in mapper.keyframes}
+            write_exposures(staging / "exposure.json", poses.index, poses.timestamp, exposures, keyframes)
         saved = read_splats(staging / "splats.ply")
-        states = {"online": online, "refined": saved} if config.refine.steps else {"online": saved}
+        states = {"online": (saved, exposures)}
+        if config.refine.steps:
+            states = {"online": (online, online_exposures), "refined": (saved, exposures)}
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
             scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders")
         truth = getattr(tracker, "ground_truth", list)()
@@ -160,23 +168,29 @@ def _evaluate(
     mapper: OnlineMapper,
     tracker: Tracker,
     trajectory: list[NDArray[np.float64]],
-    states: dict[str, dict[str, NDArray]],
+    states: dict[str, tuple[dict[str, NDArray], list[NDArray[np.float64] | None]]],
     renders: Path,
 ) -> dict[str, dict]:
     """Scores of every version of the map by name; pictures of the held-out frames from the last version.
 
-    The last version stays in `mapper.gaussians`.
+    states: of each version the Gaussians, and the exposure of every frame. The last version stays in
+    `mapper.gaussians`.
     """
     near = mapper.settings.near * mapper.keyframes.scene_depth
     sets = {name: {"all": Scores(), "held_out": Scores()} for name in states}
     last = list(states)[-1]
     frames = iter(tracker)
     while batch := list(islice(frames, EVALUATED_TOGETHER)):
-        for name, state in states.items():
+        for name, (state, exposures) in states.items():
             mapper.gaussians.load(state)
             for frame in batch:
                 psnr, ssim, render = score_frame(
-                    mapper.renderer, mapper.optimiser.loss, frame, trajectory[frame.index], near
+                    mapper.renderer,
+                    mapper.optimiser.loss,
+                    frame,
+                    trajectory[frame.index],
+                    near,
+                    exposures[frame.index],
                 )
                 sets[name]["all"].add(psnr, ssim)
                 if frame.held_out:

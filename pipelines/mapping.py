@@ -79,6 +79,8 @@ class OnlineMapper:
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
+            with self.stopwatch.measure("optimise"):
+                self.optimiser.exposure.begin(view, self.renderer, self.settings.near * self.keyframes.scene_depth)
             self._add(view, compensate=self.settings.densify.error_compensation)
             psnr = self.optimise(self.settings.optimise.steps)
         elif len(self.keyframes):
@@ -153,6 +155,7 @@ class OnlineMapper:
                 self.voxels.query(view.points.xyz, 1.0)
                 self.voxels.update(np.zeros((0, 3)), 1.0)
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
+            self.optimiser.exposure.begin(view, self.renderer, self.settings.near)
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), refine_poses=False)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()

@@ -7,6 +7,7 @@ import numpy as np
 from fields.gaussians import GaussianField
 from fields.keyframes import Keyframe, KeyframeStore
 from pipelines.adam import Adam, LearningRates
+from pipelines.exposure import ExposureRefinement
 from pipelines.losses import AspectPenalty, LossValues, PhotometricLoss
 from pipelines.pose_refinement import PoseRefinement
 from pipelines.rendering import Renderer
@@ -26,6 +27,7 @@ class MapOptimiser:
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
         self.poses = PoseRefinement(settings.poses)
+        self.exposure = ExposureRefinement(settings.exposure)
 
     def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
         """The settings' learning rates, positions in scene units."""
@@ -39,8 +41,9 @@ class MapOptimiser:
         )
 
     def compare(self, view: Keyframe, scene_depth: float) -> LossValues:
-        """Render a keyframe into the renderer's images and evaluate the loss against its image."""
+        """Render a keyframe, developed as its image is, into the renderer's images and evaluate the loss."""
         self.renderer.forward(view.camera, view.T_camera_world, self.settings.near * scene_depth)
+        self.renderer.develop(view.exposure, view.vignette)
         self.renderer.images.set_reference(view.rgba)
         return self.loss.forward()
 
@@ -53,11 +56,13 @@ class MapOptimiser:
     ) -> float:
         """One Adam step on the mean loss of the views (indices into `store`); return their mean PSNR.
 
-        The keyframes' errors are brought up to date. Poses move only where `refine_poses`.
+        The keyframes' errors are brought up to date. Poses move only where `refine_poses`, exposures only where they
+        are estimated; those of the first keyframe are held, to fix the gauge.
         """
         o = self.settings.optimise
         psnr = 0.0
         pose_gradients: dict[int, np.ndarray] = {}
+        exposure_gradients: dict[int, np.ndarray] = {}
         for j in views:
             view = store[j]
             values = self.compare(view, store.scene_depth)
@@ -67,8 +72,12 @@ class MapOptimiser:
             psnr += values.psnr / len(views)
             if refine_poses and j > 0:
                 pose_gradients[j] = pose_gradients.get(j, 0.0) + self.renderer.camera_gradient()
+            if view.exposure is not None and j > 0:
+                exposure_gradients[j] = exposure_gradients.get(j, 0.0) + self.renderer.exposure_gradient()
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         self.adam.step(rates, len(views))
         for j, gradient in pose_gradients.items():
             self.poses.step(store[j], gradient, store.scene_depth)
+        for j, gradient in exposure_gradients.items():
+            self.exposure.step(store[j], gradient, views.count(j) / len(views))
         return psnr

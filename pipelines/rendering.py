@@ -14,6 +14,7 @@ from fields.tiles import TilePairs
 from fields.view import ViewField
 from pipelines.binning import CHUNKS, Binning
 from pipelines.compositing import Compositing
+from pipelines.development import Development
 from pipelines.projection import Projection
 
 __all__ = ["RenderedView", "Renderer"]
@@ -54,6 +55,7 @@ class Renderer:
         self.projection = Projection(gaussians, self.view, self.projected)
         self.binning = Binning(self.view, self.projected, self.pairs)
         self.compositing = Compositing(self.view, self.projected, self.pairs, self.images)
+        self.development = Development(self.images)
 
     def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float) -> None:
         """Render into `images`. near: depth [scene units] below which nothing is drawn."""
@@ -62,15 +64,28 @@ class Renderer:
         self.projection.forward()
         self.binning.forward()
         self.compositing.forward()
+        self.develop(None, None)
+
+    def develop(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
+        """Develop the rendered picture into a photograph with this exposure (3, 4) and vignette (H, W, 3).
+
+        None stands for the identity.
+        """
+        self.development.forward(exposure, vignette)
 
     def backward(self, with_depth: bool = False) -> None:
         """Add d loss / d Gaussian to the gradients of the Gaussians, for the view that was rendered last."""
+        self.development.backward()
         self.compositing.backward(with_depth)
         self.projection.backward()
 
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the T_camera_world that was rendered last, after `backward`."""
         return self.projection.camera_gradient()
+
+    def exposure_gradient(self) -> np.ndarray:
+        """d loss / d exposure (3, 4) of the picture that was developed last, after `backward`."""
+        return self.development.exposure_gradient()
 
     def render(
         self,

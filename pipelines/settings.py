@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 __all__ = [
     "DensifySettings",
     "DepthSettings",
+    "ExposureSettings",
     "KeyframeSettings",
     "MappingSettings",
     "OptimiseSettings",
@@ -110,6 +111,17 @@ class PoseSettings(StrictModel):
     )
 
 
+class ExposureSettings(StrictModel):
+    """Exposure of every keyframe: image = A colour + b, for cameras that set their exposure by themselves."""
+
+    enabled: bool = Field(False, description="estimate the exposure of keyframes with the map")
+    learning_rate: float = Field(0.005, ge=0, description="Adam step of A (3x3) and b")
+    regularisation: float = Field(0.03, ge=0, description="weight of |A - I|^2 + |b|^2 of a keyframe beside its loss")
+    prior: float = Field(
+        0.001, gt=0, description="weight of the last keyframe's exposure in the fit that a new keyframe begins with"
+    )
+
+
 class OptimiseSettings(StrictModel):
     """Loss and learning rates."""
 
@@ -143,6 +155,7 @@ class MappingSettings(StrictModel):
     voxels: VoxelSettings = VoxelSettings()
     views: ViewSettings = ViewSettings()
     poses: PoseSettings = PoseSettings()
+    exposure: ExposureSettings = ExposureSettings()
     optimise: OptimiseSettings = OptimiseSettings()
 
 
