@@ -147,9 +147,26 @@ class GaussianField:
             self.count = before
             raise
 
+    def clear_gradients(self) -> None:
+        """Drop what the views rendered since the last Adam step have added to the gradients."""
+        if self.count:
+            self._clear_gradients(self.count)
+
     def opacities(self) -> NDArray:
         """Opacity in (0, 1) of all Gaussians (N,)."""
         return 1.0 / (1.0 + np.exp(-self.to_numpy()["opacity_logit"]))
+
+    @ti.kernel
+    def _clear_gradients(self, count: ti.i32):
+        for i in range(count):
+            if self.touched[i] != 0:
+                self.touched[i] = 0
+                self.position.grad[i].fill(0.0)
+                self.log_scale.grad[i].fill(0.0)
+                self.quaternion.grad[i].fill(0.0)
+                self.opacity_logit.grad[i] = 0.0
+                for k in range(self.sh_count):
+                    self.sh.grad[i, k].fill(0.0)
 
     @ti.func
     def _forget(self, i):

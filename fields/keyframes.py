@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
+from fields.pyramid import ImageLevel, build_pyramid
 from fields.se3 import interpolate_se3, inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 
@@ -18,7 +19,8 @@ __all__ = ["Keyframe", "KeyframeStore"]
 class Keyframe:
     """One keyframe. Images stay in host memory with 8 bits a channel.
 
-    index: of its frame. rgba: (H, W, 4) uint8, the image and 255 where it is valid. T_tracked: the tracker's
+    index: of its frame. rgba: (H, W, 4) uint8, the image and 255 where it is valid; camera: of that image. pyramid:
+    the same at halved sizes, itself first. T_tracked: the tracker's
     T_camera_world; T_camera_world: the refined one. median_depth: of its tracked points [scene units]; view_scale:
     median_depth / focal, the width of a pixel out there (Section 3.2.1). error: mean absolute error when the frame was
     optimised last (err(j) of Eq. 2). vignette: as in `TrackedFrame`, at full size. exposure: (3, 4) affine colour
@@ -33,6 +35,7 @@ class Keyframe:
     points: SparsePoints
     median_depth: float
     error: float
+    pyramid: tuple[ImageLevel, ...] = ()
     pose_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
     pose_v: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
     pose_steps: int = 0
@@ -46,6 +49,14 @@ class Keyframe:
     def view_scale(self) -> float:
         return self.median_depth / self.camera.focal
 
+    def at_level(self, level: int) -> Keyframe:
+        """This view with the image of a pyramid level (the coarsest where there are fewer), for reading only."""
+        level = min(level, len(self.pyramid) - 1)
+        image = self.pyramid[level]
+        scale = np.array([image.camera.width / self.camera.width, image.camera.height / self.camera.height])
+        points = replace(self.points, pixels=self.points.pixels * scale)
+        return replace(self, rgba=image.rgba, camera=image.camera, points=points, pyramid=self.pyramid[level:])
+
     @property
     def correction(self) -> NDArray[np.float64]:
         """The motion (4, 4) that refinement has put on the left of the tracked pose."""
@@ -55,7 +66,9 @@ class Keyframe:
 class KeyframeStore:
     """The keyframes in the order of their frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, levels: int = 1) -> None:
+        """levels: of the keyframes' image pyramids."""
+        self.levels = levels
         self._keyframes: list[Keyframe] = []
         self._scene_depth = 1.0
 
@@ -75,18 +88,19 @@ class KeyframeStore:
 
     def append(self, frame: TrackedFrame) -> Keyframe:
         """Keep `frame`. It starts at the mean error of the others (1 for the first), so that it is drawn soon."""
-        keyframe = self.view(frame)
+        keyframe = self.view(frame, self.levels)
         self._keyframes.append(keyframe)
         self._scene_depth = float(np.median([k.median_depth for k in self._keyframes]))
         return keyframe
 
-    def view(self, frame: TrackedFrame) -> Keyframe:
+    def view(self, frame: TrackedFrame, levels: int = 1) -> Keyframe:
         """`frame` as a keyframe would be, with the pose and exposure that those around it imply, but not kept."""
         depth = frame.points.xyz @ frame.T_camera_world[2, :3] + frame.T_camera_world[2, 3]
         depth = depth[depth > 0]
+        rgba = frame.rgba()
         return Keyframe(
             index=frame.index,
-            rgba=frame.rgba(),
+            rgba=rgba,
             camera=frame.camera,
             T_tracked=frame.T_camera_world.copy(),
             T_camera_world=self.corrected(frame.index, frame.T_camera_world),
@@ -95,6 +109,7 @@ class KeyframeStore:
             error=float(np.mean([k.error for k in self._keyframes])) if self._keyframes else 1.0,
             vignette=frame.vignette,
             exposure=self.exposure_at(frame.index),
+            pyramid=build_pyramid(rgba, frame.camera, levels),
         )
 
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -24,6 +24,7 @@ from modp_ti.errors import InputError
 from pipelines.settings import MappingSettings, RefineSettings, StrictModel
 
 __all__ = [
+    "EvaluationSettings",
     "KeyDoc",
     "SceneConfig",
     "SourceSettings",
@@ -92,6 +93,16 @@ class TrackerSettings(StrictModel):
     )
 
 
+class EvaluationSettings(StrictModel):
+    """How the finished map is scored."""
+
+    lpips_weights: Path | None = Field(
+        None,
+        description="folder with `alexnet-owt-7be5be79.pth` (torchvision) and `alex.pth` (the `lpips` package, v0.1); "
+        "empty: torch's cache and the installed package; LPIPS is null where they are not",
+    )
+
+
 class SceneConfig(StrictModel):
     """Everything that a run depends on."""
 
@@ -103,6 +114,7 @@ class SceneConfig(StrictModel):
     threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
 
     @model_validator(mode="after")
     def _images_are_named(self) -> SceneConfig:

@@ -2,39 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.se3 import inverse_se3
 from fields.tracked_frame import TrackedFrame
+from modp_ti.lpips import Lpips
 from pipelines.losses import PhotometricLoss
 from pipelines.rendering import Renderer
 
-__all__ = ["Scores", "absolute_trajectory_error", "score_frame", "umeyama"]
+__all__ = ["FrameScore", "absolute_trajectory_error", "score_frame", "summary", "umeyama"]
 
 
-@dataclass
-class Scores:
-    """PSNR [dB] and SSIM, a list entry a frame."""
+@dataclass(frozen=True)
+class FrameScore:
+    """Scores of one frame in one version ("online" or "refined") of the map; lpips is None where it has no weights.
 
-    psnr: list[float] = field(default_factory=list)
-    ssim: list[float] = field(default_factory=list)
+    index: position among the frames. psnr: [dB].
+    """
 
-    def add(self, psnr: float, ssim: float) -> None:
-        self.psnr.append(psnr)
-        self.ssim.append(ssim)
+    index: int
+    name: str
+    held_out: bool
+    stage: str
+    psnr: float
+    ssim: float
+    lpips: float | None
 
-    def summary(self) -> dict[str, float | int | None]:
-        """Means over the frames, as they stand in metrics.json. lpips is null: its weights are not shipped."""
-        count = len(self.psnr)
-        return {
-            "psnr": round(float(np.mean(self.psnr)), 4) if count else None,
-            "ssim": round(float(np.mean(self.ssim)), 5) if count else None,
-            "lpips": None,
-            "count": count,
-        }
+
+def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
+    """Means over the frames, as they stand in metrics.json; null where there is nothing to take the mean of."""
+
+    def mean(values: list[float | None], digits: int) -> float | None:
+        return None if not values or None in values else round(float(np.mean(values)), digits)
+
+    return {
+        "psnr": mean([score.psnr for score in scores], 4),
+        "ssim": mean([score.ssim for score in scores], 5),
+        "lpips": mean([score.lpips for score in scores], 5),
+        "count": len(scores),
+    }
 
 
 def score_frame(
@@ -43,18 +53,24 @@ def score_frame(
     frame: TrackedFrame,
     T_camera_world: NDArray[np.float64],
     near: float,
+    stage: str,
+    lpips: Lpips | None = None,
     exposure: NDArray[np.float64] | None = None,
-) -> tuple[float, float, NDArray[np.float32]]:
-    """(PSNR, SSIM, render (H, W, 3)) of `frame` seen from T_camera_world (4, 4), developed with exposure (3, 4).
+) -> tuple[FrameScore, NDArray[np.float32]]:
+    """Scores and render (H, W, 3) of `frame` seen from T_camera_world (4, 4) in the renderer's map.
 
-    The render is clipped to [0, 1]. Masked pixels do not count and are shown as in the frame.
+    The render is developed with the frame's exposure (3, 4) and vignette, and clipped to [0, 1]. Masked pixels do not
+    count and are shown as in the frame.
     """
+    rgba = frame.rgba()
     renderer.forward(frame.camera, T_camera_world, near)
     renderer.develop(exposure, frame.vignette)
     renderer.images.clip_colour()
-    renderer.images.set_reference(frame.rgba())
+    renderer.images.set_reference(rgba)
     values = loss.forward()
-    return values.psnr, values.ssim, renderer.images.colour_to_numpy()
+    render = renderer.images.colour_to_numpy()
+    distance = None if lpips is None else lpips(render, rgba[..., :3] / np.float32(255.0))
+    return FrameScore(frame.index, frame.name, frame.held_out, stage, values.psnr, values.ssim, distance), render
 
 
 def umeyama(

@@ -64,10 +64,12 @@ class ProgressLine:
         """Say in one line what the run came to."""
         scores = metrics["refined"] or metrics["online"]
         which = "held_out" if scores["held_out"]["count"] else "all"
+        lpips = scores[which]["lpips"]
         self.console.print(
             f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {metrics['gaussians']:,} Gaussians, "
             f"{metrics['frames_per_second']:.2f} frames/s; {which.replace('_', '-')} "
-            f"PSNR {scores[which]['psnr']:.2f} dB, SSIM {scores[which]['ssim']:.3f}",
+            f"PSNR {scores[which]['psnr']:.2f} dB, SSIM {scores[which]['ssim']:.3f}"
+            + ("" if lpips is None else f", LPIPS {lpips:.3f}"),
             highlight=False,
             soft_wrap=True,
         )

@@ -21,14 +21,17 @@ from fields.backend import initialise
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
 from modp_ti.errors import InputError
-from modp_ti.evaluation import Scores, absolute_trajectory_error, score_frame
+from modp_ti.evaluation import FrameScore, absolute_trajectory_error, score_frame, summary
 from modp_ti.exports.exposure import write_exposures
+from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats, write_splats
 from modp_ti.exports.trajectory import write_trajectory
+from modp_ti.lpips import Lpips, open_lpips
 from modp_ti.progress import ProgressLine
 from modp_ti.trackers import Tracker, frame_count, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.refinement import refine
+from pipelines.stopwatch import breakdown_percent
 
 __all__ = ["run_scene"]
 
@@ -71,10 +74,14 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     if first is None:
         raise InputError("the tracker delivered no frame: nothing to map")
     prepared = time.perf_counter() - tick
-    for note in tracker.notes:
+    lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
+    for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
-    mapper = OnlineMapper(config.mapping, first.camera.width, first.camera.height, config.seed)
+    try:
+        mapper = OnlineMapper(config.mapping, first.camera.width, first.camera.height, config.seed)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     watch = mapper.stopwatch
     watch.seconds["track"] = prepared
     with line.working("compiling kernels (the first time on this machine takes longest)"):
@@ -93,6 +100,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         line.frame(None if frame.held_out else mapper.process(frame))
     mapper.finish()
     online_seconds = time.perf_counter() - tick
+    breakdown = breakdown_percent(watch.seconds, online_seconds)
     line.stop()
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -123,8 +131,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         if config.refine.steps:
             states = {"online": (online, online_exposures), "refined": (saved, exposures)}
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
-            scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders")
-        truth = getattr(tracker, "ground_truth", list)()
+            scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders", lpips)
+        write_scores(staging / "scores.csv", scores)
         metrics = {
             "frames": len(poses.index),
             "keyframes": len(mapper.keyframes),
@@ -133,10 +141,12 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "seed": config.seed,
             "frames_per_second": round(len(poses.index) / online_seconds, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "online": scores["online"],
-            "refined": scores.get("refined"),
+            "online": _summaries(scores, "online"),
+            "refined": _summaries(scores, "refined") if config.refine.steps else None,
+            "lpips_note": no_lpips,
             "seconds": _seconds(watch.seconds, time.perf_counter() - started),
-            "ate_rmse": round(absolute_trajectory_error(trajectory, truth), 6) if len(truth) else None,
+            "breakdown_percent": breakdown,
+            **_trajectory_errors(poses.tracked, trajectory, getattr(tracker, "ground_truth", list)()),
         }
         (staging / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         dump_scene(config, staging / "config.yaml")
@@ -170,34 +180,52 @@ def _evaluate(
     trajectory: list[NDArray[np.float64]],
     states: dict[str, tuple[dict[str, NDArray], list[NDArray[np.float64] | None]]],
     renders: Path,
-) -> dict[str, dict]:
-    """Scores of every version of the map by name; pictures of the held-out frames from the last version.
+    lpips: Lpips | None,
+) -> list[FrameScore]:
+    """Scores of every frame in every version of the map by name; pictures of the held-out frames from the last one.
 
     states: of each version the Gaussians, and the exposure of every frame. The last version stays in
     `mapper.gaussians`.
     """
     near = mapper.settings.near * mapper.keyframes.scene_depth
-    sets = {name: {"all": Scores(), "held_out": Scores()} for name in states}
+    scores = []
     last = list(states)[-1]
     frames = iter(tracker)
     while batch := list(islice(frames, EVALUATED_TOGETHER)):
         for name, (state, exposures) in states.items():
             mapper.gaussians.load(state)
             for frame in batch:
-                psnr, ssim, render = score_frame(
+                score, render = score_frame(
                     mapper.renderer,
                     mapper.optimiser.loss,
                     frame,
                     trajectory[frame.index],
                     near,
+                    name,
+                    lpips,
                     exposures[frame.index],
                 )
-                sets[name]["all"].add(psnr, ssim)
-                if frame.held_out:
-                    sets[name]["held_out"].add(psnr, ssim)
-                    if name == last:
-                        _write_pair(renders / f"{frame.index:06d}.png", frame.image, render)
-    return {name: {key: scores.summary() for key, scores in of.items()} for name, of in sets.items()}
+                scores.append(score)
+                if frame.held_out and name == last:
+                    _write_pair(renders / f"{frame.index:06d}.png", frame.image, render)
+    return sorted(scores, key=lambda score: list(states).index(score.stage))
+
+
+def _summaries(scores: list[FrameScore], stage: str) -> dict[str, dict]:
+    """A version's means over all frames and over those held out."""
+    of = [score for score in scores if score.stage == stage]
+    return {"all": summary(of), "held_out": summary([score for score in of if score.held_out])}
+
+
+def _trajectory_errors(
+    tracked: list[NDArray[np.float64]], refined: list[NDArray[np.float64]], truth: list[NDArray[np.float64]]
+) -> dict[str, float | None]:
+    """ATE of the refined poses (aligned by a similarity, and rigidly) and of the tracked ones; None without truth."""
+    cases = {"ate_rmse": (refined, True), "ate_rmse_rigid": (refined, False), "ate_rmse_tracked": (tracked, True)}
+    return {
+        name: round(absolute_trajectory_error(poses, truth, with_scale), 6) if len(truth) else None
+        for name, (poses, with_scale) in cases.items()
+    }
 
 
 def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:

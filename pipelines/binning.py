@@ -7,6 +7,7 @@ them are taken in depth order, and the same for any number of threads.
 import numpy as np
 import taichi as ti
 
+from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_WIDTH, TilePairs
 from fields.view import ViewField
@@ -15,6 +16,8 @@ from pipelines.projection import ALPHA_MIN
 __all__ = ["CHUNKS", "Binning", "ellipse_span"]
 
 CHUNKS = 16
+# A thread takes one chunk at a time.
+SPREAD = HANDED_OUT
 # Slack [px] around an ellipse, far above rounding and far below a pixel.
 SLACK = 0.01
 
@@ -118,23 +121,27 @@ class Binning:
 
     @ti.kernel
     def _count(self, slots: ti.i32, tiles_x: ti.i32, tiles_y: ti.i32):
-        ti.loop_config(block_dim=1)
-        for chunk in range(CHUNKS):
-            for t in range(tiles_x * tiles_y):
-                self.pairs.histogram[chunk, t] = 0
-            n = 0
-            for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
-                self.projected.first_pair[s] = n
-                e = self._ellipse(s)
-                if e[4] > 0.0:
-                    rows = self._tile_rows(s, e, tiles_y)
-                    for tile_y in range(rows[0], rows[1]):
-                        columns = self._tile_columns(s, e, tile_y, tiles_x)
-                        for tile_x in range(columns[0], columns[1]):
-                            t = tile_y * tiles_x + tile_x
-                            self.pairs.histogram[chunk, t] = self.pairs.histogram[chunk, t] + 1
-                            n += 1
-            self.pairs.chunk_pairs[chunk] = n
+        for i in range(CHUNKS * SPREAD):
+            if i % SPREAD == 0:
+                self._count_chunk(i // SPREAD, slots, tiles_x, tiles_y)
+
+    @ti.func
+    def _count_chunk(self, chunk, slots, tiles_x, tiles_y):
+        for t in range(tiles_x * tiles_y):
+            self.pairs.histogram[chunk, t] = 0
+        n = 0
+        for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+            self.projected.first_pair[s] = n
+            e = self._ellipse(s)
+            if e[4] > 0.0:
+                rows = self._tile_rows(s, e, tiles_y)
+                for tile_y in range(rows[0], rows[1]):
+                    columns = self._tile_columns(s, e, tile_y, tiles_x)
+                    for tile_x in range(columns[0], columns[1]):
+                        t = tile_y * tiles_x + tile_x
+                        self.pairs.histogram[chunk, t] = self.pairs.histogram[chunk, t] + 1
+                        n += 1
+        self.pairs.chunk_pairs[chunk] = n
 
     @ti.kernel
     def _scan(self, tiles: ti.i32, total: ti.types.ndarray()):
@@ -157,21 +164,25 @@ class Binning:
 
     @ti.kernel
     def _scatter(self, slots: ti.i32, tiles_x: ti.i32, tiles_y: ti.i32):
-        ti.loop_config(block_dim=1)
-        for chunk in range(CHUNKS):
-            for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
-                pair = self.projected.first_pair[s] + self.pairs.chunk_pairs[chunk]
-                self.projected.first_pair[s] = pair
-                e = self._ellipse(s)
-                if e[4] > 0.0:
-                    rows = self._tile_rows(s, e, tiles_y)
-                    for tile_y in range(rows[0], rows[1]):
-                        columns = self._tile_columns(s, e, tile_y, tiles_x)
-                        for tile_x in range(columns[0], columns[1]):
-                            t = tile_y * tiles_x + tile_x
-                            place = self.pairs.histogram[chunk, t]
-                            self.pairs.histogram[chunk, t] = place + 1
-                            self.pairs.slot[place] = s
-                            self.pairs.rows[place] = self._pixel_rows(s, e, tile_x, tile_y)
-                            self.pairs.position[pair] = place
-                            pair += 1
+        for i in range(CHUNKS * SPREAD):
+            if i % SPREAD == 0:
+                self._scatter_chunk(i // SPREAD, slots, tiles_x, tiles_y)
+
+    @ti.func
+    def _scatter_chunk(self, chunk, slots, tiles_x, tiles_y):
+        for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+            pair = self.projected.first_pair[s] + self.pairs.chunk_pairs[chunk]
+            self.projected.first_pair[s] = pair
+            e = self._ellipse(s)
+            if e[4] > 0.0:
+                rows = self._tile_rows(s, e, tiles_y)
+                for tile_y in range(rows[0], rows[1]):
+                    columns = self._tile_columns(s, e, tile_y, tiles_x)
+                    for tile_x in range(columns[0], columns[1]):
+                        t = tile_y * tiles_x + tile_x
+                        place = self.pairs.histogram[chunk, t]
+                        self.pairs.histogram[chunk, t] = place + 1
+                        self.pairs.slot[place] = s
+                        self.pairs.rows[place] = self._pixel_rows(s, e, tile_x, tile_y)
+                        self.pairs.position[pair] = place
+                        pair += 1

@@ -11,6 +11,7 @@ Gaussian outside, pixels inside: the transpose of the form for GPUs). Only rows 
 import taichi as ti
 
 from fields.images import PAD, ImageBuffers
+from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TilePairs
 from fields.view import ViewField
@@ -25,8 +26,8 @@ OPAQUE = 1e-5
 # Gaussians between two tests of whether the whole tile is opaque.
 TEST_EVERY = 16
 ROW_BITS = TILE_WIDTH.bit_length() - 1
-# Taichi hands out 512 iterations of a parallel loop at a time: one tile every 64 makes tasks of eight tiles.
-SPREAD = 64
+# A thread takes eight tiles at a time.
+SPREAD = HANDED_OUT // 8
 
 
 @ti.data_oriented

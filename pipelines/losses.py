@@ -13,12 +13,15 @@ import taichi as ti
 
 from fields.gaussians import GaussianField
 from fields.images import PAD, STRIPS, ImageBuffers
+from fields.parallel import HANDED_OUT
 
 __all__ = ["AspectPenalty", "LossValues", "PhotometricLoss", "window_weights"]
 
 RADIUS = 5
 C1 = 0.01**2
 C2 = 0.03**2
+# A thread takes four strips of a channel at a time.
+SPREAD = HANDED_OUT // 4
 
 
 def window_weights() -> tuple[float, ...]:
@@ -99,93 +102,101 @@ class PhotometricLoss:
 
     @ti.kernel
     def _compare(self, width: ti.i32, height: ti.i32, sums: ti.types.ndarray()):
-        ti.loop_config(block_dim=1)
-        for unit in range(3 * STRIPS):
-            stride, plane = ti.static(self.images.stride, self.images.plane)
-            channel = unit // STRIPS * plane
-            partial = unit // STRIPS * 3 * plane
-            strip = unit % STRIPS
-            scratch = unit * 10 * stride
-            # A first access out here makes Taichi fetch the tree's root once, not at every pixel.
-            self.images.rows[scratch] = 0.0
-            zero = ti.cast(0.0, self.real)
-            l1, ssim, square, count = zero, zero, zero, zero
-            for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
-                top = channel + (y + PAD - RADIUS) * stride
-                for x in range(width + 2 * PAD):
-                    mu_x, mu_y, xx, yy, xy = zero, zero, zero, zero, zero
-                    for k in ti.static(range(2 * RADIUS + 1)):
-                        a = self.images.colour[top + k * stride + x]
-                        b = self.images.reference[top + k * stride + x]
-                        wa, wb = self.weights[k] * a, self.weights[k] * b
-                        mu_x, mu_y = mu_x + wa, mu_y + wb
-                        xx, yy, xy = xx + wa * a, yy + wb * b, xy + wa * b
-                    self.images.rows[scratch + x] = mu_x
-                    self.images.rows[scratch + stride + x] = mu_y
-                    self.images.rows[scratch + 2 * stride + x] = xx
-                    self.images.rows[scratch + 3 * stride + x] = yy
-                    self.images.rows[scratch + 4 * stride + x] = xy
-                self._smooth_rows(scratch, 5, width)
-                row = (y + PAD) * stride + PAD
-                smooth = scratch + 5 * stride
-                for x in range(width):
-                    mu_x, mu_y = self.images.rows[smooth + x], self.images.rows[smooth + stride + x]
-                    var_x = self.images.rows[smooth + 2 * stride + x] - mu_x * mu_x
-                    var_y = self.images.rows[smooth + 3 * stride + x] - mu_y * mu_y
-                    covariance = self.images.rows[smooth + 4 * stride + x] - mu_x * mu_y
-                    # S = (A1 A2) / (B1 B2)
-                    A1, B1 = 2.0 * mu_x * mu_y + C1, mu_x * mu_x + mu_y * mu_y + C1
-                    A2, B2 = 2.0 * covariance + C2, var_x + var_y + C2
-                    inv = 1.0 / (B1 * B2)
-                    S = A1 * A2 * inv
-                    valid = self.images.valid[row + x]
-                    d_mu = 2.0 * inv * (mu_y * (A2 - A1) - mu_x * S * (B2 - B1))
-                    self.images.ssim_partial[partial + row + x] = d_mu * valid
-                    self.images.ssim_partial[partial + plane + row + x] = -S * B1 * inv * valid
-                    self.images.ssim_partial[partial + 2 * plane + row + x] = 2.0 * A1 * inv * valid
-                    self.images.ssim[channel + row + x] = S
-                    d = self.images.colour[channel + row + x] - self.images.reference[channel + row + x]
-                    l1 += ti.abs(d)
-                    square += d * d
-                    ssim += S * valid
-                    count += valid
-            sums[unit, 0] = l1
-            sums[unit, 1] = ssim
-            sums[unit, 2] = square
-            sums[unit, 3] = count
+        for i in range((3 * STRIPS) * SPREAD):
+            if i % SPREAD == 0:
+                self._compare_unit(i // SPREAD, width, height, sums)
+
+    @ti.func
+    def _compare_unit(self, unit, width, height, sums: ti.template()):
+        stride, plane = ti.static(self.images.stride, self.images.plane)
+        channel = unit // STRIPS * plane
+        partial = unit // STRIPS * 3 * plane
+        strip = unit % STRIPS
+        scratch = unit * 10 * stride
+        # A first access out here makes Taichi fetch the tree's root once, not at every pixel.
+        self.images.rows[scratch] = 0.0
+        zero = ti.cast(0.0, self.real)
+        l1, ssim, square, count = zero, zero, zero, zero
+        for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
+            top = channel + (y + PAD - RADIUS) * stride
+            for x in range(width + 2 * PAD):
+                mu_x, mu_y, xx, yy, xy = zero, zero, zero, zero, zero
+                for k in ti.static(range(2 * RADIUS + 1)):
+                    a = self.images.colour[top + k * stride + x]
+                    b = self.images.reference[top + k * stride + x]
+                    wa, wb = self.weights[k] * a, self.weights[k] * b
+                    mu_x, mu_y = mu_x + wa, mu_y + wb
+                    xx, yy, xy = xx + wa * a, yy + wb * b, xy + wa * b
+                self.images.rows[scratch + x] = mu_x
+                self.images.rows[scratch + stride + x] = mu_y
+                self.images.rows[scratch + 2 * stride + x] = xx
+                self.images.rows[scratch + 3 * stride + x] = yy
+                self.images.rows[scratch + 4 * stride + x] = xy
+            self._smooth_rows(scratch, 5, width)
+            row = (y + PAD) * stride + PAD
+            smooth = scratch + 5 * stride
+            for x in range(width):
+                mu_x, mu_y = self.images.rows[smooth + x], self.images.rows[smooth + stride + x]
+                var_x = self.images.rows[smooth + 2 * stride + x] - mu_x * mu_x
+                var_y = self.images.rows[smooth + 3 * stride + x] - mu_y * mu_y
+                covariance = self.images.rows[smooth + 4 * stride + x] - mu_x * mu_y
+                # S = (A1 A2) / (B1 B2)
+                A1, B1 = 2.0 * mu_x * mu_y + C1, mu_x * mu_x + mu_y * mu_y + C1
+                A2, B2 = 2.0 * covariance + C2, var_x + var_y + C2
+                inv = 1.0 / (B1 * B2)
+                S = A1 * A2 * inv
+                valid = self.images.valid[row + x]
+                d_mu = 2.0 * inv * (mu_y * (A2 - A1) - mu_x * S * (B2 - B1))
+                self.images.ssim_partial[partial + row + x] = d_mu * valid
+                self.images.ssim_partial[partial + plane + row + x] = -S * B1 * inv * valid
+                self.images.ssim_partial[partial + 2 * plane + row + x] = 2.0 * A1 * inv * valid
+                self.images.ssim[channel + row + x] = S
+                d = self.images.colour[channel + row + x] - self.images.reference[channel + row + x]
+                l1 += ti.abs(d)
+                square += d * d
+                ssim += S * valid
+                count += valid
+        sums[unit, 0] = l1
+        sums[unit, 1] = ssim
+        sums[unit, 2] = square
+        sums[unit, 3] = count
 
     @ti.kernel
     def _differentiate(self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64):
-        ti.loop_config(block_dim=1)
-        for unit in range(3 * STRIPS):
-            stride, plane = ti.static(self.images.stride, self.images.plane)
-            channel = unit // STRIPS * plane
-            partial = unit // STRIPS * 3 * plane
-            strip = unit % STRIPS
-            scratch = unit * 10 * stride
-            self.images.rows[scratch] = 0.0
-            by_l1, by_ssim = ti.cast(l1_scale, self.real), ti.cast(ssim_scale, self.real)
-            for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
-                for q in range(3):
-                    top = partial + q * plane + (y + PAD - RADIUS) * stride
-                    target = scratch + q * stride
-                    for x in range(width + 2 * PAD):
-                        total = ti.cast(0.0, self.real)
-                        for k in ti.static(range(2 * RADIUS + 1)):
-                            total += self.weights[k] * self.images.ssim_partial[top + k * stride + x]
-                        self.images.rows[target + x] = total
-                self._smooth_rows(scratch, 3, width)
-                row = (y + PAD) * stride + PAD
-                smooth = scratch + 5 * stride
-                for x in range(width):
-                    a = self.images.colour[channel + row + x]
-                    b = self.images.reference[channel + row + x]
-                    by_mean = self.images.rows[smooth + x]
-                    by_square = self.images.rows[smooth + stride + x]
-                    by_product = self.images.rows[smooth + 2 * stride + x]
-                    sign = ti.select(a > b, 1.0, ti.select(a < b, -1.0, 0.0))
-                    gradient = by_l1 * sign + by_ssim * (by_mean + 2.0 * a * by_square + b * by_product)
-                    self.images.colour_grad[channel + row + x] = gradient * self.images.valid[row + x]
+        for i in range((3 * STRIPS) * SPREAD):
+            if i % SPREAD == 0:
+                self._differentiate_unit(i // SPREAD, width, height, l1_scale, ssim_scale)
+
+    @ti.func
+    def _differentiate_unit(self, unit, width, height, l1_scale, ssim_scale):
+        stride, plane = ti.static(self.images.stride, self.images.plane)
+        channel = unit // STRIPS * plane
+        partial = unit // STRIPS * 3 * plane
+        strip = unit % STRIPS
+        scratch = unit * 10 * stride
+        self.images.rows[scratch] = 0.0
+        by_l1, by_ssim = ti.cast(l1_scale, self.real), ti.cast(ssim_scale, self.real)
+        for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
+            for q in range(3):
+                top = partial + q * plane + (y + PAD - RADIUS) * stride
+                target = scratch + q * stride
+                for x in range(width + 2 * PAD):
+                    total = ti.cast(0.0, self.real)
+                    for k in ti.static(range(2 * RADIUS + 1)):
+                        total += self.weights[k] * self.images.ssim_partial[top + k * stride + x]
+                    self.images.rows[target + x] = total
+            self._smooth_rows(scratch, 3, width)
+            row = (y + PAD) * stride + PAD
+            smooth = scratch + 5 * stride
+            for x in range(width):
+                a = self.images.colour[channel + row + x]
+                b = self.images.reference[channel + row + x]
+                by_mean = self.images.rows[smooth + x]
+                by_square = self.images.rows[smooth + stride + x]
+                by_product = self.images.rows[smooth + 2 * stride + x]
+                sign = ti.select(a > b, 1.0, ti.select(a < b, -1.0, 0.0))
+                gradient = by_l1 * sign + by_ssim * (by_mean + 2.0 * a * by_square + b * by_product)
+                self.images.colour_grad[channel + row + x] = gradient * self.images.valid[row + x]
 
 
 @ti.data_oriented

@@ -13,7 +13,7 @@ from fields.occupancy import OccupancyVoxels
 from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from pipelines.densification import dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
-from pipelines.depth import DepthEstimator, GaussianProcessDepth
+from pipelines.depth import DepthEstimator, build_depth
 from pipelines.keyframe_selection import KeyframeSelector
 from pipelines.optimisation import MapOptimiser
 from pipelines.rendering import Renderer
@@ -57,11 +57,11 @@ class OnlineMapper:
         self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
         self.renderer = Renderer(self.gaussians, max_width, max_height)
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
-        self.keyframes = KeyframeStore()
+        self.keyframes = KeyframeStore(len(settings.levels.probabilities))
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
         self.selector = KeyframeSelector(settings.keyframes)
-        self.depth = depth or GaussianProcessDepth(settings.depth, self.rng)
+        self.depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self._frames = 0
 
@@ -79,10 +79,13 @@ class OnlineMapper:
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
+            if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
+                self.optimiser.poses.align(view)
             with self.stopwatch.measure("optimise"):
                 self.optimiser.exposure.begin(view, self.renderer, self.settings.near * self.keyframes.scene_depth)
-            self._add(view, compensate=self.settings.densify.error_compensation)
-            psnr = self.optimise(self.settings.optimise.steps)
+            level = self._draw_level()
+            self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
+            psnr = self.optimise(self.settings.optimise.steps, level)
         elif len(self.keyframes):
             # Other frames only bring their points, at the pose that the keyframes around them imply.
             self._add(self.keyframes.view(frame), compensate=False)
@@ -94,11 +97,19 @@ class OnlineMapper:
         self.prune()
         return psnr
 
-    def optimise(self, steps: int) -> float | None:
-        """Optimise the map for the last keyframe and the views chosen with it; return the last step's mean PSNR."""
+    def _draw_level(self) -> int:
+        """Pyramid level of a new keyframe."""
+        p = np.array(self.settings.levels.probabilities)
+        return int(self.rng.choice(len(p), p=p / p.sum()))
+
+    def optimise(self, steps: int, level: int = 0) -> float | None:
+        """Optimise the map for the last keyframe and the views chosen with it, on a pyramid level.
+
+        Returns the last step's mean PSNR.
+        """
         if len(self.keyframes) == 0 or len(self.gaussians) == 0:
             return None
-        psnr = None
+        psnr, poses = None, self.settings.poses
         with self.stopwatch.measure("select"):
             self.views.begin(self.keyframes)
         for step in range(steps):
@@ -109,7 +120,8 @@ class OnlineMapper:
                     self.keyframes,
                     views,
                     self.optimiser.rates(self.keyframes.scene_depth),
-                    refine_poses=self.settings.poses.enabled and step < self.settings.poses.steps,
+                    pose_rate=poses.learning_rate if poses.enabled and step < poses.steps else 0.0,
+                    level=level,
                 )
         return psnr
 
@@ -130,7 +142,8 @@ class OnlineMapper:
                 self.optimiser.compare(view, self.keyframes.scene_depth)
                 error = dissimilarity(self.renderer.images.colour_to_numpy(), view.rgba)
             pixels = error_pixels(view, error, self.settings.densify, self.rng)
-            seeds = pixel_seeds(view, (), pixels, self.depth, self.settings.depth.max_deviation)
+            neighbours = [k for k in self.keyframes if k.index != view.index][-self.settings.depth.neighbours :]
+            seeds = pixel_seeds(view, neighbours, pixels, self.depth, self.settings.depth.max_deviation)
         self._grow(seeds, view)
 
     def _grow(self, seeds, view: Keyframe) -> None:
@@ -152,11 +165,10 @@ class OnlineMapper:
             store = KeyframeStore()
             view = store.append(TrackedFrame(0, 0.0, "compile", image, camera, np.eye(4), points))
             if self.voxels is not None:
-                self.voxels.query(view.points.xyz, 1.0)
-                self.voxels.update(np.zeros((0, 3)), 1.0)
+                self.voxels.admit(np.zeros((0, 3)), 1.0)
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
             self.optimiser.exposure.begin(view, self.renderer, self.settings.near)
-            self.optimiser.step(store, [0], self.optimiser.rates(1.0), refine_poses=False)
+            self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()
             self.gaussians.remove(np.zeros(1, dtype=bool))

@@ -26,7 +26,7 @@ class MapOptimiser:
         self.loss = PhotometricLoss(renderer.images)
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
-        self.poses = PoseRefinement(settings.poses)
+        self.poses = PoseRefinement()
         self.exposure = ExposureRefinement(settings.exposure)
 
     def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
@@ -40,44 +40,51 @@ class MapOptimiser:
             colour=o.colour_rate,
         )
 
-    def compare(self, view: Keyframe, scene_depth: float) -> LossValues:
-        """Render a keyframe, developed as its image is, into the renderer's images and evaluate the loss."""
-        self.renderer.forward(view.camera, view.T_camera_world, self.settings.near * scene_depth)
+    def compare(self, view: Keyframe, scene_depth: float, level: int = 0) -> LossValues:
+        """Render a keyframe, develop it, and evaluate the loss against its image of a pyramid level."""
+        image = view.pyramid[min(level, len(view.pyramid) - 1)]
+        self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth)
         self.renderer.develop(view.exposure, view.vignette)
-        self.renderer.images.set_reference(view.rgba)
+        self.renderer.images.set_reference(image.rgba)
         return self.loss.forward()
 
     def step(
-        self,
-        store: KeyframeStore,
-        views: list[int],
-        rates: LearningRates,
-        refine_poses: bool,
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int = 0
     ) -> float:
-        """One Adam step on the mean loss of the views (indices into `store`); return their mean PSNR.
+        """Adam steps on the mean loss of the views (indices into `store`), in batches; return their mean PSNR.
 
-        The keyframes' errors are brought up to date. Poses move only where `refine_poses`, exposures only where they
-        are estimated; those of the first keyframe are held, to fix the gauge.
+        The keyframes' errors are brought up to date, and their poses but the first are stepped at `pose_rate` [px];
+        so are their exposures where they are estimated.
         """
+        size = self.settings.optimise.batch
+        total = 0.0
+        for first in range(0, len(views), size):
+            batch = views[first : first + size]
+            total += len(batch) * self._step(store, batch, rates, pose_rate, level)
+        return total / len(views)
+
+    def _step(
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int
+    ) -> float:
         o = self.settings.optimise
         psnr = 0.0
         pose_gradients: dict[int, np.ndarray] = {}
         exposure_gradients: dict[int, np.ndarray] = {}
         for j in views:
             view = store[j]
-            values = self.compare(view, store.scene_depth)
+            values = self.compare(view, store.scene_depth, level)
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
             self.renderer.backward()
             view.error = values.l1
             psnr += values.psnr / len(views)
-            if refine_poses and j > 0:
+            if pose_rate > 0 and j > 0:
                 pose_gradients[j] = pose_gradients.get(j, 0.0) + self.renderer.camera_gradient()
             if view.exposure is not None and j > 0:
                 exposure_gradients[j] = exposure_gradients.get(j, 0.0) + self.renderer.exposure_gradient()
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         self.adam.step(rates, len(views))
         for j, gradient in pose_gradients.items():
-            self.poses.step(store[j], gradient, store.scene_depth)
+            self.poses.step(store[j], gradient, pose_rate)
         for j, gradient in exposure_gradients.items():
             self.exposure.step(store[j], gradient, views.count(j) / len(views))
         return psnr

@@ -1,39 +1,97 @@
-"""Camera refinement: keyframe poses follow the gradient of the rendering loss on SE(3) (Section 3.3.3)."""
+"""Camera refinement on SE(3): by the tracked points and by the gradient of the rendering loss (Section 3.3.3)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.camera import PinholeCamera
 from fields.keyframes import Keyframe
-from fields.se3 import exp_se3, orthonormalised
-from pipelines.settings import PoseSettings
+from fields.se3 import exp_se3, log_se3, orthonormalised
 
-__all__ = ["PoseRefinement"]
+__all__ = ["PoseRefinement", "pixel_jacobian", "pixel_metric", "reprojection"]
+
+# Depths that the metric takes to be in a view [its median depth].
+NEAR_AND_FAR = (0.6, 1.6)
+# Reprojection errors beyond this [px] count as outliers and pull no harder (Huber).
+OUTLIER = 2.0
+
+
+def pixel_jacobian(camera: PinholeCamera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """d pixel / d xi (N, 2, 6) of camera-frame points (N, 3), z > 0, under exp(xi) at xi = 0."""
+    x, y, z = points.T
+    fx, fy, zero = camera.fx / z, camera.fy / z, np.zeros(len(points))
+    by_point = np.stack([fx, zero, -fx * x / z, zero, fy, -fy * y / z], axis=1).reshape(-1, 2, 3)
+    # exp(xi) p = p + rho + omega x p
+    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    return np.concatenate([by_point, by_point @ turned], axis=2)
+
+
+def pixel_metric(view: Keyframe) -> NDArray[np.float64]:
+    """W (6, 6) of coordinates u of a pose's tangent, xi = W u, in which a step of |u| moves the image by |u| pixels.
+
+    The root mean square over a grid of pixels at two depths. In these coordinates a small turn and a small shift, which
+    look alike, no longer stand in one another's way, and the scale of the scene cancels.
+    """
+    camera = view.camera
+    across, down = (np.arange(0.1, 1.0, 0.2) * side for side in (camera.width, camera.height))
+    grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    p = np.concatenate([camera.unproject(grid, np.full(len(grid), d * view.median_depth)) for d in NEAR_AND_FAR])
+    J = pixel_jacobian(camera, p).reshape(-1, 6)
+    return np.linalg.inv(np.linalg.cholesky(J.T @ J / len(p))).T
+
+
+def reprojection(view: Keyframe, W: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gradient (6,) and Gauss-Newton Hessian (6, 6) by u of half the mean squared reprojection error [px^2], Huber's.
+
+    Over the view's tracked points that lie before its camera; xi = W u.
+    """
+    p = view.points.xyz @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+    before = p[:, 2] > 0.05 * view.median_depth
+    if not before.any():
+        return np.zeros(6), np.zeros((6, 6))
+    residual = view.camera.project(p[before]) - view.points.pixels[before]
+    length = np.linalg.norm(residual, axis=1)
+    weight = np.minimum(1.0, OUTLIER / np.maximum(length, 1e-12)) / len(residual)
+    J = pixel_jacobian(view.camera, p[before]) @ W
+    return np.einsum("nij,ni,n->j", J, residual, weight), np.einsum("nij,nik,n->jk", J, J, weight)
 
 
 class PoseRefinement:
-    """Adam on the tangent xi = (rho, omega) of a keyframe's T_camera_world, T <- exp(xi) T.
+    """Moves a keyframe's T_camera_world, T <- exp(xi) T, in the coordinates of `pixel_metric`.
 
-    Translation is stepped in units of the scene's depth, so that the scale of a monocular map does not matter. The
-    moments live in the keyframe and are expressed in its own camera frame, which an increment hardly turns.
+    Adam's moments live in the keyframe and are expressed in its own camera frame, which an increment hardly turns.
     """
 
     BETAS = (0.9, 0.999)
+    # Gauss-Newton steps of an alignment, and its weight of half the squared movement from the tracked pose [px^2].
+    ITERATIONS = 5
+    PRIOR = 0.01
 
-    def __init__(self, settings: PoseSettings) -> None:
-        self.settings = settings
+    def align(self, view: Keyframe) -> None:
+        """Move `view` to where its tracked points project to where they were tracked, by Gauss-Newton.
 
-    def step(self, view: Keyframe, gradient: NDArray[np.float64], scene_depth: float) -> None:
-        """Move `view` against d loss / d xi (6,). A gradient that is not finite moves nothing."""
+        A tracker's poses and points agree; where they do not, the points, of which there are many, know better. The
+        prior holds what they leave open.
+        """
+        for _ in range(self.ITERATIONS):
+            W = pixel_metric(view)
+            gradient, H = reprojection(view, W)
+            moved = np.linalg.solve(W, log_se3(view.correction))
+            u = np.linalg.solve(H + self.PRIOR * np.eye(6), -gradient - self.PRIOR * moved)
+            view.T_camera_world = orthonormalised(exp_se3(W @ u) @ view.T_camera_world)
+
+    def step(self, view: Keyframe, gradient: NDArray[np.float64], rate: float) -> None:
+        """Move `view` by about `rate` px against d loss / d xi (6,); a gradient that is not finite moves nothing."""
         if not np.isfinite(gradient).all():
             return
         beta1, beta2 = self.BETAS
+        W = pixel_metric(view)
+        g = W.T @ gradient
         view.pose_steps += 1
-        view.pose_m = beta1 * view.pose_m + (1 - beta1) * gradient
-        view.pose_v = beta2 * view.pose_v + (1 - beta2) * gradient**2
+        view.pose_m = beta1 * view.pose_m + (1 - beta1) * g
+        view.pose_v = beta2 * view.pose_v + (1 - beta2) * g**2
         m = view.pose_m / (1 - beta1**view.pose_steps)
         v = view.pose_v / (1 - beta2**view.pose_steps)
-        rate = self.settings.learning_rate * np.repeat([scene_depth, 1.0], 3)
-        xi = -rate * m / (np.sqrt(v) + 1e-15)
+        xi = W @ (-rate * m / (np.sqrt(v) + 1e-15))
         view.T_camera_world = orthonormalised(exp_se3(xi) @ view.T_camera_world)

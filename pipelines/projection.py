@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 
 from fields.gaussians import SH_C0, GaussianField
+from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.se3 import ti_rotation_from_quaternion
 from fields.vec3 import cross, dot, rotate, rotate_back
@@ -23,6 +24,8 @@ ALPHA_MIN = 1.0 / 255.0
 # Compensation is floored here: below, a Gaussian is far thinner than a pixel and its gradient would be infinite.
 MIN_DETERMINANT_RATIO = 1e-6
 CHUNK = 512
+# A thread takes two chunks at a time.
+SPREAD = HANDED_OUT // 2
 
 
 @ti.data_oriented
@@ -87,42 +90,50 @@ class Projection:
 
     @ti.kernel
     def _cull(self, n: ti.i32, depths: ti.types.ndarray(), counts: ti.types.ndarray()):
-        ti.loop_config(block_dim=1)
-        for chunk in range((n + CHUNK - 1) // CHUNK):
-            rotation, translation = self.view.rotation[None], self.view.translation[None]
-            focal, centre, limits = self.view.focal[None], self.view.centre[None], self.view.limits[None]
-            size = self.view.size[None]
-            # The largest stretch of the linearised projection: |rows of J| <= f / z * sqrt(1 + limit^2).
-            bound = ti.max(ti.max(-limits[0], limits[1]), ti.max(-limits[2], limits[3]))
-            stretch = ti.max(focal[0], focal[1]) * ti.sqrt(1.0 + bound * bound)
-            seen = 0
-            for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
-                p = rotation @ self.gaussians.position[i] + translation
-                visible = 0
-                if p.z > self.view.near[None]:
-                    opacity = 1.0 / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
-                    if opacity > ALPHA_MIN:
-                        sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch / p.z
-                        radius = ti.sqrt(2.0 * ti.log(opacity / ALPHA_MIN) * (sigma * sigma + BLUR))
-                        x = focal[0] * p.x / p.z + centre[0]
-                        y = focal[1] * p.y / p.z + centre[1]
-                        if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
-                            visible = 1
-                depths[i] = ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
-                seen += visible
-            counts[chunk] = seen
+        for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
+            if i % SPREAD == 0:
+                self._cull_chunk(i // SPREAD, n, depths, counts)
+
+    @ti.func
+    def _cull_chunk(self, chunk, n, depths: ti.template(), counts: ti.template()):
+        rotation, translation = self.view.rotation[None], self.view.translation[None]
+        focal, centre, limits = self.view.focal[None], self.view.centre[None], self.view.limits[None]
+        size = self.view.size[None]
+        # The largest stretch of the linearised projection: |rows of J| <= f / z * sqrt(1 + limit^2).
+        bound = ti.max(ti.max(-limits[0], limits[1]), ti.max(-limits[2], limits[3]))
+        stretch = ti.max(focal[0], focal[1]) * ti.sqrt(1.0 + bound * bound)
+        seen = 0
+        for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
+            p = rotation @ self.gaussians.position[i] + translation
+            visible = 0
+            if p.z > self.view.near[None]:
+                opacity = 1.0 / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
+                if opacity > ALPHA_MIN:
+                    sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch / p.z
+                    radius = ti.sqrt(2.0 * ti.log(opacity / ALPHA_MIN) * (sigma * sigma + BLUR))
+                    x = focal[0] * p.x / p.z + centre[0]
+                    y = focal[1] * p.y / p.z + centre[1]
+                    if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
+                        visible = 1
+            depths[i] = ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
+            seen += visible
+        counts[chunk] = seen
 
     @ti.kernel
     def _compact(self, n: ti.i32, depths: ti.types.ndarray(), first: ti.types.ndarray(), keys: ti.types.ndarray()):
-        ti.loop_config(block_dim=1)
-        for chunk in range((n + CHUNK - 1) // CHUNK):
-            slot = first[chunk]
-            for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
-                if depths[i] > 0.0:
-                    # The bits of a positive float rise with it.
-                    bits = ti.cast(ti.bit_cast(depths[i], ti.u32), ti.u64)
-                    keys[slot] = (bits << 32) | ti.cast(i, ti.u64)
-                    slot += 1
+        for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
+            if i % SPREAD == 0:
+                self._compact_chunk(i // SPREAD, n, depths, first, keys)
+
+    @ti.func
+    def _compact_chunk(self, chunk, n, depths: ti.template(), first: ti.template(), keys: ti.template()):
+        slot = first[chunk]
+        for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
+            if depths[i] > 0.0:
+                # The bits of a positive float rise with it.
+                bits = ti.cast(ti.bit_cast(depths[i], ti.u32), ti.u64)
+                keys[slot] = (bits << 32) | ti.cast(i, ti.u64)
+                slot += 1
 
     @ti.kernel
     def _assign_slots(self, count: ti.i32, keys: ti.types.ndarray()):
@@ -194,10 +205,14 @@ class Projection:
 
     @ti.kernel
     def _sum_tangents(self, count: ti.i32, partial: ti.types.ndarray()):
-        ti.loop_config(block_dim=1)
-        for chunk in range((count + CHUNK - 1) // CHUNK):
-            total = ti.Vector.zero(self.projected.real, 6)
-            for s in range(chunk * CHUNK, ti.min(count, (chunk + 1) * CHUNK)):
-                total += self.projected.tangent.grad[s]
-            for c in ti.static(range(6)):
-                partial[chunk, c] = total[c]
+        for i in range(((count + CHUNK - 1) // CHUNK) * SPREAD):
+            if i % SPREAD == 0:
+                self._sum_tangents_chunk(i // SPREAD, count, partial)
+
+    @ti.func
+    def _sum_tangents_chunk(self, chunk, count, partial: ti.template()):
+        total = ti.Vector.zero(self.projected.real, 6)
+        for s in range(chunk * CHUNK, ti.min(count, (chunk + 1) * CHUNK)):
+            total += self.projected.tangent.grad[s]
+        for c in ti.static(range(6)):
+            partial[chunk, c] = total[c]

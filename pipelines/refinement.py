@@ -19,23 +19,25 @@ def decay(step: int, steps: int, final: float) -> float:
 def refine(
     mapper: OnlineMapper, settings: RefineSettings, progress: Callable[[int, float], None] | None = None
 ) -> None:
-    """Run `settings.steps` steps on error-weighted draws of keyframes, poses fixed; positions and scales slow down.
+    """Run `settings.steps` steps on error-weighted draws of keyframes; positions, scales and poses slow down.
 
     progress: called after every step with (steps done, mean PSNR of its views).
     """
-    store, views = mapper.keyframes, mapper.settings.views
+    store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
+    pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0
     if len(store) == 0 or len(mapper.gaussians) == 0:
         return
     for step in range(settings.steps):
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0)
             batch = [int(j) for j in mapper.rng.choice(len(store), settings.views, p=p)]
+            slower = decay(step, settings.steps, settings.position_decay)
             rates = mapper.optimiser.rates(
                 store.scene_depth,
-                position_factor=decay(step, settings.steps, settings.position_decay),
+                position_factor=slower,
                 scale_factor=decay(step, settings.steps, settings.scale_decay),
             )
-            psnr = mapper.optimiser.step(store, batch, rates, refine_poses=False)
+            psnr = mapper.optimiser.step(store, batch, rates, pose_rate * slower)
         if progress is not None:
             progress(step + 1, psnr)
     mapper.prune()

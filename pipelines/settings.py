@@ -5,13 +5,20 @@ a `view scale` is the median of depth / focal length over a view's tracked point
 out there; the `scene depth` is the median depth of the tracked points over all keyframes.
 """
 
-from pydantic import BaseModel, ConfigDict, Field
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = [
     "DensifySettings",
     "DepthSettings",
+    "EpipolarSettings",
     "ExposureSettings",
     "KeyframeSettings",
+    "LevelSettings",
     "MappingSettings",
     "OptimiseSettings",
     "PoseSettings",
@@ -48,13 +55,45 @@ class KeyframeSettings(StrictModel):
     min_points: int = Field(10, ge=0, description="tracked points that a keyframe needs")
 
 
-class DepthSettings(StrictModel):
-    """Depth of pixels without a tracked point: Gaussian process on the log depths of the tracked points."""
+class EpipolarSettings(StrictModel):
+    """Search along epipolar lines in neighbour keyframes."""
 
+    views: int = Field(4, ge=1, description="neighbours that are searched")
+    parallax: float = Field(0.1, gt=0, description="baseline to them that is preferred [the view's median depths]")
+    max_samples: int = Field(96, ge=8, description="samples of inverse depth along a line at most")
+    min_score: float = Field(0.8, ge=-1, le=1, description="correlation (ZNCC) that a match must have")
+    min_lead: float = Field(0.05, ge=0, le=2, description="by how much it must beat all others along the line")
+    pixel_noise: float = Field(0.2, ge=0, description="standard deviation of a sharp match [px]")
+
+
+DepthSource = Literal["constant", "image", "depthcov", "epipolar", "map"]
+
+
+class DepthSettings(StrictModel):
+    """Depth of pixels without a tracked point (Section 3.2.2)."""
+
+    sources: tuple[DepthSource, ...] = Field(
+        ("image", "epipolar", "map"),
+        min_length=1,
+        description="estimators that are fused by inverse variance: Gaussian processes on the tracked points with a "
+        "constant kernel (constant), one that follows the image (image) or DepthCov's (depthcov); matches in other "
+        "keyframes (epipolar); the render of the map (map)",
+    )
     max_points: int = Field(500, ge=10, description="tracked points that condition the process, drawn at random beyond")
     max_deviation: float = Field(
         0.06, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
     )
+    checkpoint: Path | None = Field(
+        None, description="DepthCov's weights (`scannet.ckpt` or `nyu.ckpt`), a file of the user's own; for depthcov"
+    )
+    neighbours: int = Field(10, ge=0, description="latest other keyframes among which matches are looked for")
+    epipolar: EpipolarSettings = EpipolarSettings()
+
+    @model_validator(mode="after")
+    def _checkpoint_is_given(self) -> DepthSettings:
+        if "depthcov" in self.sources and self.checkpoint is None:
+            raise ValueError("depthcov needs its weights: set checkpoint")
+        return self
 
 
 class DensifySettings(StrictModel):
@@ -107,7 +146,19 @@ class PoseSettings(StrictModel):
     enabled: bool = Field(True, description="refine keyframe poses while mapping")
     steps: int = Field(8, ge=0, description="first steps of a keyframe that also refine poses")
     learning_rate: float = Field(
-        1e-5, ge=0, description="Adam step of rotation [rad] and of translation [scene depths]"
+        0.01, ge=0, description="Adam step of a pose, as the movement of its tracked points in the image [px]"
+    )
+    align: bool = Field(True, description="first move a new keyframe to where its tracked points project rightly")
+
+
+class LevelSettings(StrictModel):
+    """Image pyramid: the level that a new keyframe is optimised and densified on."""
+
+    probabilities: tuple[float, ...] = Field(
+        (0.4, 0.3, 0.2, 0.1),
+        min_length=1,
+        max_length=8,
+        description="of drawing the full size, the half, the quarter, ...; [1] for full size only",
     )
 
 
@@ -124,6 +175,10 @@ class ExposureSettings(StrictModel):
 
 class OptimiseSettings(StrictModel):
     """Loss and learning rates."""
+
+    batch: int = Field(
+        6, ge=1, description="views whose gradients make one Adam step; the views of a step are shared out"
+    )
 
     steps: int = Field(25, ge=0, description="steps per keyframe")
     last_steps: int = Field(40, ge=0, description="steps after the last frame")
@@ -153,6 +208,7 @@ class MappingSettings(StrictModel):
     densify: DensifySettings = DensifySettings()
     depth: DepthSettings = DepthSettings()
     voxels: VoxelSettings = VoxelSettings()
+    levels: LevelSettings = LevelSettings()
     views: ViewSettings = ViewSettings()
     poses: PoseSettings = PoseSettings()
     exposure: ExposureSettings = ExposureSettings()
@@ -164,5 +220,6 @@ class RefineSettings(StrictModel):
 
     steps: int = Field(1000, ge=0, description="steps over all keyframes after the last frame; 0 for none")
     views: int = Field(4, ge=1, description="views per step, drawn as the global views are")
+    poses: bool = Field(False, description="also refine poses, at a rate that decays as that of positions does")
     position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
     scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")

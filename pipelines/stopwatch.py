@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-__all__ = ["Stopwatch"]
+__all__ = ["Stopwatch", "breakdown_percent"]
+
+# The stages of the paper's breakdown: Optim, Cam Select, Depth Est., MOHV.
+BREAKDOWN = ("optimise", "select", "depth", "occupancy")
 
 
 class Stopwatch:
@@ -23,3 +26,10 @@ class Stopwatch:
             yield
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def breakdown_percent(seconds: Mapping[str, float], total: float) -> dict[str, float]:
+    """Percent of `total` seconds of mapping that each stage took, and `others`, as in the paper's breakdown of time."""
+    percent = {stage: 100.0 * seconds.get(stage, 0.0) / total for stage in BREAKDOWN}
+    percent["others"] = 100.0 - sum(percent.values())
+    return {stage: round(value, 2) for stage, value in percent.items()}

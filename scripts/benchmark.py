@@ -1,7 +1,8 @@
-"""Times of the kernels and of one optimisation step, as Markdown tables.
+"""Times of the kernels and of one optimisation step, and the cost of the voxels, as Markdown tables.
 
 A scene of Gaussians spread over depths of 2 to 6 units stands for a map. Medians of repeated calls after a warm-up.
-Per-pair times come from one thread, the step from all of them.
+Per-pair times come from one thread, the step and the voxels from all of them. The voxels take 300,000 points in random
+order on the walls of a room that is 80 coarsest cells wide.
 """
 
 from __future__ import annotations
@@ -25,23 +26,31 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=15, help="timed calls a figure (default 15)")
     parser.add_argument("--json", help="also write all figures to this file")
     parser.add_argument("--threads", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--voxels", type=int, metavar="LEVEL", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     width, height = (int(v) for v in arguments.size.split("x"))
+    if arguments.voxels is not None:
+        print(json.dumps(measure_voxels(arguments.voxels, arguments.threads)))
+        return
     if arguments.threads:
         print(json.dumps(measure(width, height, arguments.gaussians, arguments.threads, arguments.repeats)))
         return
     cores = len(os.sched_getaffinity(0))
     runs = {n: _in_process(arguments, n) for n in sorted({1, cores})}
+    voxels = {level: _in_process(arguments, cores, "--voxels", str(level)) for level in (3, 7)}
     print(report(runs, cores, width, height, arguments.gaussians))
+    print(report_voxels(voxels))
     if arguments.json:
         with open(arguments.json, "w", encoding="utf-8") as file:
-            json.dump({str(n): figures for n, figures in runs.items()}, file, indent=2)
+            figures = {str(n): figures for n, figures in runs.items()}
+            figures |= {f"voxels, level {level}": of_level for level, of_level in voxels.items()}
+            json.dump(figures, file, indent=2)
 
 
-def _in_process(arguments: argparse.Namespace, threads: int) -> dict[str, float]:
+def _in_process(arguments: argparse.Namespace, threads: int, *more: str) -> dict[str, float]:
     command = [sys.executable, __file__, "--size", arguments.size, "--gaussians", str(arguments.gaussians)]
-    command += ["--repeats", str(arguments.repeats), "--threads", str(threads)]
-    print(f"measuring with {threads} thread(s) ...", file=sys.stderr)
+    command += ["--repeats", str(arguments.repeats), "--threads", str(threads), *more]
+    print(f"measuring with {threads} thread(s) {' '.join(more)} ...", file=sys.stderr)
     result = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(result.stdout.splitlines()[-1])
 
@@ -117,8 +126,69 @@ def measure(width: int, height: int, count: int, threads: int, repeats: int) -> 
         optimiser.adam.step(rates)
 
     figures["projection backward, Adam"] = milliseconds(backward_and_adam)
-    figures["step"] = milliseconds(lambda: optimiser.step(store, [0], rates, refine_poses=False))
+    figures["step"] = milliseconds(lambda: optimiser.step(store, [0], rates, pose_rate=0.0))
     return figures
+
+
+VOXEL_POINTS, VOXEL_BATCHES, ROOM = 100_000, 3, 80.0
+
+
+def measure_voxels(level: int, threads: int) -> dict[str, float]:
+    """Milliseconds per 100,000 points at a level of the voxels, and megabytes that 300,000 points take."""
+    from fields.backend import initialise
+    from fields.occupancy import OccupancyVoxels
+
+    initialise("cpu", threads)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-ROOM / 2, ROOM / 2, (VOXEL_BATCHES, VOXEL_POINTS, 3))
+    wall = rng.integers(0, 6, points.shape[:2])
+    np.put_along_axis(points, (wall // 2)[..., None], ((wall % 2) - 0.5)[..., None] * ROOM, axis=2)
+    size = 0.5**level
+    times: dict[str, list[float]] = {"query": [], "update": [], "admit": []}
+
+    def timed(name: str, call: Callable[[], object]) -> None:
+        start = time.perf_counter()
+        call()
+        times[name].append(time.perf_counter() - start)
+
+    def compiled() -> OccupancyVoxels:
+        voxels = OccupancyVoxels()
+        voxels.query(np.zeros((0, 3)), size)
+        voxels.admit(np.zeros((0, 3)), size)
+        return voxels
+
+    voxels = compiled()
+    before = _resident_mb()
+    for batch in points:
+        timed("query", lambda batch=batch: voxels.query(batch, size))
+        timed("update", lambda batch=batch: voxels.update(batch, size))
+    megabytes = _resident_mb() - before
+    voxels = compiled()
+    for batch in points:
+        timed("admit", lambda batch=batch: voxels.admit(batch, size))
+    return {name: 1e3 * float(np.median(of)) for name, of in times.items()} | {"megabytes": megabytes}
+
+
+def _resident_mb() -> float:
+    """Memory of this process that is in use now (Linux; elsewhere not a number)."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except OSError:
+        return float("nan")
+
+
+def report_voxels(levels: dict[int, dict[str, float]]) -> str:
+    """The Markdown table of the voxels' figures by level."""
+    lines = [
+        "",
+        "| voxels, 300,000 points, ms per 100,000 | query | update | admit: both at once | MB |",
+        "|---|---|---|---|---|",
+    ]
+    for level, of in levels.items():
+        name = f"down to level {level} of 0 to 7"
+        lines.append(f"| {name} | {of['query']:.1f} | {of['update']:.1f} | {of['admit']:.1f} | {of['megabytes']:.0f} |")
+    return "\n".join(lines)
 
 
 def report(runs: dict[int, dict[str, float]], cores: int, width: int, height: int, count: int) -> str:

@@ -1,19 +1,21 @@
-"""Gaussian process on the log depths of a view's tracked points, with a constant kernel."""
+"""Gaussian processes on the log depths of a view's tracked points: over the image plane, and following the image."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from fields.keyframes import Keyframe
 from pipelines.depth.covariance import matern32
-from pipelines.depth.estimate import DepthEstimate, point_depths, unknown_depth
+from pipelines.depth.estimate import DepthEstimate, unknown_depth
+from pipelines.depth.regression import MIN_POINTS, conditioning_points, regress_log_depth
 from pipelines.settings import DepthSettings
 
-__all__ = ["GaussianProcessDepth"]
+__all__ = ["GaussianProcessDepth", "ImageGuidedDepth"]
 
 
 class GaussianProcessDepth:
@@ -25,49 +27,67 @@ class GaussianProcessDepth:
     """
 
     LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
-    # Three numbers need no more points than this.
-    FIT_POINTS = 150
+    # Difference of colour that weighs as much as a length scale of distance; infinite: colour does not count.
+    COLOURS: tuple[float, ...] = (np.inf,)
     NOISE_RATIOS = (1e-3, 1e-2, 1e-1)
+    # Four numbers need no more points than this.
+    FIT_POINTS = 150
 
     def __init__(self, settings: DepthSettings, rng: np.random.Generator) -> None:
         self.settings = settings
         self._rng = rng
 
     def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
-        """See `DepthEstimator`. Three tracked points are the least that it works with."""
-        places, z = point_depths(view)
-        if len(z) > self.settings.max_points:
-            some = np.sort(self._rng.choice(len(z), self.settings.max_points, replace=False))
-            places, z = places[some], z[some]
-        if len(z) < 3 or len(pixels) == 0:
+        """See `DepthEstimator`. Fewer than MIN_POINTS tracked points leave every pixel unknown."""
+        places, z = conditioning_points(view, self.settings.max_points, self._rng)
+        if len(z) < MIN_POINTS or len(pixels) == 0:
             return unknown_depth(len(pixels))
-        side = max(view.camera.width, view.camera.height)
-        known = torch.from_numpy(places / side)
-        asked = torch.from_numpy(np.asarray(pixels, dtype=np.float64) / side)
+        known, asked = self._features(view, places), self._features(view, pixels)
         y = torch.from_numpy(np.log(z))
-        mean = y.mean()
         some = slice(None, None, max(len(y) // self.FIT_POINTS, 1))
-        length, ratio, variance = self._fit(known[some], (y - mean)[some])
-        K = matern32(torch.cdist(known, known) / length)
-        L = torch.linalg.cholesky(K + ratio * torch.eye(len(y), dtype=torch.float64))
-        k = matern32(torch.cdist(asked, known) / length)
-        log_depth = mean + k @ torch.cholesky_solve((y - mean)[:, None], L)[:, 0]
-        half = torch.linalg.solve_triangular(L, k.T, upper=False)
-        deviation = torch.sqrt(variance * (1.0 - (half * half).sum(0)).clamp_min(0.0))
-        return DepthEstimate(torch.exp(log_depth).numpy(), deviation.numpy())
+        length, colour, ratio, variance = self._fit(known[some], (y - y.mean())[some])
+        K = variance * self._correlation(known, known, length, colour)
+        k = variance * self._correlation(asked, known, length, colour)
+        return regress_log_depth(z, K, ratio * variance, k, variance)
 
-    def _fit(self, known: torch.Tensor, y: torch.Tensor) -> tuple[float, float, float]:
-        """(length scale, noise / signal, signal variance) of greatest likelihood; the variance in closed form."""
-        distance = torch.cdist(known, known)
+    def _features(self, view: Keyframe, pixels: NDArray[np.float64]) -> torch.Tensor:
+        """What the correlation of pixels (N, 2) depends on (N, 2 + c): place in larger image sides, then colour."""
+        return torch.from_numpy(np.asarray(pixels, dtype=np.float64) / max(view.camera.width, view.camera.height))
+
+    @staticmethod
+    def _correlation(a: torch.Tensor, b: torch.Tensor, length: float, colour: float) -> torch.Tensor:
+        return matern32(torch.cdist(*(torch.cat([f[:, :2] / length, f[:, 2:] / colour], dim=1) for f in (a, b))))
+
+    def _fit(self, known: torch.Tensor, y: torch.Tensor) -> tuple[float, float, float, float]:
+        """(length, colour scale, noise / signal, signal variance) of greatest likelihood; the last in closed form."""
         n = len(y)
-        best = (-np.inf, self.LENGTHS[0], self.NOISE_RATIOS[0], 1.0)
+        best = (-np.inf, 0.0, 0.0, 0.0, 0.0)
         for length in self.LENGTHS:
-            K = matern32(distance / length)
-            for ratio in self.NOISE_RATIOS:
-                L = torch.linalg.cholesky(K + ratio * torch.eye(n, dtype=torch.float64))
-                half = torch.linalg.solve_triangular(L, y[:, None], upper=False)[:, 0]
-                variance = float((half @ half) / n) + 1e-12
-                likelihood = -0.5 * n * np.log(variance) - float(torch.log(torch.diagonal(L)).sum())
-                if likelihood > best[0]:
-                    best = (likelihood, length, ratio, variance)
+            for colour in self.COLOURS:
+                K = self._correlation(known, known, length, colour)
+                for ratio in self.NOISE_RATIOS:
+                    L = torch.linalg.cholesky(K + ratio * torch.eye(n, dtype=torch.float64))
+                    half = torch.linalg.solve_triangular(L, y[:, None], upper=False)[:, 0]
+                    variance = float((half @ half) / n) + 1e-12
+                    likelihood = -0.5 * n * np.log(variance) - float(torch.log(torch.diagonal(L)).sum())
+                    if likelihood > best[0]:
+                        best = (likelihood, length, colour, ratio, variance)
         return best[1:]
+
+
+class ImageGuidedDepth(GaussianProcessDepth):
+    """The same process over place and colour together: correlation is shorter across colour edges.
+
+    Colours are those of the slightly blurred image, so that texture finer than a surface does not count. How much
+    they count is chosen by likelihood with the rest, down to not at all.
+    """
+
+    COLOURS = (np.inf, 0.5, 0.25, 0.125)
+    # Standard deviation [px] of the blur.
+    BLUR = 2.0
+
+    def _features(self, view: Keyframe, pixels: NDArray[np.float64]) -> torch.Tensor:
+        image = cv2.GaussianBlur(view.rgba[..., :3].astype(np.float32) / 255.0, (0, 0), self.BLUR)
+        x, y = (pixels - 0.5).astype(np.float32).T
+        colour = cv2.remap(image, x[None], y[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+        return torch.cat([super()._features(view, pixels), torch.from_numpy(colour).double()], dim=1)

@@ -60,6 +60,45 @@ def test_batches_are_answered_as_by_plain_sets(voxels: Callable[..., OccupancyVo
     assert max(admitted) > 0.9
 
 
+def test_batches_of_mixed_sizes_are_answered_as_by_plain_sets(voxels: Callable[..., OccupancyVoxels]) -> None:
+    # Nine levels: three stacks of bricks, the coarsest stack of one level only.
+    ours, plain = voxels(1.0, levels=9, resolution=64), PlainVoxels(1.0, 9)
+    rng = np.random.default_rng(1)
+    seen = set()
+    for _ in range(4):
+        # Half of the points lie near others, so that cells are shared on every level.
+        centres = rng.uniform(-2, 2, (60, 3))
+        near = np.repeat(centres, 10, axis=0) + rng.normal(size=(600, 3)) * 10 ** rng.uniform(-3, 0, (600, 1))
+        points = rng.permutation(np.concatenate([rng.uniform(-2, 2, (600, 3)), near]))
+        marked, asked, added = 2.0 ** rng.uniform(-9, 1, (3, len(points)))
+        ours.update(points[:300], marked[:300])
+        for p, size in zip(points[:300], marked[:300], strict=True):
+            plain.mark(p, size)
+        expected = [plain.occupied(p, size) for p, size in zip(points, asked, strict=True)]
+        assert ours.query(points, asked).tolist() == expected
+        seen |= {(int(level), occupied) for level, occupied in zip(ours.level_of(asked), expected, strict=True)}
+        expected = [plain.admit(p, size) for p, size in zip(points, added, strict=True)]
+        assert ours.admit(points, added).tolist() == expected
+    assert seen == {(level, occupied) for level in range(9) for occupied in (False, True)}
+
+
+def test_the_order_of_a_batch_decides_and_not_the_threads(voxels: Callable[..., OccupancyVoxels]) -> None:
+    points = np.random.default_rng(2).uniform(-0.2, 0.2, (20_000, 3))
+    admitted = voxels(0.1, levels=3, resolution=64).admit(points, 0.05)
+    # The oracle: the first point of each cell of the asked level, which alone decides where nothing was marked before.
+    _, first = np.unique(np.floor(points / 0.05), axis=0, return_index=True)
+    assert np.flatnonzero(admitted).tolist() == sorted(first.tolist())
+
+
+@pytest.mark.parametrize("levels", [3, 16])
+def test_places_that_are_no_numbers_are_never_free(voxels: Callable[..., OccupancyVoxels], levels: int) -> None:
+    v = voxels(1.0, levels=levels, resolution=8)
+    nowhere = [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0, -np.inf]]
+    assert not v.admit(nowhere, 0.5).any()
+    assert v.query(nowhere, 0.5).all()
+    assert not v.query([[0.1, 0.1, 0.1]], 0.5).any()
+
+
 def test_an_update_marks_up_to_its_level_and_no_finer_one(voxels: Callable[..., OccupancyVoxels]) -> None:
     v = voxels(1.0, levels=4, resolution=8)
     p = [[0.1, 0.1, 0.1]]

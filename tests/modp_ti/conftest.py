@@ -1,4 +1,4 @@
-"""Inputs of the readers: the real data where it is there, and a posed scene with known geometry."""
+"""Inputs of the readers: the real data where it is there, a posed scene with known geometry, and made LPIPS weights."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -136,3 +137,21 @@ def plane_scene(tmp_path: Path) -> PlaneScene:
         cv2.imwrite(str(folder / names[-1]), image)
         poses.append(T)
     return PlaneScene(folder, names, K, np.stack(poses), (width, height))
+
+
+@pytest.fixture(scope="session")
+def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with LPIPS weights that nobody has trained, in files as torchvision and the `lpips` package bring them."""
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    generator = torch.Generator().manual_seed(2)
+    alexnet = {"classifier.1.weight": torch.zeros(3, 3), "classifier.1.bias": torch.zeros(3)}
+    linear = {}
+    for n, (i, shape) in enumerate(shapes.items()):
+        fan = shape[1] * shape[2] * shape[3]
+        alexnet[f"features.{i}.weight"] = torch.randn(shape, generator=generator) * (2 / fan) ** 0.5
+        alexnet[f"features.{i}.bias"] = 0.1 * torch.randn(shape[0], generator=generator)
+        linear[f"lin{n}.model.1.weight"] = torch.rand(1, shape[0], 1, 1, generator=generator)
+    folder = tmp_path_factory.mktemp("weights")
+    torch.save(alexnet, folder / "alexnet-owt-7be5be79.pth")
+    torch.save(linear, folder / "alex.pth", _use_new_zipfile_serialization=False)  # the package's is of the old format
+    return folder

@@ -46,8 +46,9 @@ def held_out_psnr(frames: list[TrackedFrame], **exposure: object) -> float:
             frame,
             store.corrected(frame.index, frame.T_camera_world),
             near,
-            store.exposure_at(frame.index),
-        )[0]
+            "online",
+            exposure=store.exposure_at(frame.index),
+        )[0].psnr
         for frame in frames
         if frame.held_out
     ]
@@ -55,5 +56,5 @@ def held_out_psnr(frames: list[TrackedFrame], **exposure: object) -> float:
 
 
 def test_estimated_exposure_wins_at_least_a_decibel(frames: list[TrackedFrame]) -> None:
-    """Measured when this was written: 20.1 dB without, 22.8 dB with."""
+    """Measured when this was written: 19.8 dB without, 22.6 dB with."""
     assert held_out_psnr(frames, enabled=True) > held_out_psnr(frames) + 1.0

@@ -1,18 +1,20 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modp_ti.evaluation import Scores, absolute_trajectory_error, umeyama
+from modp_ti.evaluation import FrameScore, absolute_trajectory_error, summary, umeyama
 
 
 def test_the_summary_holds_means_and_nothing_where_there_are_no_frames() -> None:
-    scores = Scores()
-    assert scores.summary() == {"psnr": None, "ssim": None, "lpips": None, "count": 0}
-    scores.add(20.0, 0.5)
-    scores.add(30.0, 0.7)
-    assert scores.summary() == {"psnr": 25.0, "ssim": 0.6, "lpips": None, "count": 2}
+    assert summary([]) == {"psnr": None, "ssim": None, "lpips": None, "count": 0}
+    scores = [FrameScore(0, "a", True, "online", 20.0, 0.5, None), FrameScore(1, "b", False, "online", 30.0, 0.7, None)]
+    assert summary(scores) == {"psnr": 25.0, "ssim": 0.6, "lpips": None, "count": 2}
+    scores = [replace(score, lpips=0.1 + 0.2 * score.index) for score in scores]
+    assert summary(scores)["lpips"] == 0.2
 
 
 @pytest.mark.parametrize("with_scale", [True, False])

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pipelines.stopwatch import Stopwatch
+from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 
 def test_times_of_a_stage_add_up() -> None:
@@ -24,3 +24,14 @@ def test_a_stage_that_fails_is_counted_too() -> None:
         time.sleep(0.01)
         raise KeyError
     assert watch.seconds["render"] >= 0.01
+
+
+def test_the_breakdown_is_the_share_of_each_stage() -> None:
+    seconds = {"optimise": 8.0, "select": 0.5, "depth": 0.25, "read": 1.0, "refine": 99.0}
+    assert breakdown_percent(seconds, 10.0) == {
+        "optimise": 80.0,
+        "select": 5.0,
+        "depth": 2.5,
+        "occupancy": 0.0,
+        "others": 12.5,
+    }

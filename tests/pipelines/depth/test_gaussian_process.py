@@ -6,7 +6,7 @@ import pytest
 from fields.camera import PinholeCamera
 from fields.keyframes import Keyframe, KeyframeStore
 from fields.tracked_frame import SparsePoints, TrackedFrame
-from pipelines.depth import GaussianProcessDepth
+from pipelines.depth import GaussianProcessDepth, ImageGuidedDepth
 from pipelines.settings import DepthSettings
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
@@ -100,3 +100,34 @@ def test_no_more_points_than_allowed_condition_it(grid: np.ndarray) -> None:
 def test_without_points_nothing_is_known() -> None:
     estimate = estimator().estimate(view(np.zeros((0, 2)), np.zeros(0)), [], np.array([[3.0, 3.0]]))
     assert np.isinf(estimate.deviation).all()
+
+
+def two_walls(rng: np.random.Generator) -> tuple[Keyframe, np.ndarray, np.ndarray]:
+    """A red wall at depth 2 left of a wavy edge, a blue one at 3 right of it; pixels near the edge, their depths."""
+    x, y = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
+    far = x > 80 + 20 * np.sin(y / 12)
+    image = np.where(far[..., None], [0.1, 0.2, 0.9], [0.9, 0.2, 0.1]).astype(np.float32)
+    depth = np.where(far, 3.0, 2.0)
+    pixels = rng.integers([2, 2], [158, 118], (150, 2)) + 0.5
+    column, row = pixels.astype(int).T
+    points = SparsePoints(CAMERA.unproject(pixels, depth[row, column]), pixels, np.arange(150))
+    view = KeyframeStore().append(TrackedFrame(0, 0.0, "v", image, CAMERA, np.eye(4), points))
+    asked = np.stack([rng.integers(55, 105, 300), rng.integers(5, 115, 300)], axis=1) + 0.5
+    column, row = asked.astype(int).T
+    return view, asked, depth[row, column]
+
+
+def test_depth_jumps_where_the_colour_does() -> None:
+    view, asked, truth = two_walls(np.random.default_rng(3))
+    guided = ImageGuidedDepth(DepthSettings(), np.random.default_rng(0)).estimate(view, [], asked)
+    constant = estimator().estimate(view, [], asked)
+    errors = [np.abs(np.log(e.depth / truth)) for e in (guided, constant)]
+    assert np.mean(errors[0] > 0.1) < 0.5 * np.mean(errors[1] > 0.1)
+    assert errors[0].mean() < 0.5 * errors[1].mean()
+
+
+def test_without_colour_the_guided_process_is_the_constant_one(grid: np.ndarray) -> None:
+    asked = np.random.default_rng(1).uniform([5, 5], [155, 115], (50, 2))
+    v = view(grid, surface(grid))  # black all over
+    guided = ImageGuidedDepth(DepthSettings(), np.random.default_rng(0)).estimate(v, [], asked)
+    np.testing.assert_allclose(guided.depth, estimator().estimate(v, [], asked).depth, rtol=1e-9)

@@ -1,0 +1,132 @@
+"""The paper's ablations on scenes of yours, as Markdown tables.
+
+Every variant is a run of its own, online only unless --refine asks for more. Finished runs are kept in the output
+folder, and used again as long as their settings are the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from experiments import (
+    Figures,
+    Job,
+    command_line,
+    execute,
+    first_third_psnr,
+    markdown_table,
+    mean_figures,
+    named_scenes,
+    quality,
+    write_report,
+)
+
+from modp_ti.errors import InputError
+
+FULL = "full"
+OTHER_TRACKER = "other tracker"
+# Without the global views as many views a step are drawn from the local bank: the budget stays that of the full method.
+VARIANTS: dict[str, dict[str, str]] = {
+    "w/o EC": {"mapping.densify.error_compensation": "false"},
+    "w/o MOHV": {"mapping.voxels.enabled": "false"},
+    "w/o EC & MOHV": {"mapping.densify.error_compensation": "false", "mapping.voxels.enabled": "false"},
+    "w/o global cams": {"mapping.views.global_views": "0", "mapping.views.local_views": "5"},
+    "w/o cam refinement": {"mapping.poses.enabled": "false"},
+    FULL: {},
+}
+QUALITY = {"PSNR": ("psnr", ".2f"), "SSIM": ("ssim", ".3f"), "LPIPS": ("lpips", ".3f")}
+GAUSSIANS = {"# Gaussians": ("gaussians", ",.0f")}
+FIRST_THIRD = {"held-out PSNR, first third": ("first_third_psnr", ".2f")}
+# The paper's tables: title, columns, rows.
+TABLES = (
+    ("Gaussian management", QUALITY | GAUSSIANS, ("w/o EC", "w/o MOHV", "w/o EC & MOHV", FULL)),
+    ("Global consistent optimisation", QUALITY | FIRST_THIRD, ("w/o global cams", "w/o cam refinement", FULL)),
+    ("Tracking", QUALITY | GAUSSIANS, (OTHER_TRACKER, FULL)),
+)
+
+
+def main() -> None:
+    """Run what is missing, then print and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", metavar="scene.yaml", help="scene files, one or several")
+    parser.add_argument("-o", "--output", required=True, type=Path, help="folder of runs, ablation.md, ablation.json")
+    parser.add_argument(
+        "--tracker", nargs="+", default=[], metavar="other.yaml", help="for each scene the same with another tracker"
+    )
+    parser.add_argument(
+        "--refine", type=int, default=0, metavar="STEPS", help="post refinement of each run (default 0)"
+    )
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of every run")
+    parser.add_argument("--fresh", action="store_true", help="run again what is there already")
+    arguments = parser.parse_args()
+    try:
+        scenes = named_scenes(arguments.scenes)
+        common = {"refine.steps": str(arguments.refine)} | command_line(arguments.set)
+        jobs = plan(scenes, arguments.output, common, arguments.tracker)
+        metrics = execute([job for of_scene in jobs.values() for job in of_scene.values()], arguments.fresh)
+    except InputError as error:
+        sys.exit(f"error: {error}")
+    rest = iter(metrics)
+    figures = {
+        scene: {variant: summary(next(rest), job.folder) for variant, job in of_scene.items()}
+        for scene, of_scene in jobs.items()
+    }
+    write_report(arguments.output, "ablation", report(figures), figures)
+
+
+def plan(
+    scenes: Mapping[str, Path], output: Path, common: Mapping[str, str], trackers: list[str]
+) -> dict[str, dict[str, Job]]:
+    """The jobs by scene and variant. trackers: empty, or for each scene the file that names another tracker."""
+    if trackers and len(trackers) != len(scenes):
+        raise InputError(f"--tracker needs one file for each of the {len(scenes)} scenes, got {len(trackers)}")
+    jobs = {
+        scene: {
+            name: Job(f"{scene}, {name}", file, output / scene / _folder(name), {**common, **overrides})
+            for name, overrides in VARIANTS.items()
+        }
+        for scene, file in scenes.items()
+    }
+    for scene, other in zip(scenes, trackers, strict=False):
+        file = Path(other).resolve()
+        jobs[scene][OTHER_TRACKER] = Job(
+            f"{scene}, {OTHER_TRACKER}", file, output / scene / _folder(OTHER_TRACKER), common
+        )
+    return jobs
+
+
+def _folder(variant: str) -> str:
+    return variant.replace("w/o", "without").replace("& ", "").replace(" ", "-").lower()
+
+
+def summary(metrics: Mapping, folder: Path) -> Figures:
+    """The figures of one run for the tables: those of the refined map where there is one."""
+    stage = "refined" if metrics.get("refined") else "online"
+    return quality(metrics[stage]) | {
+        "gaussians": metrics["gaussians"],
+        "first_third_psnr": first_third_psnr(folder, stage),
+    }
+
+
+def report(figures: Mapping[str, Mapping[str, Figures]]) -> str:
+    """The paper's tables by {scene: {variant: figures}}: the means over the scenes, then each scene."""
+    parts = {}
+    if len(figures) > 1:
+        variants = [v for v in (*VARIANTS, OTHER_TRACKER) if all(v in of_scene for of_scene in figures.values())]
+        parts[f"Mean of {len(figures)} scenes"] = {
+            v: mean_figures([of_scene[v] for of_scene in figures.values()]) for v in variants
+        }
+    lines = ["# Ablations", "", "Held-out frames; all frames where none is held out."]
+    for title, rows in (parts | dict(figures)).items():
+        lines += ["", f"## {title}"]
+        for name, columns, variants in TABLES:
+            if all(v in rows for v in variants):
+                lines += ["", markdown_table(name, columns, {v: rows[v] for v in variants})]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

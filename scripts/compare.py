@@ -1,0 +1,183 @@
+"""The online map, its post refinement and offline 3DGS compared, and where the time goes, as the paper's tables.
+
+Offline 3DGS gets as many view renders (forward and backward) as the online run with its first post refinement took.
+Finished runs are kept in the output folder, and used again as long as their settings are the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments import (
+    Figures,
+    Job,
+    command_line,
+    execute,
+    mapping_seconds,
+    markdown_table,
+    mean_figures,
+    named_scenes,
+    quality,
+    write_report,
+)
+
+from modp_ti.errors import InputError
+
+ONLINE, OFFLINE = "online", "offline 3DGS"
+COLUMNS = {
+    "PSNR": ("psnr", ".2f"),
+    "SSIM": ("ssim", ".3f"),
+    "LPIPS": ("lpips", ".3f"),
+    "steps": ("steps", ",.0f"),
+    "# Gaussians": ("gaussians", ",.0f"),
+    "view renders": ("view_renders", ",.0f"),
+    "time [s]": ("seconds", ",.0f"),
+}
+# The paper's columns by the names of metrics.json.
+BREAKDOWN = {
+    "Optim": "optimise",
+    "Cam Select": "select",
+    "Depth Est.": "depth",
+    "MOHV": "occupancy",
+    "Others": "others",
+}
+
+
+def main() -> None:
+    """Run what is missing, then print and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", metavar="scene.yaml", help="scene files, one or several")
+    parser.add_argument(
+        "-o", "--output", required=True, type=Path, help="folder of the runs, comparison.md, comparison.json"
+    )
+    parser.add_argument(
+        "--steps", nargs="+", type=int, default=[1000], help="post refinements, a run for each (default 1000)"
+    )
+    parser.add_argument("--no-offline", action="store_true", help="leave offline 3DGS out")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of every run")
+    parser.add_argument("--fresh", action="store_true", help="run again what is there already")
+    arguments = parser.parse_args()
+    if min(arguments.steps) < 1:
+        parser.error("--steps must be positive: the online map is a row in any case")
+    figures: dict[str, dict[str, Figures]] = {}
+    breakdown: dict[str, Figures] = {}
+    try:
+        common = command_line(arguments.set)
+        jobs = {
+            (scene, file): [
+                refined_job(scene, file, arguments.output / scene, steps, common)
+                for steps in dict.fromkeys(arguments.steps)
+            ]
+            for scene, file in named_scenes(arguments.scenes).items()
+        }
+        for (scene, file), of_scene in jobs.items():  # before the first of them runs for hours
+            for job in of_scene:
+                job.check()
+            if not arguments.no_offline:
+                offline_job(scene, file, arguments.output / scene, 1, common).check()
+        for (scene, file), of_scene in jobs.items():
+            runs = execute(of_scene, arguments.fresh)
+            figures[scene] = online_rows(runs, [job.check()["refine"] for job in of_scene])
+            breakdown[scene] = time_breakdown(runs[0])
+            if not arguments.no_offline:
+                job = offline_job(scene, file, arguments.output / scene, view_renders(runs[0]), common)
+                figures[scene][OFFLINE] = offline_row(execute([job], arguments.fresh)[0])
+    except InputError as error:
+        sys.exit(f"error: {error}")
+    text = report(figures, breakdown)
+    write_report(arguments.output, "comparison", text, {"quality": figures, "breakdown_percent": breakdown})
+
+
+def refined_job(scene: str, file: Path, folder: Path, steps: int, common: Mapping[str, str]) -> Job:
+    """The online run with its post refinement: its metrics hold both maps."""
+    return Job(
+        f"{scene}, online + {steps:,} steps", file, folder / f"refined-{steps}", {**common, "refine.steps": str(steps)}
+    )
+
+
+def offline_job(scene: str, file: Path, folder: Path, renders: int, common: Mapping[str, str]) -> Job:
+    """Offline 3DGS, which renders one view a step."""
+    overrides = {**common, "mode": "offline", "offline.steps": str(renders)}
+    return Job(f"{scene}, {OFFLINE}", file, folder / "offline", overrides)
+
+
+def view_renders(metrics: Mapping[str, Any]) -> int:
+    """Views that a whole run rendered forward and backward."""
+    if "view_renders" not in metrics:
+        raise InputError("metrics.json does not count view renders: made by an older version; run again with --fresh")
+    return metrics["view_renders"]
+
+
+def online_rows(runs: Sequence[Mapping[str, Any]], refinements: Sequence[Mapping[str, Any]]) -> dict[str, Figures]:
+    """The rows of the online map and of each post refinement. refinements: the `refine` settings of each run."""
+    first, refine = runs[0], refinements[0]
+    rows: dict[str, Figures] = {
+        ONLINE: quality(first["online"])
+        | {
+            "steps": 0,
+            "gaussians": first["gaussians"],
+            "view_renders": view_renders(first) - refine["steps"] * refine["views"],
+            "seconds": mapping_seconds(first, refined=False),
+        }
+    }
+    for metrics, refine in zip(runs, refinements, strict=True):
+        rows[f"{ONLINE} + {refine['steps']:,} steps"] = quality(metrics["refined"]) | {
+            "steps": refine["steps"],
+            "gaussians": metrics["gaussians"],
+            "view_renders": view_renders(metrics),
+            "seconds": mapping_seconds(metrics, refined=True),
+        }
+    return rows
+
+
+def offline_row(metrics: Mapping[str, Any]) -> Figures:
+    """The row of offline 3DGS, all of whose steps are optimisation."""
+    return quality(metrics["offline"]) | {
+        "steps": view_renders(metrics),
+        "gaussians": metrics["gaussians"],
+        "view_renders": view_renders(metrics),
+        "seconds": mapping_seconds(metrics, refined=True),
+    }
+
+
+def time_breakdown(metrics: Mapping[str, Any]) -> Figures:
+    """Percent of the online run's time by the paper's columns, and frames per second."""
+    percent = metrics.get("breakdown_percent")
+    if percent is None:
+        total = mapping_seconds(metrics, refined=False)
+        percent = {
+            stage: 100.0 * metrics["seconds"][stage] / total for stage in BREAKDOWN.values() if stage != "others"
+        }
+        percent["others"] = 100.0 - sum(percent.values())
+    return {label: percent[stage] for label, stage in BREAKDOWN.items()} | {"FPS": metrics["frames_per_second"]}
+
+
+def report(figures: Mapping[str, Mapping[str, Figures]], breakdown: Mapping[str, Figures]) -> str:
+    """The tables by {scene: {row: figures}} and {scene: percent}: the means over the scenes, then each scene."""
+    tables: dict[str, Mapping[str, Figures]] = {}
+    times = dict(breakdown)
+    if len(figures) > 1:
+        labels = next(iter(figures.values()))
+        tables[f"Mean of {len(figures)} scenes"] = {
+            label: mean_figures([rows[label] for rows in figures.values()]) for label in labels
+        }
+        times["mean"] = mean_figures(list(breakdown.values()))
+    lines = [
+        "# Online and offline",
+        "",
+        "Held-out frames; all frames where none is held out. Time without compiling, the tracker's preparation and "
+        "evaluation.",
+    ]
+    for title, rows in (tables | dict(figures)).items():
+        lines += ["", f"## {title}", "", markdown_table("map", COLUMNS, rows)]
+    columns = {label: (label, ".2f") for label in (*BREAKDOWN, "FPS")}
+    lines += ["", "## Time of the online run, percent", "", markdown_table("scene", columns, times)]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
