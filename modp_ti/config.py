@@ -21,7 +21,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from pydantic_core import PydanticUndefined
 
 from modp_ti.errors import InputError
-from pipelines.settings import MappingSettings, RefineSettings, StrictModel
+from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
 __all__ = [
     "EvaluationSettings",
@@ -110,10 +110,15 @@ class SceneConfig(StrictModel):
     tracker: TrackerSettings
     output: Path = Field(description="folder of the results, made where it is missing")
     device: Literal["cpu", "cuda", "auto"] = Field("auto", description="`auto` takes CUDA where there is a GPU")
+    mode: Literal["online", "offline"] = Field(
+        "online",
+        description="`online` maps while frames arrive and then refines; `offline` is 3DGS on all frames at once",
+    )
     seed: int = Field(0, ge=0, description="seed of all randomness")
     threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
+    offline: OfflineSettings = OfflineSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
 
     @model_validator(mode="after")

@@ -19,9 +19,9 @@ __all__ = ["FrameScore", "absolute_trajectory_error", "score_frame", "summary", 
 
 @dataclass(frozen=True)
 class FrameScore:
-    """Scores of one frame in one version ("online" or "refined") of the map; lpips is None where it has no weights.
+    """Scores of one frame in one version of the map; lpips is None where it has no weights.
 
-    index: position among the frames. psnr: [dB].
+    stage: "online", "refined" or "offline". index: position among the frames. psnr: [dB].
     """
 
     index: int

@@ -36,14 +36,15 @@ class ProgressLine:
         if done >= total:
             self.stop()
 
-    def start_mapping(self, frames: int | None) -> None:
-        self._begin("mapping", frames)
+    def start_mapping(self, frames: int | None, what: str = "mapping") -> None:
+        self._begin(what, frames)
 
     def frame(self, report: FrameReport | None) -> None:
         """Show a frame that is done; None for one that is held out."""
         if report is not None:
             psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
-            self._state = f"{report.keyframes} keyframes  {report.gaussians:,} Gaussians{psnr}"
+            gaussians = f"  {report.gaussians:,} Gaussians" if report.gaussians else ""
+            self._state = f"{report.keyframes} keyframes{gaussians}{psnr}"
         task = self._progress.tasks[0]
         speed = f"  {task.speed:.2f} frames/s" if task.speed else ""
         self._progress.update(self._task, advance=1, state=self._state + speed)
@@ -54,6 +55,13 @@ class ProgressLine:
     def refined(self, step: int, psnr: float) -> None:
         self._progress.update(self._task, completed=step, state=f"{psnr:.2f} dB")
 
+    def start_offline(self, steps: int) -> None:
+        self._begin("optimising", steps)
+
+    def optimised(self, step: int, gaussians: int, psnr: float) -> None:
+        """Show a step of offline optimisation that is done."""
+        self._progress.update(self._task, completed=step, state=f"{gaussians:,} Gaussians  {psnr:.2f} dB")
+
     def stop(self) -> None:
         """End the line, leaving its last state on the screen."""
         if self._progress is not None:
@@ -62,7 +70,7 @@ class ProgressLine:
 
     def summary(self, metrics: dict) -> None:
         """Say in one line what the run came to."""
-        scores = metrics["refined"] or metrics["online"]
+        scores = metrics["refined"] or metrics["online"] or metrics["offline"]
         which = "held_out" if scores["held_out"]["count"] else "all"
         lpips = scores[which]["lpips"]
         self.console.print(

@@ -30,12 +30,15 @@ from modp_ti.lpips import Lpips, open_lpips
 from modp_ti.progress import ProgressLine
 from modp_ti.trackers import Tracker, frame_count, open_tracker
 from pipelines.mapping import OnlineMapper
+from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
 from pipelines.stopwatch import breakdown_percent
 
 __all__ = ["run_scene"]
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
+# Versions of a map that metrics.json has room for; null where a run does not make one.
+MAPS = ("online", "refined", "offline")
 # Frames that evaluation holds in memory at a time, to load each version of the map once for all of them.
 EVALUATED_TOGETHER = 32
 
@@ -78,8 +81,14 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
+    offline = config.mode == "offline"
+    size = (first.camera.width, first.camera.height)
+    mapper: OnlineMapper | OfflineMapper
     try:
-        mapper = OnlineMapper(config.mapping, first.camera.width, first.camera.height, config.seed)
+        if offline:
+            mapper = OfflineMapper(config.offline, *size, config.seed)
+        else:
+            mapper = OnlineMapper(config.mapping, *size, config.seed)
     except ValueError as error:
         raise InputError(str(error)) from None
     watch = mapper.stopwatch
@@ -89,18 +98,21 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
 
     poses = Poses()
     tick = time.perf_counter()
-    line.start_mapping(frame_count(tracker))
+    line.start_mapping(frame_count(tracker), "reading" if offline else "mapping")
     for frame in _chain(first, _timed(frames, watch)):
-        if (frame.camera.width, frame.camera.height) != (first.camera.width, first.camera.height):
+        if (frame.camera.width, frame.camera.height) != size:
             raise InputError(
                 f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
                 f"{first.camera.width}x{first.camera.height}: all images of a scene must have one size"
             )
         poses.add(frame)
         line.frame(None if frame.held_out else mapper.process(frame))
-    mapper.finish()
-    online_seconds = time.perf_counter() - tick
-    breakdown = breakdown_percent(watch.seconds, online_seconds)
+    if offline:
+        _optimise_offline(mapper, line)
+    else:
+        mapper.finish()
+    mapping_seconds = time.perf_counter() - tick
+    breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     line.stop()
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -108,9 +120,10 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "give a tracker with points or lower mapping.keyframes.min_points"
         )
 
-    online = mapper.gaussians.to_numpy()
-    online_exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
-    if config.refine.steps:
+    unrefined = mapper.gaussians.to_numpy()
+    unrefined_exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
+    refined = config.refine.steps > 0 and not offline
+    if refined:
         line.start_refining(config.refine.steps)
         refine(mapper, config.refine, line.refined)
         line.stop()
@@ -123,13 +136,13 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         (staging / "renders").mkdir(parents=True)
         write_splats(staging / "splats.ply", mapper.gaussians.to_numpy())
         write_trajectory(staging / "trajectory.txt", poses.timestamp, trajectory)
-        if config.mapping.exposure.enabled:
+        if mapper.keyframes[0].exposure is not None:
             keyframes = {k.index for k in mapper.keyframes}
             write_exposures(staging / "exposure.json", poses.index, poses.timestamp, exposures, keyframes)
         saved = read_splats(staging / "splats.ply")
-        states = {"online": (saved, exposures)}
-        if config.refine.steps:
-            states = {"online": (online, online_exposures), "refined": (saved, exposures)}
+        states = {config.mode: (saved, exposures)}
+        if refined:
+            states = {config.mode: (unrefined, unrefined_exposures), "refined": (saved, exposures)}
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
             scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders", lpips)
         write_scores(staging / "scores.csv", scores)
@@ -139,10 +152,10 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "gaussians": len(mapper.gaussians),
             "backend": backend,
             "seed": config.seed,
-            "frames_per_second": round(len(poses.index) / online_seconds, 4),
+            "frames_per_second": round(len(poses.index) / mapping_seconds, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "online": _summaries(scores, "online"),
-            "refined": _summaries(scores, "refined") if config.refine.steps else None,
+            "view_renders": mapper.renderer.view_renders,
+            **{stage: _summaries(scores, stage) if stage in states else None for stage in MAPS},
             "lpips_note": no_lpips,
             "seconds": _seconds(watch.seconds, time.perf_counter() - started),
             "breakdown_percent": breakdown,
@@ -157,6 +170,15 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         shutil.rmtree(staging, ignore_errors=True)
     line.summary(metrics)
     return config.output
+
+
+def _optimise_offline(mapper: OfflineMapper, line: ProgressLine) -> None:
+    try:
+        mapper.initialise()
+    except ValueError as error:
+        raise InputError(f"`mode: offline` starts from tracked points: {error}") from None
+    line.start_offline(mapper.settings.steps)
+    mapper.optimise(line.optimised)
 
 
 def _timed(frames: Iterator[TrackedFrame], watch) -> Iterator[TrackedFrame]:
@@ -175,7 +197,7 @@ def _chain(first: TrackedFrame, rest: Iterable[TrackedFrame]) -> Iterator[Tracke
 
 
 def _evaluate(
-    mapper: OnlineMapper,
+    mapper: OnlineMapper | OfflineMapper,
     tracker: Tracker,
     trajectory: list[NDArray[np.float64]],
     states: dict[str, tuple[dict[str, NDArray], list[NDArray[np.float64] | None]]],
@@ -197,7 +219,7 @@ def _evaluate(
             for frame in batch:
                 score, render = score_frame(
                     mapper.renderer,
-                    mapper.optimiser.loss,
+                    mapper.loss,
                     frame,
                     trajectory[frame.index],
                     near,

@@ -34,14 +34,18 @@ class Adam:
         self.gaussians = gaussians
         self.real = gaussians.real
 
-    def step(self, rates: LearningRates, batch: int = 1) -> None:
-        """Update and clear the gradients of every touched Gaussian."""
+    def step(self, rates: LearningRates, batch: int = 1, sh_degree: int | None = None) -> None:
+        """Update and clear the gradients of every touched Gaussian.
+
+        sh_degree: harmonics above it keep value and moments; None for all that the Gaussians have.
+        """
         if self.gaussians.count == 0:
             return
+        active = self.gaussians.sh_count if sh_degree is None else (sh_degree + 1) ** 2
         root = float(np.sqrt(batch))
         beta1, beta2 = max(1.0 - 0.1 * batch, 0.0), 1.0 - 0.001 * batch
         values = [rates.position, rates.log_scale, rates.quaternion, rates.opacity_logit, rates.colour]
-        self._step(self.gaussians.count, *(root * v for v in values), beta1, beta2, 1e-15 / root)
+        self._step(self.gaussians.count, active, *(root * v for v in values), beta1, beta2, 1e-15 / root)
 
     @ti.func
     def _update(self, value, gradient, m: ti.template(), v: ti.template(), lr, betas, corrections, eps):
@@ -54,6 +58,7 @@ class Adam:
     def _step(
         self,
         count: ti.i32,
+        active: ti.i32,
         lr_position: ti.f32,
         lr_log_scale: ti.f32,
         lr_quaternion: ti.f32,
@@ -96,7 +101,7 @@ class Adam:
                     lr_opacity, betas, corrections, eps,
                 )  # fmt: skip
                 self.gaussians.opacity_logit.grad[i] = 0.0
-                for k in range(self.gaussians.sh_count):
+                for k in range(active):
                     # The directional part moves twenty times slower, as in 3DGS.
                     lr = ti.select(k == 0, lr_colour, lr_colour / 20.0)
                     for c in ti.static(range(3)):
@@ -106,3 +111,5 @@ class Adam:
                             lr, betas, corrections, eps,
                         )  # fmt: skip
                         self.gaussians.sh.grad[i, k][c] = 0.0
+                for k in range(active, self.gaussians.sh_count):
+                    self.gaussians.sh.grad[i, k].fill(0.0)

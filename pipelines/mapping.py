@@ -57,6 +57,7 @@ class OnlineMapper:
         self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
         self.renderer = Renderer(self.gaussians, max_width, max_height)
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
+        self.loss = self.optimiser.loss
         self.keyframes = KeyframeStore(len(settings.levels.probabilities))
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
@@ -171,4 +172,5 @@ class OnlineMapper:
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()
+            self.renderer.view_renders = 0
             self.gaussians.remove(np.zeros(1, dtype=bool))

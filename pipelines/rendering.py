@@ -1,5 +1,6 @@
 """`Renderer`: a view of the map as colour, depth and opacity, and the way back to gradients."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,8 @@ class Renderer:
 
     `forward` leaves the picture in `images`; after a loss has filled `images.colour_grad`, `backward` adds the
     gradients of the Gaussians to their fields and returns the camera's. Images of any size up to the given one.
+
+    view_renders: views rendered and differentiated so far, the measure of work that the modes are compared at.
     """
 
     def __init__(self, gaussians: GaussianField, max_width: int, max_height: int) -> None:
@@ -56,6 +59,7 @@ class Renderer:
         self.binning = Binning(self.view, self.projected, self.pairs)
         self.compositing = Compositing(self.view, self.projected, self.pairs, self.images)
         self.development = Development(self.images)
+        self.view_renders = 0
 
     def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float) -> None:
         """Render into `images`. near: depth [scene units] below which nothing is drawn."""
@@ -73,11 +77,19 @@ class Renderer:
         """
         self.development.forward(exposure, vignette)
 
-    def backward(self, with_depth: bool = False) -> None:
-        """Add d loss / d Gaussian to the gradients of the Gaussians, for the view that was rendered last."""
+    def backward(
+        self, with_depth: bool = False, observe: Callable[[ProjectedGaussians, ViewField], None] | None = None
+    ) -> None:
+        """Add d loss / d Gaussian to the gradients of the Gaussians, for the view that was rendered last.
+
+        observe: called while the gradients in the image stand; projection's backward uses them up.
+        """
         self.development.backward()
         self.compositing.backward(with_depth)
+        if observe is not None:
+            observe(self.projected, self.view)
         self.projection.backward()
+        self.view_renders += 1
 
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the T_camera_world that was rendered last, after `backward`."""

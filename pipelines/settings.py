@@ -20,6 +20,7 @@ __all__ = [
     "KeyframeSettings",
     "LevelSettings",
     "MappingSettings",
+    "OfflineSettings",
     "OptimiseSettings",
     "PoseSettings",
     "RefineSettings",
@@ -223,3 +224,51 @@ class RefineSettings(StrictModel):
     poses: bool = Field(False, description="also refine poses, at a rate that decays as that of positions does")
     position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
     scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")
+
+
+class OfflineSettings(StrictModel):
+    """Offline 3DGS [Kerbl 2023], the baseline: all frames at once, from the tracked points.
+
+    An `extent` is 1.1 times the largest distance of a camera from the mean of all of them. Step numbers marked "of
+    30,000" are those of the published run and scale with `steps`.
+    """
+
+    steps: int = Field(30_000, ge=1, description="optimisation steps, one view each")
+    sh_degree: int = Field(3, ge=0, le=3, description="degree of the spherical harmonics of colour at the end")
+    sh_every: int = Field(1000, ge=1, description="steps of 30,000 after which the degree rises by one")
+    max_gaussians: int = Field(
+        1_000_000,
+        ge=1024,
+        le=1_000_000,
+        description="size of the pool; beyond it only the largest gradients grow. Taichi's allocator sets the limit",
+    )
+    near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
+    initial_opacity: float = Field(0.1, gt=0, lt=1, description="opacity of a Gaussian at the start")
+    ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
+    position_rate: float = Field(1.6e-4, ge=0, description="Adam step of positions at the start [extents]")
+    position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
+    scale_rate: float = Field(5e-3, ge=0, description="Adam step of log-scales")
+    rotation_rate: float = Field(1e-3, ge=0, description="Adam step of quaternions")
+    opacity_rate: float = Field(0.05, ge=0, description="Adam step of opacity logits")
+    colour_rate: float = Field(
+        2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
+    )
+    densify_from: int = Field(
+        500, ge=0, description="step after which Gaussians are cloned and split; at most a twelfth of the run"
+    )
+    densify_until: int = Field(15_000, ge=0, description="step of 30,000 at which that ends")
+    densify_every: int = Field(100, ge=1, description="steps between; at most a twelfth of the run")
+    gradient_threshold: float = Field(
+        2e-4, gt=0, description="mean gradient by the mean's place in the image [half images] that clones or splits"
+    )
+    clone_size: float = Field(
+        0.01, gt=0, description="longest axis up to which a Gaussian is cloned, not split [extents]"
+    )
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="opacity below which a Gaussian is removed")
+    prune_size: float = Field(
+        0.1, gt=0, description="longest axis above which it is, after the first reset of opacities [extents]"
+    )
+    reset_every: int = Field(
+        3000, ge=1, description="steps of 30,000 between resets of all opacities, but 1,500 steps at least"
+    )
+    reset_opacity: float = Field(0.01, gt=0, lt=1, description="largest opacity after a reset")

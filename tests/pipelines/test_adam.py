@@ -92,3 +92,16 @@ def test_a_gradient_that_is_not_finite_moves_nothing(gaussians: GaussianField) -
     set_gradients(gaussians, gradients, np.ones(N, dtype=bool))
     Adam(gaussians).step(RATES)
     np.testing.assert_array_equal(gaussians.to_numpy()["position"], state["position"])
+
+
+def test_harmonics_above_the_active_degree_wait(gaussians: GaussianField) -> None:
+    state = load(gaussians)
+    ones = {name: np.ones(value.shape) for name, value in state.items()}
+    everything = np.ones(N, dtype=bool)
+    set_gradients(gaussians, ones, everything)
+    Adam(gaussians).step(RATES, sh_degree=0)
+    result = gaussians.to_numpy()
+    np.testing.assert_array_equal(result["sh"][:, 1:], state["sh"][:, 1:])
+    assert (gaussians.sh_m.to_numpy()[:N, 1:] == 0).all()
+    assert (gaussians.gradients_to_numpy()["sh"] == 0).all()
+    np.testing.assert_allclose(result["sh"][:, 0], state["sh"][:, 0] - RATES.colour, rtol=1e-4, atol=1e-5)

@@ -66,7 +66,9 @@ def test_refinement_improves_the_map_and_leaves_the_poses(mapped: OnlineMapper) 
     poses = [k.T_camera_world.copy() for k in mapped.keyframes]
     before = np.mean([psnr(mapped, i) for i in range(7)])
     seen = []
-    refine(mapped, RefineSettings(steps=40), lambda step, _: seen.append(step))
+    renders = mapped.renderer.view_renders
+    refine(mapped, RefineSettings(steps=40, views=4), lambda step, _: seen.append(step))
+    assert mapped.renderer.view_renders == renders + 40 * 4
     assert np.mean([psnr(mapped, i) for i in range(7)]) > before
     assert seen == list(range(1, 41))
     for keyframe, T in zip(mapped.keyframes, poses, strict=True):

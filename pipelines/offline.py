@@ -1,0 +1,185 @@
+"""Offline 3D Gaussian Splatting [Kerbl 2023] in the same renderer: the paper's baseline (Section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fields.camera import PinholeCamera
+from fields.gaussians import GaussianField
+from fields.keyframes import Keyframe, KeyframeStore
+from fields.se3 import inverse_se3
+from fields.tracked_frame import SparsePoints, TrackedFrame
+from pipelines.adam import Adam, LearningRates
+from pipelines.adaptive_density import AdaptiveDensity
+from pipelines.losses import PhotometricLoss
+from pipelines.mapping import FrameReport
+from pipelines.point_initialisation import initialise, union_of_points
+from pipelines.refinement import decay
+from pipelines.rendering import Renderer
+from pipelines.settings import OfflineSettings
+from pipelines.stopwatch import Stopwatch
+
+__all__ = ["OfflineMapper", "Schedule", "scene_extent"]
+
+# Steps of the published run, whose step numbers the settings name.
+PUBLISHED_STEPS = 30_000
+# Density control waits for a picture to form, which takes as many steps in a short run: its start and its interval
+# do not scale, but are at most this share of the run.
+LONGEST_WAIT = 1 / 12
+# An opacity needs some hundred looks to come back: resets are at least so far apart, or the rounds between them
+# see little but the recovery.
+LEAST_STEPS_BETWEEN_RESETS = 1_500
+# Extent that a scene has at least [scene depths]: cameras that only turn have none.
+LEAST_EXTENT = 0.01
+# Size that a Gaussian of the start has at least [extents].
+LEAST_SIZE = 1e-5
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Step numbers of a run, those of the published one in proportion to its length where they can be.
+
+    Steps count from 1.
+    """
+
+    steps: int
+    highest_degree: int
+    sh_every: int
+    densify_from: int
+    densify_until: int
+    densify_every: int
+    reset_every: int
+
+    @classmethod
+    def of(cls, settings: OfflineSettings) -> Schedule:
+        def scaled(step: int) -> int:
+            return max(round(step * settings.steps / PUBLISHED_STEPS), 1)
+
+        longest_wait = max(round(settings.steps * LONGEST_WAIT), 1)
+        return cls(
+            steps=settings.steps,
+            highest_degree=settings.sh_degree,
+            sh_every=scaled(settings.sh_every),
+            densify_from=min(settings.densify_from, longest_wait),
+            densify_until=scaled(settings.densify_until),
+            densify_every=min(settings.densify_every, longest_wait),
+            reset_every=max(scaled(settings.reset_every), LEAST_STEPS_BETWEEN_RESETS),
+        )
+
+    def sh_degree(self, step: int) -> int:
+        """Degree up to which harmonics are optimised in this step."""
+        return min(step // self.sh_every, self.highest_degree)
+
+    def adapts_at(self, step: int) -> bool:
+        """Whether Gaussians are cloned, split and pruned after this step."""
+        return self.densify_from < step < self.densify_until and step % self.densify_every == 0
+
+    def resets_at(self, step: int) -> bool:
+        """Whether opacities are reset after this step."""
+        return step < self.densify_until and step % self.reset_every == 0
+
+
+def scene_extent(store: KeyframeStore) -> float:
+    """1.1 times the largest distance of a camera from the mean of all [scene units], the unit of 3DGS's settings.
+
+    Raises ValueError where there is no camera.
+    """
+    if len(store) == 0:
+        raise ValueError("there is no frame to map")
+    centres = np.array([inverse_se3(view.T_camera_world)[:3, 3] for view in store])
+    radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    return max(1.1 * radius, LEAST_EXTENT * store.scene_depth)
+
+
+class OfflineMapper:
+    """Collects all frames, then optimises Gaussians from their tracked points on one random view a step.
+
+    `process` takes the frames one by one as `OnlineMapper` does; `initialise` and `optimise` then make the map.
+    `keyframes` are all frames, at their tracked poses.
+    """
+
+    def __init__(self, settings: OfflineSettings, max_width: int, max_height: int, seed: int = 0) -> None:
+        self.settings = settings
+        self.rng = np.random.default_rng(seed)
+        self.stopwatch = Stopwatch()
+        self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
+        self.renderer = Renderer(self.gaussians, max_width, max_height)
+        self.loss = PhotometricLoss(self.renderer.images)
+        self.adam = Adam(self.gaussians)
+        self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
+        self.keyframes = KeyframeStore()
+
+    def process(self, frame: TrackedFrame) -> FrameReport:
+        """Keep the next frame. Held-out frames must not come here: ValueError."""
+        if frame.held_out:
+            raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
+        self.keyframes.append(frame)
+        return FrameReport(frame.index, True, len(self.keyframes), 0, None)
+
+    def initialise(self) -> None:
+        """Begin the map with the tracked points of the frames so far. Raises ValueError where they are too few."""
+        with self.stopwatch.measure("optimise"):
+            points = union_of_points(self.keyframes)
+            extent = scene_extent(self.keyframes)
+            initialise(self.gaussians, points, self.settings.initial_opacity, LEAST_SIZE * extent)
+
+    def optimise(self, progress: Callable[[int, int, float], None] | None = None) -> None:
+        """Run all steps on an initialised map.
+
+        progress: called after every step with (steps done, Gaussians, PSNR of its view).
+        """
+        schedule, extent = Schedule.of(self.settings), scene_extent(self.keyframes)
+        views: list[int] = []
+        for step in range(1, schedule.steps + 1):
+            with self.stopwatch.measure("optimise"):
+                views = views or self.rng.permutation(len(self.keyframes)).tolist()
+                rates = self._rates(extent * decay(step - 1, schedule.steps, self.settings.position_decay))
+                psnr = self._step(self.keyframes[views.pop()], rates, schedule.sh_degree(step))
+                if schedule.adapts_at(step):
+                    self.density.adapt(extent, prune_large=step > schedule.reset_every)
+                if schedule.resets_at(step):
+                    self.density.reset_opacities()
+            if progress is not None:
+                progress(step, len(self.gaussians), psnr)
+
+    def _rates(self, position_unit: float) -> LearningRates:
+        s = self.settings
+        return LearningRates(
+            position=s.position_rate * position_unit,
+            log_scale=s.scale_rate,
+            quaternion=s.rotation_rate,
+            opacity_logit=s.opacity_rate,
+            colour=s.colour_rate,
+        )
+
+    def _step(self, view: Keyframe, rates: LearningRates, sh_degree: int) -> float:
+        """One Adam step on one view; its PSNR before the step."""
+        renderer = self.renderer
+        renderer.forward(view.camera, view.T_camera_world, self.settings.near * self.keyframes.scene_depth)
+        renderer.develop(None, view.vignette)
+        renderer.images.set_reference(view.rgba)
+        values = self.loss.forward()
+        self.loss.backward(self.settings.ssim_weight)
+        renderer.backward(observe=self.density.statistics.observe)
+        self.adam.step(rates, sh_degree=sh_degree)
+        return values.psnr
+
+    def compile(self) -> None:
+        """Compile every kernel on a scene of four Gaussians, so that timing starts warm. The map must be empty."""
+        camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
+        with self.stopwatch.measure("compile"):
+            image = np.full((16, 16, 3), 0.5, dtype=np.float32)
+            xyz = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [0.1, 0.1, 1.0]])
+            points = SparsePoints(xyz, camera.project(xyz), np.arange(4))
+            store = KeyframeStore()
+            view = store.append(TrackedFrame(0, 0.0, "compile", image, camera, np.eye(4), points))
+            initialise(self.gaussians, union_of_points(store), self.settings.initial_opacity, LEAST_SIZE)
+            self._step(view, self._rates(1.0), self.settings.sh_degree)
+            self.density.reset_opacities()
+            self.density.statistics.clear()
+            self.renderer.images.colour_to_numpy()
+            self.gaussians.remove(np.zeros(4, dtype=bool))
+            self.renderer.view_renders = 0
