@@ -23,7 +23,8 @@ class Keyframe:
     the same at halved sizes, itself first. T_tracked: the tracker's
     T_camera_world; T_camera_world: the refined one. median_depth: of its tracked points [scene units]; view_scale:
     median_depth / focal, the width of a pixel out there (Section 3.2.1). error: mean absolute error when the frame was
-    optimised last (err(j) of Eq. 2).
+    optimised last (err(j) of Eq. 2). vignette: as in `TrackedFrame`, at full size. exposure: (3, 4) affine colour
+    transform (A, b), image = (A colour + b) vignette; None for an identity that is not estimated.
     """
 
     index: int
@@ -38,6 +39,11 @@ class Keyframe:
     pose_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
     pose_v: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
     pose_steps: int = 0
+    vignette: NDArray[np.float32] | None = None
+    exposure: NDArray[np.float64] | None = None
+    exposure_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 4)))
+    exposure_v: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 4)))
+    exposure_steps: int = 0
 
     @property
     def view_scale(self) -> float:
@@ -88,7 +94,7 @@ class KeyframeStore:
         return keyframe
 
     def view(self, frame: TrackedFrame, levels: int = 1) -> Keyframe:
-        """`frame` as a keyframe would be, at the pose that the keyframes around it imply, but not kept."""
+        """`frame` as a keyframe would be, with the pose and exposure that those around it imply, but not kept."""
         depth = frame.points.xyz @ frame.T_camera_world[2, :3] + frame.T_camera_world[2, 3]
         depth = depth[depth > 0]
         rgba = frame.rgba()
@@ -101,6 +107,8 @@ class KeyframeStore:
             points=frame.points,
             median_depth=float(np.median(depth)) if len(depth) else self._scene_depth,
             error=float(np.mean([k.error for k in self._keyframes])) if self._keyframes else 1.0,
+            vignette=frame.vignette,
+            exposure=self.exposure_at(frame.index),
             pyramid=build_pyramid(rgba, frame.camera, levels),
         )
 
@@ -111,10 +119,29 @@ class KeyframeStore:
         """
         if not self._keyframes:
             return np.array(T_tracked, dtype=np.float64)
+        a, b, t = self._around(index)
+        if a is b:
+            return a.correction @ T_tracked
+        return interpolate_se3(a.correction, b.correction, t) @ T_tracked
+
+    def exposure_at(self, index: int) -> NDArray[np.float64] | None:
+        """Exposure (3, 4) of frame `index`: interpolated between those of the keyframes around it, as poses are.
+
+        None where exposure is not estimated.
+        """
+        if not self._keyframes:
+            return None
+        a, b, t = self._around(index)
+        if a.exposure is None or b.exposure is None:
+            return None
+        return (1.0 - t) * a.exposure + t * b.exposure
+
+    def _around(self, index: int) -> tuple[Keyframe, Keyframe, float]:
+        """The keyframes before and after frame `index`, and its place between them; twice the nearest one outside."""
         indices = [k.index for k in self._keyframes]
         after = int(np.searchsorted(indices, index))
         if after == 0 or after == len(indices):
-            return self._keyframes[min(after, len(indices) - 1)].correction @ T_tracked
+            nearest = self._keyframes[min(after, len(indices) - 1)]
+            return nearest, nearest, 0.0
         a, b = self._keyframes[after - 1], self._keyframes[after]
-        t = (index - a.index) / (b.index - a.index)
-        return interpolate_se3(a.correction, b.correction, t) @ T_tracked
+        return a, b, (index - a.index) / (b.index - a.index)

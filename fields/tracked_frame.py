@@ -49,6 +49,8 @@ class TrackedFrame:
     image: (H, W, 3) float32 RGB in [0, 1], undistorted. camera: its intrinsics.
     T_camera_world: (4, 4) float64, world to camera, OpenCV axes.
     mask: (H, W) bool, True where the pixel is valid; None where all are.
+    vignette: (H, W, 3) float32 in (0, 1], the share of the light that reaches each pixel, one array for all frames of
+    a camera; None for all of it. The image shows the scene times the vignette.
     held_out: only for evaluation; such a frame never touches the map.
     """
 
@@ -60,6 +62,7 @@ class TrackedFrame:
     T_camera_world: NDArray[np.float64]
     points: SparsePoints = field(default_factory=SparsePoints)
     mask: NDArray[np.bool_] | None = None
+    vignette: NDArray[np.float32] | None = None
     held_out: bool = False
 
     def __post_init__(self) -> None:
@@ -71,6 +74,8 @@ class TrackedFrame:
             )
         if self.mask is not None and self.mask.shape != expected:
             raise ValueError(f"{self.name}: mask is {self.mask.shape}, the image {expected}")
+        if self.vignette is not None and self.vignette.shape != self.image.shape:
+            raise ValueError(f"{self.name}: vignette is {self.vignette.shape}, the image {self.image.shape}")
         if self.T_camera_world.shape != (4, 4) or not np.isfinite(self.T_camera_world).all():
             raise ValueError(f"{self.name}: T_camera_world must be a finite 4x4 matrix")
 

@@ -17,7 +17,7 @@ from types import NoneType
 from typing import Any, Literal, get_args
 
 import yaml
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticUndefined
 
 from modp_ti.errors import InputError
@@ -50,6 +50,26 @@ class SourceSettings(StrictModel):
     start: int = Field(0, ge=0, description="first frame, as position in the folder")
     stop: int | None = Field(None, ge=1, description="position after the last frame; empty for all")
     step: int = Field(1, ge=1, description="every n-th frame")
+    masks: Path | None = Field(
+        None,
+        description="folder with one mask an image, of its name and size: white valid, black ignored; empty for none",
+    )
+    mask_colour: tuple[int, int, int] | None = Field(
+        None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty for none"
+    )
+    mask_tolerance: int = Field(
+        0, ge=0, le=255, description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG"
+    )
+    vignette: Path | None = Field(
+        None, description="image of how much light reaches each pixel, brightest where all does; empty for none"
+    )
+
+    @field_validator("mask_colour")
+    @classmethod
+    def _colour_has_8_bits(cls, colour: tuple[int, int, int] | None) -> tuple[int, int, int] | None:
+        if colour is not None and not all(0 <= value <= 255 for value in colour):
+            raise ValueError(f"source.mask_colour must be three numbers from 0 to 255, not {list(colour)}")
+        return colour
 
     @model_validator(mode="after")
     def _range_is_not_empty(self) -> SourceSettings:
@@ -67,6 +87,9 @@ class TrackerSettings(StrictModel):
     path: Path | None = Field(
         None,
         description="model folder or file; empty: `sparse/0`, `sparse` or `transforms.json` near the images",
+    )
+    exposure_change: float = Field(
+        0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
     )
 
 
@@ -102,6 +125,8 @@ class SceneConfig(StrictModel):
     def _images_are_named(self) -> SceneConfig:
         if self.source.path is None and self.tracker.kind != "synthetic":
             raise ValueError("source.path is missing: give the folder that holds the images")
+        if self.tracker.exposure_change and self.tracker.kind != "synthetic":
+            raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
         return self
 
 

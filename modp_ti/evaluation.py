@@ -55,13 +55,16 @@ def score_frame(
     near: float,
     stage: str,
     lpips: Lpips | None = None,
+    exposure: NDArray[np.float64] | None = None,
 ) -> tuple[FrameScore, NDArray[np.float32]]:
     """Scores and render (H, W, 3) of `frame` seen from T_camera_world (4, 4) in the renderer's map.
 
-    The render is clipped to [0, 1]. Masked pixels do not count and are shown as in the frame.
+    The render is developed with the frame's exposure (3, 4) and vignette, and clipped to [0, 1]. Masked pixels do not
+    count and are shown as in the frame.
     """
     rgba = frame.rgba()
     renderer.forward(frame.camera, T_camera_world, near)
+    renderer.develop(exposure, frame.vignette)
     renderer.images.clip_colour()
     renderer.images.set_reference(rgba)
     values = loss.forward()

@@ -22,6 +22,7 @@ from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
 from modp_ti.errors import InputError
 from modp_ti.evaluation import FrameScore, absolute_trajectory_error, score_frame, summary
+from modp_ti.exports.exposure import write_exposures
 from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats, write_splats
 from modp_ti.exports.trajectory import write_trajectory
@@ -120,6 +121,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         )
 
     unrefined = mapper.gaussians.to_numpy()
+    unrefined_exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
     refined = config.refine.steps > 0 and not offline
     if refined:
         line.start_refining(config.refine.steps)
@@ -127,14 +129,20 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         line.stop()
 
     trajectory = [mapper.keyframes.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)]
+    exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
     staging = config.output.with_name(config.output.name + ".partial")
     shutil.rmtree(staging, ignore_errors=True)
     try:
         (staging / "renders").mkdir(parents=True)
         write_splats(staging / "splats.ply", mapper.gaussians.to_numpy())
         write_trajectory(staging / "trajectory.txt", poses.timestamp, trajectory)
+        if mapper.keyframes[0].exposure is not None:
+            keyframes = {k.index for k in mapper.keyframes}
+            write_exposures(staging / "exposure.json", poses.index, poses.timestamp, exposures, keyframes)
         saved = read_splats(staging / "splats.ply")
-        states = {config.mode: unrefined, "refined": saved} if refined else {config.mode: saved}
+        states = {config.mode: (saved, exposures)}
+        if refined:
+            states = {config.mode: (unrefined, unrefined_exposures), "refined": (saved, exposures)}
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
             scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders", lpips)
         write_scores(staging / "scores.csv", scores)
@@ -192,24 +200,32 @@ def _evaluate(
     mapper: OnlineMapper | OfflineMapper,
     tracker: Tracker,
     trajectory: list[NDArray[np.float64]],
-    states: dict[str, dict[str, NDArray]],
+    states: dict[str, tuple[dict[str, NDArray], list[NDArray[np.float64] | None]]],
     renders: Path,
     lpips: Lpips | None,
 ) -> list[FrameScore]:
     """Scores of every frame in every version of the map by name; pictures of the held-out frames from the last one.
 
-    The last version stays in `mapper.gaussians`.
+    states: of each version the Gaussians, and the exposure of every frame. The last version stays in
+    `mapper.gaussians`.
     """
     near = mapper.settings.near * mapper.keyframes.scene_depth
     scores = []
     last = list(states)[-1]
     frames = iter(tracker)
     while batch := list(islice(frames, EVALUATED_TOGETHER)):
-        for name, state in states.items():
+        for name, (state, exposures) in states.items():
             mapper.gaussians.load(state)
             for frame in batch:
                 score, render = score_frame(
-                    mapper.renderer, mapper.loss, frame, trajectory[frame.index], near, name, lpips
+                    mapper.renderer,
+                    mapper.loss,
+                    frame,
+                    trajectory[frame.index],
+                    near,
+                    name,
+                    lpips,
+                    exposures[frame.index],
                 )
                 scores.append(score)
                 if frame.held_out and name == last:

@@ -14,6 +14,7 @@ from fields.keyframes import Keyframe
 from fields.occupancy import OccupancyVoxels
 from fields.se3 import inverse_se3
 from pipelines.depth import DepthEstimator
+from pipelines.exposure import scene_colours
 from pipelines.settings import DensifySettings
 
 __all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "tracked_seeds"]
@@ -36,9 +37,9 @@ class Seeds:
 
 def _at_pixels(view: Keyframe, pixels: NDArray[np.float64], xyz: NDArray, depth: NDArray) -> Seeds:
     """Seeds at pixels (N, 2) of a view, without those on masked pixels. Size is d / f of Eq. 1."""
-    column, row = np.floor(pixels).astype(int).T
-    rgba = view.rgba[row, column]
-    return Seeds(xyz, depth / view.camera.focal, rgba[:, :3] / 255.0)[rgba[:, 3] > 0]
+    places = np.floor(pixels).astype(int)
+    valid = view.rgba[places[:, 1], places[:, 0], 3] > 0
+    return Seeds(xyz, depth / view.camera.focal, scene_colours(view, places))[valid]
 
 
 def tracked_seeds(view: Keyframe) -> Seeds:

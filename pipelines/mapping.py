@@ -82,6 +82,8 @@ class OnlineMapper:
             view = self.keyframes.append(frame)
             if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
                 self.optimiser.poses.align(view)
+            with self.stopwatch.measure("optimise"):
+                self.optimiser.exposure.begin(view, self.renderer, self.settings.near * self.keyframes.scene_depth)
             level = self._draw_level()
             self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
             psnr = self.optimise(self.settings.optimise.steps, level)
@@ -166,6 +168,7 @@ class OnlineMapper:
             if self.voxels is not None:
                 self.voxels.admit(np.zeros((0, 3)), 1.0)
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
+            self.optimiser.exposure.begin(view, self.renderer, self.settings.near)
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()

@@ -159,6 +159,7 @@ class OfflineMapper:
         """One Adam step on one view; its PSNR before the step."""
         renderer = self.renderer
         renderer.forward(view.camera, view.T_camera_world, self.settings.near * self.keyframes.scene_depth)
+        renderer.develop(None, view.vignette)
         renderer.images.set_reference(view.rgba)
         values = self.loss.forward()
         self.loss.backward(self.settings.ssim_weight)

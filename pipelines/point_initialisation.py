@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fields.gaussians import SH_C0, GaussianField
 from fields.keyframes import Keyframe
+from pipelines.exposure import scene_colours
 
 __all__ = ["PointCloud", "initialise", "spacing", "union_of_points"]
 
@@ -40,12 +41,11 @@ def union_of_points(views: Iterable[Keyframe]) -> PointCloud:
     for view in views:
         points = view.points
         inside = np.flatnonzero(view.camera.contains(points.pixels))
-        column, row = np.floor(points.pixels[inside]).astype(int).T
-        rgba = view.rgba[row, column]
-        valid = rgba[:, 3] > 0
+        places = np.floor(points.pixels[inside]).astype(int)
+        valid = view.rgba[places[:, 1], places[:, 0], 3] > 0
         ids.append(points.ids[inside[valid]])
         xyz.append(points.xyz[inside[valid]])
-        colour.append(rgba[valid, :3] / 255.0)
+        colour.append(scene_colours(view, places[valid]))
     every = np.concatenate(ids)
     _, first_from_the_end = np.unique(every[::-1], return_index=True)
     last = len(every) - 1 - first_from_the_end

@@ -15,6 +15,7 @@ from fields.tiles import TilePairs
 from fields.view import ViewField
 from pipelines.binning import CHUNKS, Binning
 from pipelines.compositing import Compositing
+from pipelines.development import Development
 from pipelines.projection import Projection
 
 __all__ = ["RenderedView", "Renderer"]
@@ -57,6 +58,7 @@ class Renderer:
         self.projection = Projection(gaussians, self.view, self.projected)
         self.binning = Binning(self.view, self.projected, self.pairs)
         self.compositing = Compositing(self.view, self.projected, self.pairs, self.images)
+        self.development = Development(self.images)
         self.view_renders = 0
 
     def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float) -> None:
@@ -66,6 +68,14 @@ class Renderer:
         self.projection.forward()
         self.binning.forward()
         self.compositing.forward()
+        self.develop(None, None)
+
+    def develop(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
+        """Develop the rendered picture into a photograph with this exposure (3, 4) and vignette (H, W, 3).
+
+        None stands for the identity.
+        """
+        self.development.forward(exposure, vignette)
 
     def backward(
         self, with_depth: bool = False, observe: Callable[[ProjectedGaussians, ViewField], None] | None = None
@@ -74,6 +84,7 @@ class Renderer:
 
         observe: called while the gradients in the image stand; projection's backward uses them up.
         """
+        self.development.backward()
         self.compositing.backward(with_depth)
         if observe is not None:
             observe(self.projected, self.view)
@@ -83,6 +94,10 @@ class Renderer:
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the T_camera_world that was rendered last, after `backward`."""
         return self.projection.camera_gradient()
+
+    def exposure_gradient(self) -> np.ndarray:
+        """d loss / d exposure (3, 4) of the picture that was developed last, after `backward`."""
+        return self.development.exposure_gradient()
 
     def render(
         self,

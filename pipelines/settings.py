@@ -16,6 +16,7 @@ __all__ = [
     "DensifySettings",
     "DepthSettings",
     "EpipolarSettings",
+    "ExposureSettings",
     "KeyframeSettings",
     "LevelSettings",
     "MappingSettings",
@@ -162,6 +163,17 @@ class LevelSettings(StrictModel):
     )
 
 
+class ExposureSettings(StrictModel):
+    """Exposure of every keyframe: image = A colour + b, for cameras that set their exposure by themselves."""
+
+    enabled: bool = Field(False, description="estimate the exposure of keyframes with the map")
+    learning_rate: float = Field(0.005, ge=0, description="Adam step of A (3x3) and b")
+    regularisation: float = Field(0.03, ge=0, description="weight of |A - I|^2 + |b|^2 of a keyframe beside its loss")
+    prior: float = Field(
+        0.001, gt=0, description="weight of the last keyframe's exposure in the fit that a new keyframe begins with"
+    )
+
+
 class OptimiseSettings(StrictModel):
     """Loss and learning rates."""
 
@@ -200,6 +212,7 @@ class MappingSettings(StrictModel):
     levels: LevelSettings = LevelSettings()
     views: ViewSettings = ViewSettings()
     poses: PoseSettings = PoseSettings()
+    exposure: ExposureSettings = ExposureSettings()
     optimise: OptimiseSettings = OptimiseSettings()
 
 

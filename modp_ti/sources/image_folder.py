@@ -29,15 +29,15 @@ class ImageFolder:
     """The images under one folder, subfolders included, hidden files left out.
 
     Names are relative to the folder, with forward slashes. Raises InputError where there is no such folder or
-    no image.
+    no image. setting: the key that named the folder, for messages.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], setting: str = "source.path") -> None:
         self.path = Path(path)
         if not self.path.exists():
-            raise InputError(f"{self.path}: no such folder of images (source.path)")
+            raise InputError(f"{self.path}: no such folder of images ({setting})")
         if not self.path.is_dir():
-            raise InputError(f"{self.path}: source.path must be a folder of images, this is a file")
+            raise InputError(f"{self.path}: {setting} must be a folder of images, this is a file")
         found: list[str] = []
         for folder, subfolders, files in os.walk(self.path):
             subfolders[:] = [name for name in subfolders if not name.startswith(".")]
@@ -77,6 +77,10 @@ class ImageFolder:
             if not tail.lower().endswith(IMAGE_SUFFIXES) and tail in self._by_stem:
                 return self._by_stem[tail]
         return None
+
+    def with_stem(self, stem: str) -> str | None:
+        """The image with this path without its suffix, or None."""
+        return self._by_stem.get(stem)
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
         """Names at positions start, start + step, ... before stop; raises InputError where that is none."""

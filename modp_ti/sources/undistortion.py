@@ -42,25 +42,54 @@ class Undistorter:
             return np.asarray(pixels, dtype=np.float64) * np.divide(out, size)
         return _pixels(self.camera, self.distortion.undistort(_normalised(self.raw, pixels), self._limit))
 
-    def image(self, raw: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    def image(
+        self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
         """Undistorted, scaled image (H, W, 3) float32 in [0, 1] of a stored one (H0, W0, 3) uint8.
 
-        With it the mask (H, W) of the pixels that the stored image covers, None where it covers all.
+        With it the mask (H, W) of the pixels that the stored image covers, None where it covers all. valid: (H0, W0),
+        False for pixels of the stored image to be ignored: nothing of them comes into the image, and a pixel that more
+        than half consists of them is masked.
         """
-        import cv2
-
         if raw.shape != (self.raw.height, self.raw.width, 3) or raw.dtype != np.uint8:
             raise ValueError(f"image is {raw.shape} {raw.dtype}, the camera {self.raw.width}x{self.raw.height}")
+        mask = None if self._lookup is None else self._lookup[2]
+        if valid is None:
+            return self._resampled(raw).astype(np.float32) / 255.0, mask
+        if valid.shape != raw.shape[:2]:
+            raise ValueError(f"valid is {valid.shape}, the image {raw.shape}")
+        share = self._resampled(valid.astype(np.float32))
+        image = self._resampled(np.where(valid[..., None], raw, 0).astype(np.float32))
+        image = np.clip(image / np.maximum(share, 0.5)[..., None] / 255.0, 0.0, 1.0)
+        kept = share >= 0.5
+        return image, kept if mask is None else kept & mask
+
+    def smooth(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A smooth picture of the stored image's field of view (H1, W1, 3), as it is in the delivered one (H, W, 3)."""
+        import cv2
+
         size = (self.camera.width, self.camera.height)
-        image = raw
+        shrinks = picture.shape[1] > size[0]
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return self._remapped(picture, cv2.INTER_LINEAR)
+
+    def _resampled(self, image: NDArray) -> NDArray:
+        """A stored image, or one such channel, at the working size and undistorted."""
+        import cv2
+
+        size = (self.camera.width, self.camera.height)
         if size != (self.raw.width, self.raw.height):
-            image = cv2.resize(raw, size, interpolation=cv2.INTER_AREA)
-        if self._lookup is None:
-            return image.astype(np.float32) / 255.0, None
-        x, y, mask = self._lookup
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         # Cubic: at about one sample a pixel the linear filter blurs by an amount that depends on the place.
-        image = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return image.astype(np.float32) / 255.0, mask
+        return self._remapped(image, cv2.INTER_CUBIC)
+
+    def _remapped(self, image: NDArray, interpolation: int) -> NDArray:
+        import cv2
+
+        if self._lookup is None:
+            return image
+        x, y, _ = self._lookup
+        return cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
     @cached_property
     def _lookup(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_] | None] | None:

@@ -6,21 +6,24 @@ import math
 from typing import TYPE_CHECKING
 
 from modp_ti.errors import InputError
+from modp_ti.synthetic.light import LightChange
 from modp_ti.synthetic.simulated_tracker import FRAMES, SMALLEST, SyntheticTracker, TrackerNoise
 
 if TYPE_CHECKING:
     from modp_ti.config import SourceSettings, TrackerSettings
 
-__all__ = ["SyntheticTracker", "TrackerNoise", "open_synthetic"]
+__all__ = ["LightChange", "SyntheticTracker", "TrackerNoise", "open_synthetic"]
 
 WIDTH, HEIGHT = 320, 240  # [px] at scale 1
 
 
 def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> SyntheticTracker:
-    """The demo sequence. Of `source`, scale, start, stop, step, holdout and fps count; of `tracker` nothing.
+    """The demo sequence. Of `source`, scale, start, stop, step, holdout and fps count; of `tracker` exposure_change.
 
-    Raises InputError where the scale leaves no picture or the range no frames.
+    Raises InputError where the scale leaves no picture or the range no frames, and for masks or a vignette.
     """
+    if source.masks is not None or source.mask_colour is not None or source.vignette is not None:
+        raise InputError("the demo room has neither masks nor a vignette: take source.masks, mask_colour, vignette out")
     width, height = round(WIDTH * source.scale), round(HEIGHT * source.scale)
     if min(width, height) < SMALLEST:
         least = math.ceil(100 * SMALLEST / HEIGHT) / 100
@@ -30,4 +33,11 @@ def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> Syntheti
     select = slice(source.start, source.stop, source.step)
     if not range(FRAMES)[select]:
         raise InputError(f"source.start {source.start} lies behind the {FRAMES} frames of the demo room")
-    return SyntheticTracker(width=width, height=height, select=select, holdout=source.holdout or 0, fps=source.fps)
+    return SyntheticTracker(
+        width=width,
+        height=height,
+        select=select,
+        holdout=source.holdout or 0,
+        fps=source.fps,
+        light=LightChange().scaled(tracker.exposure_change),
+    )

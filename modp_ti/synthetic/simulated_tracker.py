@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.synthetic.camera_path import camera_path
+from modp_ti.synthetic.light import LightChange
 from modp_ti.synthetic.renderer import RoomRenderer
+from modp_ti.synthetic.walks import smooth_walks
 
 __all__ = ["FRAMES", "SMALLEST", "SyntheticTracker", "TrackerNoise"]
 
@@ -57,7 +59,9 @@ class SyntheticTracker:
 
     width, height: image size [px]. frames: number of views along the whole path. select: which of them are
     delivered. holdout: frames whose index among the delivered ones is a multiple of it are held out, 0 for
-    none. points: wanted number in view. room: one that is built already; otherwise the first frame builds it.
+    none. points: wanted number in view. light: what the camera makes of the colours, nothing by default; it
+    does not disturb tracking, and frames carry the vignette as those of a calibrated camera do. room: one
+    that is built already; otherwise the first frame builds it.
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class SyntheticTracker:
         noise: TrackerNoise | None = None,
         metres_per_unit: float = 1.0,
         seed: int = 0,
+        light: LightChange | None = None,
         room: RoomRenderer | None = None,
     ) -> None:
         if min(width, height) < SMALLEST:
@@ -93,6 +98,9 @@ class SyntheticTracker:
         path = camera_path(frames)
         self._truth = [path[k] for k in self._positions]
         self._tracked = self._noisy_poses()
+        light = LightChange.none() if light is None else light
+        self._exposures = light.exposures(len(self), np.random.default_rng([seed, 3]))
+        self._vignette = light.corner_vignette(width, height)
         self._room = room
 
     def __len__(self) -> int:
@@ -109,8 +117,12 @@ class SyntheticTracker:
         return [pose.copy() for pose in self._truth]
 
     def image(self, index: int) -> NDArray[np.float32]:
-        """Frame `index` alone: (H, W, 3) float32 RGB in [0, 1]."""
+        """The colours of frame `index` alone, before the light changes: (H, W, 3) float32 RGB in [0, 1]."""
         return self._render(index)[0]
+
+    def exposure(self, index: int) -> NDArray[np.float64]:
+        """True exposure (A, b) (3, 4) of frame `index`."""
+        return self._exposures[index].copy()
 
     def depth(self, index: int) -> NDArray[np.float32]:
         """True depth (H, W) of frame `index`: z in the camera frame at the pixel centres, in metres."""
@@ -137,7 +149,7 @@ class SyntheticTracker:
                 index=index,
                 timestamp=self._positions[index] / self._fps,
                 name=f"room-{self._positions[index]:04d}",
-                image=image,
+                image=self._developed(image, index),
                 camera=self.camera,
                 T_camera_world=tracked,
                 points=SparsePoints(
@@ -145,8 +157,18 @@ class SyntheticTracker:
                     pixels=observed[inside],
                     ids=seen[inside].astype(np.int64),
                 ),
+                vignette=self._vignette,
                 held_out=self._holdout > 0 and index % self._holdout == 0,
             )
+
+    def _developed(self, image: NDArray[np.float32], index: int) -> NDArray[np.float32]:
+        exposure = self._exposures[index]
+        if self._vignette is None and np.array_equal(exposure, np.eye(3, 4)):
+            return image
+        image = image @ exposure[:, :3].T + exposure[:, 3]
+        if self._vignette is not None:
+            image = image * self._vignette
+        return np.clip(image, 0.0, 1.0).astype(np.float32)
 
     def _render(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         if self._room is None:
@@ -156,11 +178,7 @@ class SyntheticTracker:
     def _noisy_poses(self) -> list[NDArray[np.float64]]:
         """exp(error) T of every frame, the error a smoothed random walk in (translation, rotation)."""
         rng = np.random.default_rng([self._seed, 0])
-        white = rng.standard_normal((len(self), 6))
-        distance = np.arange(len(self))[:, None] - np.arange(len(self))[None, :]
-        kernel = np.exp(-0.5 * (distance / max(self.noise.drift, 1e-3)) ** 2)
-        kernel /= np.linalg.norm(kernel, axis=1, keepdims=True)
-        errors = kernel @ white
+        errors = smooth_walks(len(self), 6, self.noise.drift, rng)
         errors[:, :3] *= self.noise.translation * SCENE_DEPTH
         errors[:, 3:] *= np.radians(self.noise.rotation)
         poses = []

@@ -13,7 +13,7 @@ from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import ImageFolder, Undistorter
+from modp_ti.sources import FrameReader, ImageFolder, Undistorter
 from modp_ti.sources.distortion import colmap_intrinsics
 from modp_ti.trackers.colmap_files import require_whole_binary_model
 from modp_ti.trackers.replay import (
@@ -63,7 +63,10 @@ def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTra
             f"{folder}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
         )
     undistorters = {i: _undistorter(camera, source.scale, folder) for i, camera in model.cameras.items()}
-    require_fitting_sizes(images, [(name, undistorters[posed[name].camera_id]) for name in names], str(folder))
+    cameras = [(name, undistorters[posed[name].camera_id]) for name in names]
+    require_fitting_sizes(images, cameras, str(folder))
+    reader = FrameReader(images, source)
+    reader.require_fitting(cameras)
 
     positions = {i: np.asarray(point.xyz, dtype=np.float64) for i, point in model.points3D.items()}
     frames = []
@@ -82,7 +85,7 @@ def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTra
     without_pose = len(selected) - len(names)
     if without_pose:
         notes.append(f"{without_pose} of {len(selected)} images have no pose in {folder}: skipped")
-    return ReplayedTracker(images, frames, source, notes)
+    return ReplayedTracker(reader, frames, source, notes)
 
 
 def _model_folder(images: Path, given: Path | None) -> Path:

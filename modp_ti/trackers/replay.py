@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.config import SourceSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import ImageFolder, Undistorter
+from modp_ti.sources import FrameReader, ImageFolder, Undistorter
 
 __all__ = ["PosedImage", "ReplayedTracker", "checked_pose", "points_inside", "require_fitting_sizes"]
 
@@ -33,18 +33,18 @@ class PosedImage:
 
 
 class ReplayedTracker:
-    """A `Tracker` over posed images, in the order given."""
+    """A `Tracker` over posed images, in the order given. Points on masked pixels are left out."""
 
     def __init__(
         self,
-        images: ImageFolder,
+        reader: FrameReader,
         frames: Sequence[PosedImage],
         source: SourceSettings,
         notes: Iterable[str] = (),
     ) -> None:
         self.frames = tuple(frames)
         self.notes = list(notes)
-        self._images = images
+        self._reader = reader
         self._source = source
 
     def __len__(self) -> int:
@@ -52,18 +52,28 @@ class ReplayedTracker:
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         for index, frame in enumerate(self.frames):
-            image, mask = frame.undistorter.image(self._images.read(frame.name))
+            picture = self._reader.read(frame.name, frame.undistorter)
             yield TrackedFrame(
                 index=index,
-                timestamp=self._images.position(frame.name) / self._source.fps,
+                timestamp=self._reader.images.position(frame.name) / self._source.fps,
                 name=frame.name,
-                image=image,
+                image=picture.image,
                 camera=frame.undistorter.camera,
                 T_camera_world=frame.T_camera_world,
-                points=frame.points,
-                mask=mask,
+                points=_unmasked(frame.points, picture.mask),
+                mask=picture.mask,
+                vignette=picture.vignette,
                 held_out=is_held_out(index, self._source),
             )
+
+
+def _unmasked(points: SparsePoints, mask: NDArray[np.bool_] | None) -> SparsePoints:
+    """The points, all of them inside the image, whose pixels are valid."""
+    if mask is None:
+        return points
+    column, row = np.floor(points.pixels).astype(int).T
+    kept = mask[row, column]
+    return SparsePoints(points.xyz[kept], points.pixels[kept], points.ids[kept])
 
 
 def is_held_out(index: int, source: SourceSettings) -> bool:

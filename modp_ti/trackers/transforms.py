@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import Distortion, ImageFolder, Undistorter
+from modp_ti.sources import Distortion, FrameReader, ImageFolder, Undistorter
 from modp_ti.trackers.point_cloud import read_ply_points, visible_points
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import (
@@ -81,6 +81,8 @@ def open_transforms(
         undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, source.scale))
         frames.append(PosedImage(name, undistorter, _pose(entries[name], file)))
     require_fitting_sizes(images, [(frame.name, frame.undistorter) for frame in frames], str(file))
+    reader = FrameReader(images, source)
+    reader.require_fitting([(frame.name, frame.undistorter) for frame in frames])
 
     notes = []
     if absent:
@@ -98,7 +100,7 @@ def open_transforms(
             notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
         solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
         frames = triangulated_frames(images, frames, solves, progress)
-    return ReplayedTracker(images, frames, source, notes)
+    return ReplayedTracker(reader, frames, source, notes)
 
 
 def _transforms_file(images: Path, given: Path | None) -> Path:

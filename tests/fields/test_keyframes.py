@@ -68,3 +68,31 @@ def test_a_new_keyframe_begins_with_the_correction_of_the_last() -> None:
 def test_without_keyframes_the_tracked_pose_stands() -> None:
     T = exp_se3([1, 2, 3, 0.1, 0.2, 0.3])
     np.testing.assert_array_equal(KeyframeStore().corrected(5, T), T)
+
+
+def test_exposure_is_interpolated_between_keyframes_and_the_nearest_outside() -> None:
+    store = KeyframeStore()
+    assert store.exposure_at(0) is None
+    for index, value in ((2, 1.0), (6, 3.0), (8, 3.0)):
+        store.append(frame(index)).exposure = np.full((3, 4), value)
+    expected = {0: 1.0, 2: 1.0, 3: 1.5, 5: 2.5, 6: 3.0, 7: 3.0, 20: 3.0}
+    for index, value in expected.items():
+        np.testing.assert_allclose(store.exposure_at(index), value)
+
+
+def test_a_new_keyframe_starts_with_the_exposure_of_the_last_but_shares_no_memory_with_it() -> None:
+    store = KeyframeStore()
+    store.append(frame(0)).exposure = np.full((3, 4), 2.0)
+    new = store.append(frame(1))
+    np.testing.assert_array_equal(new.exposure, np.full((3, 4), 2.0))
+    new.exposure += 1.0
+    new.exposure_m += 1.0
+    np.testing.assert_array_equal(store[0].exposure, np.full((3, 4), 2.0))
+    np.testing.assert_array_equal(store[0].exposure_m, 0.0)
+
+
+def test_exposure_that_is_not_estimated_is_none() -> None:
+    store = KeyframeStore()
+    store.append(frame(0))
+    assert store.append(frame(1)).exposure is None
+    assert store.exposure_at(5) is None

@@ -180,3 +180,21 @@ def test_a_scene_without_points_says_so(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert "no frame became a keyframe" in result.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["scene.yaml"]
+
+
+def test_estimated_exposures_are_written_and_the_scores_are_those_of_the_developed_pictures(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(SCENE)
+    changes = ("tracker.exposure_change=1.5", "mapping.exposure.enabled=true")
+    result = run(scene, *(part for change in changes for part in ("--set", change)))
+    assert result.returncode == 0, result.stderr
+    frames = json.loads((tmp_path / "out/exposure.json").read_text())["frames"]
+    assert len(frames) == 9
+    matrices = np.array([frame["matrix"] for frame in frames])
+    assert np.ptp(matrices, axis=0).max() > 0.01
+    errors = []
+    for path in sorted((tmp_path / "out/renders").iterdir()):
+        frame, render = np.hsplit(cv2.imread(str(path)).astype(np.float64) / 255.0, 2)
+        errors.append(-10 * np.log10(((frame - render) ** 2).mean()))
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["refined"]["held_out"]["psnr"] == pytest.approx(np.mean(errors), abs=0.02)

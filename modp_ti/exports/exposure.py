@@ -1,0 +1,36 @@
+"""`exposure.json`: the estimated exposure of every frame."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["write_exposures"]
+
+
+def write_exposures(
+    path: Path,
+    indices: Sequence[int],
+    timestamps: Sequence[float],
+    exposures: Sequence[NDArray[np.float64]],
+    keyframes: set[int],
+) -> None:
+    """Write (A, b) (3, 4) of every frame: it shows A colour + b where the map holds `colour`.
+
+    keyframes: indices of the frames whose exposure was estimated; those of the others lie between.
+    """
+    frames = [
+        {
+            "index": index,
+            "timestamp": timestamp,
+            "keyframe": index in keyframes,
+            "matrix": np.round(exposure, 6).tolist(),
+        }
+        for index, timestamp, exposure in zip(indices, timestamps, exposures, strict=True)
+    ]
+    lines = ",\n".join("  " + json.dumps(frame) for frame in frames)
+    path.write_text(f'{{"frames": [\n{lines}\n]}}\n', encoding="utf-8")
