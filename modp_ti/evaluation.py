@@ -2,19 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.gaussians import GaussianField
 from fields.se3 import inverse_se3
 from fields.tracked_frame import TrackedFrame
 from modp_ti.lpips import Lpips
 from pipelines.losses import PhotometricLoss
 from pipelines.rendering import Renderer
 
-__all__ = ["FrameScore", "absolute_trajectory_error", "score_frame", "summary", "umeyama"]
+__all__ = [
+    "FrameScore",
+    "MapVersion",
+    "Mapper",
+    "absolute_trajectory_error",
+    "evaluate",
+    "score_frame",
+    "summary",
+    "trajectory_errors",
+    "umeyama",
+]
+
+# Frames in memory at a time, to load each version of the map once for all of them.
+EVALUATED_TOGETHER = 32
+
+
+class Mapper(Protocol):
+    """What evaluation needs of a mapper: where a map is loaded, and how it is seen and compared."""
+
+    gaussians: GaussianField
+    renderer: Renderer
+    loss: PhotometricLoss
+
+    @property
+    def near(self) -> float:
+        """Depth [scene units] below which nothing is drawn."""
+
+
+@dataclass(frozen=True)
+class MapVersion:
+    """A map at one time: Gaussians by name as `GaussianField.to_numpy`, T_camera_world and exposure of every frame."""
+
+    gaussians: dict[str, NDArray]
+    trajectory: list[NDArray[np.float64]]
+    exposures: list[NDArray[np.float64] | None]
 
 
 @dataclass(frozen=True)
@@ -73,6 +110,30 @@ def score_frame(
     return FrameScore(frame.index, frame.name, frame.held_out, stage, values.psnr, values.ssim, distance), render
 
 
+def evaluate(
+    mapper: Mapper,
+    frames: Iterable[TrackedFrame],
+    versions: Mapping[str, MapVersion],
+    lpips: Lpips | None,
+    rendered: Callable[[str, TrackedFrame, NDArray[np.float32]], None],
+) -> list[FrameScore]:
+    """Scores of every frame in every version of the map by name, version by version.
+
+    rendered: called with the version's name, the frame and its render (H, W, 3). The last version stays in the mapper.
+    """
+    scores: dict[str, list[FrameScore]] = {name: [] for name in versions}
+    frames = iter(frames)
+    while batch := list(islice(frames, EVALUATED_TOGETHER)):
+        for name, version in versions.items():
+            mapper.gaussians.load(version.gaussians)
+            for frame in batch:
+                T, exposure = version.trajectory[frame.index], version.exposures[frame.index]
+                score, render = score_frame(mapper.renderer, mapper.loss, frame, T, mapper.near, name, lpips, exposure)
+                scores[name].append(score)
+                rendered(name, frame, render)
+    return [score for of in scores.values() for score in of]
+
+
 def umeyama(
     source: NDArray[np.float64], target: NDArray[np.float64], with_scale: bool = True
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
@@ -94,3 +155,14 @@ def absolute_trajectory_error(
     target = np.array([inverse_se3(T)[:3, 3] for T in truth])
     s, R, t = umeyama(source, target, with_scale)
     return float(np.sqrt(((s * source @ R.T + t - target) ** 2).sum(axis=1).mean()))
+
+
+def trajectory_errors(
+    tracked: list[NDArray[np.float64]], refined: list[NDArray[np.float64]], truth: list[NDArray[np.float64]]
+) -> dict[str, float | None]:
+    """ATE of the refined poses (aligned by a similarity, and rigidly) and of the tracked ones; None without truth."""
+    cases = {"ate_rmse": (refined, True), "ate_rmse_rigid": (refined, False), "ate_rmse_tracked": (tracked, True)}
+    return {
+        name: round(absolute_trajectory_error(poses, truth, with_scale), 6) if len(truth) else None
+        for name, (poses, with_scale) in cases.items()
+    }

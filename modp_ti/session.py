@@ -8,8 +8,7 @@ import resource
 import shutil
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -21,14 +20,14 @@ from fields.backend import initialise
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
 from modp_ti.errors import InputError
-from modp_ti.evaluation import FrameScore, absolute_trajectory_error, score_frame, summary
+from modp_ti.evaluation import FrameScore, MapVersion, evaluate, summary, trajectory_errors
 from modp_ti.exports.exposure import write_exposures
 from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats, write_splats
 from modp_ti.exports.trajectory import write_trajectory
-from modp_ti.lpips import Lpips, open_lpips
+from modp_ti.lpips import open_lpips
 from modp_ti.progress import ProgressLine
-from modp_ti.trackers import Tracker, frame_count, open_tracker
+from modp_ti.trackers import frame_count, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
@@ -39,8 +38,6 @@ __all__ = ["run_scene"]
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Versions of a map that metrics.json has room for; null where a run does not make one.
 MAPS = ("online", "refined", "offline")
-# Frames that evaluation holds in memory at a time, to load each version of the map once for all of them.
-EVALUATED_TOGETHER = 32
 
 
 @dataclass
@@ -120,31 +117,33 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "give a tracker with points or lower mapping.keyframes.min_points"
         )
 
-    unrefined = mapper.gaussians.to_numpy()
-    unrefined_exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
-    refined = config.refine.steps > 0 and not offline
-    if refined:
+    versions = {config.mode: _version(mapper, poses)}
+    if config.refine.steps and not offline:
         line.start_refining(config.refine.steps)
         refine(mapper, config.refine, line.refined)
         line.stop()
+        versions["refined"] = _version(mapper, poses)
+    last = list(versions)[-1]
+    final = versions[last]
 
-    trajectory = [mapper.keyframes.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)]
-    exposures = [mapper.keyframes.exposure_at(i) for i in poses.index]
     staging = config.output.with_name(config.output.name + ".partial")
     shutil.rmtree(staging, ignore_errors=True)
     try:
         (staging / "renders").mkdir(parents=True)
-        write_splats(staging / "splats.ply", mapper.gaussians.to_numpy())
-        write_trajectory(staging / "trajectory.txt", poses.timestamp, trajectory)
+        write_splats(staging / "splats.ply", final.gaussians)
+        write_trajectory(staging / "trajectory.txt", poses.timestamp, final.trajectory)
         if mapper.keyframes[0].exposure is not None:
             keyframes = {k.index for k in mapper.keyframes}
-            write_exposures(staging / "exposure.json", poses.index, poses.timestamp, exposures, keyframes)
-        saved = read_splats(staging / "splats.ply")
-        states = {config.mode: (saved, exposures)}
-        if refined:
-            states = {config.mode: (unrefined, unrefined_exposures), "refined": (saved, exposures)}
+            write_exposures(staging / "exposure.json", poses.index, poses.timestamp, final.exposures, keyframes)
+        # What is scored is what a reader of the file gets.
+        versions[last] = replace(final, gaussians=read_splats(staging / "splats.ply"))
+
+        def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+            if stage == last and frame.held_out:
+                _write_pair(staging / "renders" / f"{frame.index:06d}.png", frame.image, render)
+
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
-            scores = _evaluate(mapper, tracker, trajectory, states, staging / "renders", lpips)
+            scores = evaluate(mapper, tracker, versions, lpips, keep)
         write_scores(staging / "scores.csv", scores)
         metrics = {
             "frames": len(poses.index),
@@ -155,11 +154,11 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "frames_per_second": round(len(poses.index) / mapping_seconds, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
             "view_renders": mapper.renderer.view_renders,
-            **{stage: _summaries(scores, stage) if stage in states else None for stage in MAPS},
+            **{stage: _summaries(scores, stage) if stage in versions else None for stage in MAPS},
             "lpips_note": no_lpips,
             "seconds": _seconds(watch.seconds, time.perf_counter() - started),
             "breakdown_percent": breakdown,
-            **_trajectory_errors(poses.tracked, trajectory, getattr(tracker, "ground_truth", list)()),
+            **trajectory_errors(poses.tracked, final.trajectory, getattr(tracker, "ground_truth", list)()),
         }
         (staging / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         dump_scene(config, staging / "config.yaml")
@@ -170,6 +169,16 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         shutil.rmtree(staging, ignore_errors=True)
     line.summary(metrics)
     return config.output
+
+
+def _version(mapper: OnlineMapper | OfflineMapper, poses: Poses) -> MapVersion:
+    """The map as it stands."""
+    store = mapper.keyframes
+    return MapVersion(
+        mapper.gaussians.to_numpy(),
+        [store.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)],
+        [store.exposure_at(i) for i in poses.index],
+    )
 
 
 def _optimise_offline(mapper: OfflineMapper, line: ProgressLine) -> None:
@@ -196,58 +205,10 @@ def _chain(first: TrackedFrame, rest: Iterable[TrackedFrame]) -> Iterator[Tracke
     yield from rest
 
 
-def _evaluate(
-    mapper: OnlineMapper | OfflineMapper,
-    tracker: Tracker,
-    trajectory: list[NDArray[np.float64]],
-    states: dict[str, tuple[dict[str, NDArray], list[NDArray[np.float64] | None]]],
-    renders: Path,
-    lpips: Lpips | None,
-) -> list[FrameScore]:
-    """Scores of every frame in every version of the map by name; pictures of the held-out frames from the last one.
-
-    states: of each version the Gaussians, and the exposure of every frame. The last version stays in
-    `mapper.gaussians`.
-    """
-    near = mapper.settings.near * mapper.keyframes.scene_depth
-    scores = []
-    last = list(states)[-1]
-    frames = iter(tracker)
-    while batch := list(islice(frames, EVALUATED_TOGETHER)):
-        for name, (state, exposures) in states.items():
-            mapper.gaussians.load(state)
-            for frame in batch:
-                score, render = score_frame(
-                    mapper.renderer,
-                    mapper.loss,
-                    frame,
-                    trajectory[frame.index],
-                    near,
-                    name,
-                    lpips,
-                    exposures[frame.index],
-                )
-                scores.append(score)
-                if frame.held_out and name == last:
-                    _write_pair(renders / f"{frame.index:06d}.png", frame.image, render)
-    return sorted(scores, key=lambda score: list(states).index(score.stage))
-
-
 def _summaries(scores: list[FrameScore], stage: str) -> dict[str, dict]:
     """A version's means over all frames and over those held out."""
     of = [score for score in scores if score.stage == stage]
     return {"all": summary(of), "held_out": summary([score for score in of if score.held_out])}
-
-
-def _trajectory_errors(
-    tracked: list[NDArray[np.float64]], refined: list[NDArray[np.float64]], truth: list[NDArray[np.float64]]
-) -> dict[str, float | None]:
-    """ATE of the refined poses (aligned by a similarity, and rigidly) and of the tracked ones; None without truth."""
-    cases = {"ate_rmse": (refined, True), "ate_rmse_rigid": (refined, False), "ate_rmse_tracked": (tracked, True)}
-    return {
-        name: round(absolute_trajectory_error(poses, truth, with_scale), 6) if len(truth) else None
-        for name, (poses, with_scale) in cases.items()
-    }
 
 
 def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:

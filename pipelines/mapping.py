@@ -66,6 +66,11 @@ class OnlineMapper:
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self._frames = 0
 
+    @property
+    def near(self) -> float:
+        """Depth [scene units] below which nothing is drawn."""
+        return self.settings.near * self.keyframes.scene_depth
+
     # ---- the loop --------------------------------------------------------------------------------------------
 
     def process(self, frame: TrackedFrame) -> FrameReport:
@@ -83,7 +88,7 @@ class OnlineMapper:
             if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
                 self.optimiser.poses.align(view)
             with self.stopwatch.measure("optimise"):
-                self.optimiser.exposure.begin(view, self.renderer, self.settings.near * self.keyframes.scene_depth)
+                self.optimiser.exposure.begin(view, self.renderer, self.near)
             level = self._draw_level()
             self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
             psnr = self.optimise(self.settings.optimise.steps, level)

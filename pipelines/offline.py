@@ -112,6 +112,11 @@ class OfflineMapper:
         self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
         self.keyframes = KeyframeStore()
 
+    @property
+    def near(self) -> float:
+        """Depth [scene units] below which nothing is drawn."""
+        return self.settings.near * self.keyframes.scene_depth
+
     def process(self, frame: TrackedFrame) -> FrameReport:
         """Keep the next frame. Held-out frames must not come here: ValueError."""
         if frame.held_out:
@@ -158,7 +163,7 @@ class OfflineMapper:
     def _step(self, view: Keyframe, rates: LearningRates, sh_degree: int) -> float:
         """One Adam step on one view; its PSNR before the step."""
         renderer = self.renderer
-        renderer.forward(view.camera, view.T_camera_world, self.settings.near * self.keyframes.scene_depth)
+        renderer.forward(view.camera, view.T_camera_world, self.near)
         renderer.develop(None, view.vignette)
         renderer.images.set_reference(view.rgba)
         values = self.loss.forward()
