@@ -101,7 +101,7 @@ class EpipolarDepth:
         step = inverse[1] - inverse[0]
         at = inverse[inner] + offset * step
         # Half a height of noise (1 - score) moves the peak of a parabola by sqrt(noise / curvature) samples.
-        spread = step * np.sqrt((1 - top + 0.01) / curvature) + self.settings.pixel_noise / reach
+        spread = step * np.sqrt((1.01 - np.minimum(top, 1.0)) / curvature) + self.settings.pixel_noise / reach
         return DepthEstimate(1 / at, np.where(good, spread / at, np.inf))
 
     @ti.kernel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -32,6 +33,8 @@ class GaussianProcessDepth:
     NOISE_RATIOS = (1e-3, 1e-2, 1e-1)
     # Four numbers need no more points than this.
     FIT_POINTS = 150
+    # What the process's deviation is multiplied by.
+    CAUTION = 1.0
 
     def __init__(self, settings: DepthSettings, rng: np.random.Generator) -> None:
         self.settings = settings
@@ -48,7 +51,8 @@ class GaussianProcessDepth:
         length, colour, ratio, variance = self._fit(known[some], (y - y.mean())[some])
         K = variance * self._correlation(known, known, length, colour)
         k = variance * self._correlation(asked, known, length, colour)
-        return regress_log_depth(z, K, ratio * variance, k, variance)
+        estimate = regress_log_depth(z, K, ratio * variance, k, variance)
+        return replace(estimate, deviation=self.CAUTION * estimate.deviation)
 
     def _features(self, view: Keyframe, pixels: NDArray[np.float64]) -> torch.Tensor:
         """What the correlation of pixels (N, 2) depends on (N, 2 + c): place in larger image sides, then colour."""
@@ -85,6 +89,9 @@ class ImageGuidedDepth(GaussianProcessDepth):
     COLOURS = (np.inf, 0.5, 0.25, 0.125)
     # Standard deviation [px] of the blur.
     BLUR = 2.0
+    # A process is continuous and surfaces are not: against a depth sensor, 47 percent of the errors were within one
+    # deviation as it comes, 66 percent within twice that (a normal distribution: 68).
+    CAUTION = 2.0
 
     def _features(self, view: Keyframe, pixels: NDArray[np.float64]) -> torch.Tensor:
         image = cv2.GaussianBlur(view.rgba[..., :3].astype(np.float32) / 255.0, (0, 0), self.BLUR)
