@@ -23,6 +23,9 @@ class MapDepth:
     """
 
     MIN_OPACITY = 0.9
+    # Pixels are asked for where the map is worst, tracked points are where it is best: against a depth sensor, 39
+    # percent of the errors were within one deviation as it comes, 68 percent of the fused ones with twice that.
+    CAUTION = 2.0
     # Side [px] of the window around a pixel in which depth may vary.
     WINDOW = 5
 
@@ -47,7 +50,7 @@ class MapDepth:
             return unknown_depth(len(pixels))
         # 1.48: a normal distribution's deviation over its median absolute one.
         common = 1.48 * np.median(np.abs(at_points))
-        deviation = np.hypot(common, 0.5 * _at(variation, pixels))
+        deviation = self.CAUTION * np.hypot(common, 0.5 * _at(variation, pixels))
         solid = _at(picture.opacity, pixels) >= self.MIN_OPACITY
         return DepthEstimate(np.where(solid, np.exp(_at(log_depth, pixels)), 1.0), np.where(solid, deviation, np.inf))
 

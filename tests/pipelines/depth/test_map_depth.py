@@ -59,7 +59,7 @@ def test_the_deviation_is_how_far_the_map_is_from_the_tracked_points(wall: Rende
     wall.gaussians.load(state)
     found = estimate(wall, np.array([[20.5, 20.5], [30.5, 30.5]]))
     assert (found.deviation > np.log(1.1)).all()
-    assert (found.deviation < 2 * np.log(1.1)).all()
+    assert (found.deviation < 2 * MapDepth.CAUTION * np.log(1.1)).all()
 
 
 def test_an_empty_map_knows_nothing(renderer: Renderer) -> None:
