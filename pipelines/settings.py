@@ -82,7 +82,7 @@ class DepthSettings(StrictModel):
     )
     max_points: int = Field(500, ge=10, description="tracked points that condition the process, drawn at random beyond")
     max_deviation: float = Field(
-        0.06, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
+        0.045, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
     )
     checkpoint: Path | None = Field(
         None, description="DepthCov's weights (`scannet.ckpt` or `nyu.ckpt`), a file of the user's own; for depthcov"
@@ -104,7 +104,7 @@ class DensifySettings(StrictModel):
         True, description="also add Gaussians at pixels of low SSIM, not only at tracked points"
     )
     pixels: int = Field(
-        1600,
+        4000,
         ge=0,
         description="such pixels per keyframe of 640x480; other sizes by the power 3/4 of their area",
     )
@@ -156,10 +156,10 @@ class LevelSettings(StrictModel):
     """Image pyramid: the level that a new keyframe is optimised and densified on."""
 
     probabilities: tuple[float, ...] = Field(
-        (0.4, 0.3, 0.2, 0.1),
+        (1.0,),
         min_length=1,
         max_length=8,
-        description="of drawing the full size, the half, the quarter, ...; [1] for full size only",
+        description="of drawing the full size, the half, the quarter, ...; the paper has [0.4, 0.3, 0.2, 0.1]",
     )
 
 
@@ -178,15 +178,15 @@ class OptimiseSettings(StrictModel):
     """Loss and learning rates."""
 
     batch: int = Field(
-        6, ge=1, description="views whose gradients make one Adam step; the views of a step are shared out"
+        1, ge=1, description="views whose gradients make one Adam step; the views of a step are shared out"
     )
 
     steps: int = Field(25, ge=0, description="steps per keyframe")
     last_steps: int = Field(40, ge=0, description="steps after the last frame")
     ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
     aspect_weight: float = Field(1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
-    position_rate: float = Field(8e-6, ge=0, description="Adam step of positions [scene depths]")
-    scale_rate: float = Field(3e-3, ge=0, description="Adam step of log-scales")
+    position_rate: float = Field(2.4e-5, ge=0, description="Adam step of positions [scene depths]")
+    scale_rate: float = Field(2e-2, ge=0, description="Adam step of log-scales")
     rotation_rate: float = Field(1e-3, ge=0, description="Adam step of quaternions")
     opacity_rate: float = Field(0.05, ge=0, description="Adam step of opacity logits")
     colour_rate: float = Field(
@@ -223,7 +223,7 @@ class RefineSettings(StrictModel):
     views: int = Field(4, ge=1, description="views per step, drawn as the global views are")
     poses: bool = Field(False, description="also refine poses, at a rate that decays as that of positions does")
     position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
-    scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")
+    scale_decay: float = Field(0.1, gt=0, le=1, description="factor of the scale rate at the end of the decay")
 
 
 class OfflineSettings(StrictModel):
