@@ -91,7 +91,7 @@ def test_error_pixels_are_distinct_centres_of_high_error_without_a_tracked_point
     v = view()
     error = np.zeros((120, 160), dtype=np.float32)
     error[20:60, 30:90] = 0.5
-    pixels = error_pixels(v, error, DensifySettings(), np.random.default_rng(2))
+    pixels = error_pixels(v, error, DensifySettings(pixels=1600), np.random.default_rng(2))
     assert len(pixels) == round(1600 * (160 * 120 / (640 * 480)) ** 0.75)
     assert len(np.unique(pixels, axis=0)) == len(pixels)
     np.testing.assert_array_equal(pixels % 1, 0.5)

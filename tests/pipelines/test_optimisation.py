@@ -17,7 +17,7 @@ from pipelines.settings import MappingSettings
 from .differences import STEP, central_differences
 from .scenes import CAMERA, POSE, random_gaussians
 
-SETTINGS = MappingSettings(near=0.01, optimise={"aspect_weight": 0.0}, poses={"learning_rate": 1e-3})
+SETTINGS = MappingSettings(near=0.01, optimise={"aspect_weight": 0.0, "batch": 6})
 WEIGHT = 0.2
 MOTION = [0.2, -0.1, 0.1, 0.02, 0.05, -0.03]
 
@@ -122,6 +122,16 @@ def test_a_step_follows_the_mean_gradient_of_its_views(
         assert size > 0
         np.testing.assert_allclose(gradients[2][name], (first + gradients[1][name]) / 2, atol=1e-4 * size)
         np.testing.assert_allclose(gradients[3][name], (3 * first + gradients[1][name]) / 4, atol=1e-4 * size)
+
+
+def test_the_views_of_a_step_are_shared_out_among_batches(
+    optimiser: MapOptimiser, store: KeyframeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches = []
+    monkeypatch.setattr(optimiser.adam, "step", lambda rates, size: batches.append(size))
+    monkeypatch.setattr(optimiser, "settings", MappingSettings(optimise={"batch": 2}))
+    optimiser.step(store, [0, 1, 2, 0, 1], optimiser.rates(1.0), pose_rate=0.0)
+    assert batches == [2, 2, 1]
 
 
 def test_poses_move_only_where_asked_and_the_first_never(optimiser: MapOptimiser, store: KeyframeStore) -> None:
