@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from experiments import (
@@ -59,13 +59,14 @@ def main() -> None:
     parser.add_argument(
         "--refine", type=int, default=0, metavar="STEPS", help="post refinement of each run (default 0)"
     )
+    parser.add_argument("--only", nargs="+", choices=list(VARIANTS), help="these variants instead of all")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of every run")
     parser.add_argument("--fresh", action="store_true", help="run again what is there already")
     arguments = parser.parse_args()
     try:
         scenes = named_scenes(arguments.scenes)
         common = {"refine.steps": str(arguments.refine)} | command_line(arguments.set)
-        jobs = plan(scenes, arguments.output, common, arguments.tracker)
+        jobs = plan(scenes, arguments.output, common, arguments.tracker, arguments.only or VARIANTS)
         metrics = execute([job for of_scene in jobs.values() for job in of_scene.values()], arguments.fresh)
     except InputError as error:
         sys.exit(f"error: {error}")
@@ -78,15 +79,19 @@ def main() -> None:
 
 
 def plan(
-    scenes: Mapping[str, Path], output: Path, common: Mapping[str, str], trackers: list[str]
+    scenes: Mapping[str, Path],
+    output: Path,
+    common: Mapping[str, str],
+    trackers: Sequence[str] = (),
+    variants: Iterable[str] = VARIANTS,
 ) -> dict[str, dict[str, Job]]:
     """The jobs by scene and variant. trackers: empty, or for each scene the file that names another tracker."""
     if trackers and len(trackers) != len(scenes):
         raise InputError(f"--tracker needs one file for each of the {len(scenes)} scenes, got {len(trackers)}")
     jobs = {
         scene: {
-            name: Job(f"{scene}, {name}", file, output / scene / _folder(name), {**common, **overrides})
-            for name, overrides in VARIANTS.items()
+            name: Job(f"{scene}, {name}", file, output / scene / _folder(name), {**common, **VARIANTS[name]})
+            for name in variants
         }
         for scene, file in scenes.items()
     }
@@ -123,8 +128,9 @@ def report(figures: Mapping[str, Mapping[str, Figures]]) -> str:
     for title, rows in (parts | dict(figures)).items():
         lines += ["", f"## {title}"]
         for name, columns, variants in TABLES:
-            if all(v in rows for v in variants):
-                lines += ["", markdown_table(name, columns, {v: rows[v] for v in variants})]
+            shown = {v: rows[v] for v in variants if v in rows}
+            if len(shown) > 1:
+                lines += ["", markdown_table(name, columns, shown)]
     return "\n".join(lines)
 
 

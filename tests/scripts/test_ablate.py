@@ -107,6 +107,14 @@ def test_the_script_runs_every_variant_and_writes_what_it_prints(
     assert len(started) == len(folders)
 
 
+def test_variants_that_are_not_asked_for_are_neither_run_nor_shown(scene: Path, tmp_path: Path) -> None:
+    jobs = ablate.plan({"a": scene}, tmp_path, {}, variants=["w/o EC", ablate.FULL])
+    assert list(jobs["a"]) == ["w/o EC", ablate.FULL]
+    row = dict.fromkeys(("psnr", "ssim", "lpips", "gaussians", "first_third_psnr"), 1.0)
+    text = ablate.report({"a": dict.fromkeys(jobs["a"], row)})
+    assert "w/o EC" in text and "w/o MOHV" not in text and "Global consistent" not in text
+
+
 def test_another_tracker_is_named_for_every_scene_or_none(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="one file for each of the 2 scenes, got 1"):
         ablate.plan({"a": scene, "b": scene}, tmp_path, {}, ["other.yaml"])

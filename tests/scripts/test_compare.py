@@ -8,13 +8,10 @@ from pathlib import Path
 import compare
 import pytest
 
-from modp_ti.config import SceneConfig, load_scene
+from modp_ti.config import load_scene
 from modp_ti.errors import InputError
 
-needs_offline = pytest.mark.skipif("mode" not in SceneConfig.model_fields, reason="no mode: offline yet")
 
-
-@needs_offline
 def test_offline_gets_as_many_steps_as_the_online_run_rendered_views(scene: Path, tmp_path: Path) -> None:
     job = compare.offline_job("room", scene, tmp_path, 1234, {"seed": "3"})
     config = load_scene(scene, job.arguments())
