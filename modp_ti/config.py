@@ -6,33 +6,27 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
-from pydantic_core import PydanticUndefined
 
+from modp_ti.config_keys import as_yaml, documented_keys, markdown_of_keys, sections_of
 from modp_ti.errors import InputError
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
 __all__ = [
     "EvaluationSettings",
-    "KeyDoc",
     "SceneConfig",
     "SourceSettings",
     "TrackerSettings",
-    "documented_keys",
     "dump_scene",
     "load_scene",
-    "markdown_of_keys",
 ]
 
 
@@ -194,13 +188,9 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         if first["type"] == "missing":
             text = f"{place} is missing: {_description(place) or 'it has no default'}"
         elif place and first["type"] != "value_error":
-            text = f"{place}: {text.replace('Input should be', 'must be')}, not {_as_yaml(first['input'])}"
+            text = f"{place}: {text.replace('Input should be', 'must be')}, not {as_yaml(first['input'])}"
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise InputError(f"{where.get(place, name)}: {text}{more}") from None
-
-
-def _as_yaml(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 _INT = re.compile(r"[-+]?[0-9]+")
@@ -289,69 +279,9 @@ def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) 
     where[key] = origin
 
 
-@dataclass(frozen=True)
-class KeyDoc:
-    """One setting: dotted key, type, default as YAML text (None where the key is required), meaning."""
-
-    key: str
-    type: str
-    default: str | None
-    description: str
-
-
-def documented_keys() -> Iterator[KeyDoc]:
-    """Every setting of a scene file in the order of the model."""
-    yield from _walk(SceneConfig, "")
-
-
-def _walk(model: type[BaseModel], prefix: str) -> Iterator[KeyDoc]:
-    for name, info in model.model_fields.items():
-        sections = _sections(info.annotation)
-        if sections:
-            for section in sections:
-                yield from _walk(section, f"{prefix}{name}.")
-            continue
-        default = None
-        if info.default_factory is not None or info.default is not PydanticUndefined:
-            value = info.get_default(call_default_factory=True, validated_data={})
-            default = "" if value is None else _as_yaml(value)
-        yield KeyDoc(prefix + name, _type_name(info.annotation), default, info.description or "")
-
-
-def _sections(annotation: Any) -> list[type[BaseModel]]:
-    """The models that a field can hold: one for `Section` and `Section | None`, none for a plain value."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    arguments = get_args(annotation)
-    if getattr(annotation, "__origin__", None) in (list, tuple, dict):
-        return []
-    return [model for argument in arguments for model in _sections(argument)]
-
-
-def _type_name(annotation: Any) -> str:
-    names = {
-        int: "integer",
-        float: "number",
-        str: "text",
-        bool: "true or false",
-        Path: "path",
-        NoneType: "empty",
-    }
-    if annotation in names:
-        return names[annotation]
-    origin, arguments = getattr(annotation, "__origin__", None), get_args(annotation)
-    if origin is Literal:
-        return " or ".join(f"`{argument}`" for argument in arguments)
-    if origin in (list, tuple):
-        return "list of " + _type_name(arguments[0])
-    if arguments:
-        return " or ".join(_type_name(argument) for argument in arguments)
-    return getattr(annotation, "__name__", str(annotation))
-
-
 def _description(key: str) -> str:
     """What a key means; for a section, the keys that it needs."""
-    keys = list(documented_keys())
+    keys = list(documented_keys(SceneConfig))
     for entry in keys:
         if entry.key == key:
             return f"{entry.description} ({entry.type})"
@@ -376,7 +306,7 @@ def _refuse_unknown_keys(
         if key not in model.model_fields:
             hint = _nearest(place, prefix, model, whole_key)
             raise InputError(f"{where.get(place, origin)}: unknown key `{place}`{hint}")
-        sections = _sections(model.model_fields[key].annotation)
+        sections = sections_of(model.model_fields[key].annotation)
         if not isinstance(value, Mapping):
             continue
         if not sections and whole_key is not None:
@@ -387,7 +317,7 @@ def _refuse_unknown_keys(
 
 def _nearest(place: str, prefix: str, model: type[BaseModel], whole_key: str | None) -> str:
     siblings = [prefix + name for name in model.model_fields]
-    every = [entry.key for entry in documented_keys()]
+    every = [entry.key for entry in documented_keys(SceneConfig)]
     leaf = place.removeprefix(prefix)
     in_section = difflib.get_close_matches(leaf, list(model.model_fields), n=1, cutoff=0.6)
     same_leaf = [key for key in every if key.rpartition(".")[2] == leaf]
@@ -406,27 +336,5 @@ def _nearest(place: str, prefix: str, model: type[BaseModel], whole_key: str | N
     return f"; did you mean `{found}`?"
 
 
-def markdown_of_keys() -> str:
-    """The reference of all keys as Markdown tables, one a section."""
-    sections: dict[str, list[KeyDoc]] = {}
-    for entry in documented_keys():
-        sections.setdefault(entry.key.rpartition(".")[0], []).append(entry)
-    text = [
-        "# Configuration",
-        "",
-        "Every key of `scene.yaml`. Relative paths are relative to the file. Any key can be set on the",
-        "command line: `modp-ti run scene.yaml --set source.scale=0.5`.",
-        "This page is written by `python -m modp_ti.config`.",
-    ]
-    for section, entries in sections.items():
-        text += ["", f"## {f'`{section}`' if section else 'Top level'}", ""]
-        text += ["| key | type | default | meaning |", "|---|---|---|---|"]
-        for entry in entries:
-            default = "required" if entry.default is None else f"`{entry.default}`" if entry.default else "empty"
-            cells = [f"`{entry.key}`", entry.type, default, entry.description]
-            text.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return "\n".join(text) + "\n"
-
-
 if __name__ == "__main__":
-    print(markdown_of_keys(), end="")
+    print(markdown_of_keys(SceneConfig), end="")

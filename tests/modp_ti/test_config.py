@@ -8,7 +8,8 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from modp_ti.config import SceneConfig, documented_keys, dump_scene, load_scene, markdown_of_keys
+from modp_ti.config import SceneConfig, dump_scene, load_scene
+from modp_ti.config_keys import documented_keys, markdown_of_keys
 from modp_ti.errors import InputError
 
 MINIMAL = "source: {path: images}\ntracker: {kind: colmap}\noutput: out/here\n"
@@ -224,18 +225,18 @@ def leaves(data: dict, prefix: str = "") -> list[str]:
 def test_written_configuration_names_every_documented_key(scene, tmp_path):
     dump_scene(load_scene(scene(MINIMAL)), tmp_path / "config.yaml")
     written = leaves(yaml.safe_load((tmp_path / "config.yaml").read_text()))
-    assert written == [entry.key for entry in documented_keys()]
+    assert written == [entry.key for entry in documented_keys(SceneConfig)]
 
 
 def test_every_key_is_documented_with_its_meaning_and_default():
-    text = markdown_of_keys()
-    for entry in documented_keys():
+    text = markdown_of_keys(SceneConfig)
+    for entry in documented_keys(SceneConfig):
         assert entry.description, f"{entry.key} has no description"
         assert f"| `{entry.key}` |" in text
-    defaults = {entry.key: entry.default for entry in documented_keys()}
+    defaults = {entry.key: entry.default for entry in documented_keys(SceneConfig)}
     assert (defaults["source.scale"], defaults["source.holdout"], defaults["output"]) == ("1.0", "", None)
 
 
 def test_reference_of_the_keys_is_up_to_date():
     page = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
-    assert page.read_text() == markdown_of_keys(), "run: python -m modp_ti.config > docs/configuration.md"
+    assert page.read_text() == markdown_of_keys(SceneConfig), "run: python -m modp_ti.config > docs/configuration.md"
