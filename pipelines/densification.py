@@ -95,9 +95,9 @@ def pixel_seeds(
     neighbours: Sequence[Keyframe],
     pixels: NDArray[np.float64],
     estimator: DepthEstimator,
-    max_deviation: float,
+    max_deviation: float | NDArray[np.float64],
 ) -> Seeds:
-    """Seeds at pixels (N, 2) whose depth the estimator knows well enough."""
+    """Seeds at pixels (N, 2) whose depth the estimator knows well enough: to `max_deviation`, one or (N,)."""
     estimate = estimator.estimate(view, neighbours, pixels)
     sure = estimate.deviation < max_deviation
     camera_points = view.camera.unproject(pixels[sure], estimate.depth[sure])

@@ -23,6 +23,9 @@ from pipelines.view_selection import LocalGlobalViews, ViewSelection
 
 __all__ = ["FrameReport", "OnlineMapper"]
 
+# Opacity of the render below which a pixel counts as a hole.
+HOLE = 0.5
+
 
 @dataclass(frozen=True)
 class FrameReport:
@@ -143,13 +146,17 @@ class OnlineMapper:
         if not compensate:
             return
         with self.stopwatch.measure("depth"):
-            error = None
-            if self._frames > self.settings.densify.warm_up:
-                self.optimiser.compare(view, self.keyframes.scene_depth)
-                error = dissimilarity(self.renderer.images.colour_to_numpy(), view.rgba)
+            self.optimiser.compare(view, self.keyframes.scene_depth)
+            images = self.renderer.images
+            warm = self._frames > self.settings.densify.warm_up
+            error = dissimilarity(images.colour_to_numpy(), view.rgba) if warm else None
+            opacity = images.opacity_to_numpy()
             pixels = error_pixels(view, error, self.settings.densify, self.rng)
-            neighbours = [k for k in self.keyframes if k.index != view.index][-self.settings.depth.neighbours :]
-            seeds = pixel_seeds(view, neighbours, pixels, self.depth, self.settings.depth.max_deviation)
+            column, row = np.floor(pixels).astype(int).T
+            depth = self.settings.depth
+            limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
+            neighbours = [k for k in self.keyframes if k.index != view.index][-depth.neighbours :]
+            seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit)
         self._grow(seeds, view)
 
     def _grow(self, seeds, view: Keyframe) -> None:

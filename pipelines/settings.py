@@ -84,6 +84,9 @@ class DepthSettings(StrictModel):
     max_deviation: float = Field(
         0.045, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
     )
+    hole_deviation: float = Field(
+        0.15, gt=0, description="the same where the map shows next to nothing: a wrong depth is better than a hole"
+    )
     checkpoint: Path | None = Field(
         None, description="DepthCov's weights (`scannet.ckpt` or `nyu.ckpt`), a file of the user's own; for depthcov"
     )
