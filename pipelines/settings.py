@@ -60,8 +60,8 @@ class EpipolarSettings(StrictModel):
     """Search along epipolar lines in neighbour keyframes."""
 
     views: int = Field(4, ge=1, description="neighbours that are searched")
-    parallax: float = Field(0.1, gt=0, description="baseline to them that is preferred [the view's median depths]")
-    max_samples: int = Field(96, ge=8, description="samples of inverse depth along a line at most")
+    parallax: float = Field(0.2, gt=0, description="baseline to them that is preferred [the view's median depths]")
+    max_samples: int = Field(128, ge=8, description="samples of inverse depth along a line at most")
     min_score: float = Field(0.8, ge=-1, le=1, description="correlation (ZNCC) that a match must have")
     min_lead: float = Field(0.05, ge=0, le=2, description="by how much it must beat all others along the line")
     pixel_noise: float = Field(0.2, ge=0, description="standard deviation of a sharp match [px]")
