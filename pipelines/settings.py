@@ -131,7 +131,7 @@ class VoxelSettings(StrictModel):
     levels: int = Field(8, ge=1, le=12, description="number of cell sizes (L)")
     resolution: int = Field(512, ge=1, description="coarsest cells a side that the finest level covers (n)")
     coarsest: float = Field(12.5, gt=0, description="coarsest cell (S_init) in view scales of the first keyframe")
-    target: float = Field(1.0, gt=0, description="spacing asked for in a view, in its view scales")
+    target: float = Field(0.75, gt=0, description="spacing asked for in a view, in its view scales")
 
 
 class ViewSettings(StrictModel):
@@ -226,7 +226,7 @@ class RefineSettings(StrictModel):
     views: int = Field(4, ge=1, description="views per step, drawn as the global views are")
     poses: bool = Field(False, description="also refine poses, at a rate that decays as that of positions does")
     position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
-    scale_decay: float = Field(0.1, gt=0, le=1, description="factor of the scale rate at the end of the decay")
+    scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")
 
 
 class OfflineSettings(StrictModel):
