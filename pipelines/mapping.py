@@ -170,19 +170,24 @@ class OnlineMapper:
     # ---- compiling -------------------------------------------------------------------------------------------
 
     def compile(self) -> None:
-        """Compile every kernel on a scene of one Gaussian, so that no frame waits for it. The map must be empty."""
+        """Compile every kernel on two views of four Gaussians, so that no frame waits for it. The map must be empty."""
         camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
+        pixels = np.array([[4.0, 4.0], [12.0, 4.0], [4.0, 12.0], [12.0, 12.0]])
+        points = SparsePoints(camera.unproject(pixels, np.ones(4)), pixels, np.arange(4))
+        image = np.full((16, 16, 3), 0.5, dtype=np.float32)
         with self.stopwatch.measure("compile"):
-            image = np.full((16, 16, 3), 0.5, dtype=np.float32)
-            points = SparsePoints(np.array([[0.0, 0.0, 1.0]]), np.array([[8.0, 8.0]]), np.zeros(1, dtype=np.int64))
             store = KeyframeStore()
-            view = store.append(TrackedFrame(0, 0.0, "compile", image, camera, np.eye(4), points))
+            for i in range(2):
+                T = np.eye(4)
+                T[0, 3] = 0.1 * i
+                view = store.append(TrackedFrame(i, 0.0, "compile", image, camera, T, points))
             if self.voxels is not None:
                 self.voxels.admit(np.zeros((0, 3)), 1.0)
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
             self.optimiser.exposure.begin(view, self.renderer, self.settings.near)
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
+            self.depth.estimate(view, [store[0]], pixels)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()
             self.renderer.view_renders = 0
-            self.gaussians.remove(np.zeros(1, dtype=bool))
+            self.gaussians.remove(np.zeros(len(self.gaussians), dtype=bool))

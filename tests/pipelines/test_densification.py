@@ -123,6 +123,13 @@ def test_pixel_seeds_lie_on_their_rays_at_the_estimated_depth_where_it_is_known(
     np.testing.assert_allclose(seeds.size, 0.05)
 
 
+def test_every_pixel_may_have_a_limit_of_its_own() -> None:
+    pixels = np.array([[10.5, 20.5], [110.5, 100.5], [120.5, 60.5]])
+    seeds = pixel_seeds(view(), [], pixels, Wall(), np.array([0.001, 0.06, 2.0]))
+    local = seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3]
+    np.testing.assert_allclose(CAMERA.project(local), pixels[2:])
+
+
 @pytest.fixture(scope="module")
 def gaussians(taichi_on_the_cpu: None) -> GaussianField:
     return GaussianField(1, max_gaussians=1024)

@@ -45,6 +45,12 @@ def test_frames_that_were_mapped_are_seen_again(mapped: OnlineMapper) -> None:
     assert min(psnr(mapped, i) for i in range(7)) > 24
 
 
+def test_no_hole_is_left_in_the_wall(mapped: OnlineMapper) -> None:
+    for i in range(7):
+        opacity = mapped.renderer.render(CAMERA, mapped.keyframes[i].T_camera_world, 0.01).opacity[4:-4, 4:-4]
+        assert np.mean(opacity < 0.5) < 0.005
+
+
 def test_depth_is_that_of_the_wall(mapped: OnlineMapper) -> None:
     T = pose(3)
     view = mapped.renderer.render(CAMERA, T, 0.01)
