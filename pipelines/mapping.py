@@ -92,7 +92,7 @@ class OnlineMapper:
                 self.optimiser.poses.align(view)
             with self.stopwatch.measure("optimise"):
                 self.optimiser.exposure.begin(view, self.renderer, self.near)
-            level = self._draw_level()
+            level = self._draw_level(view)
             self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
             psnr = self.optimise(self.settings.optimise.steps, level)
         elif len(self.keyframes):
@@ -106,9 +106,9 @@ class OnlineMapper:
         self.prune()
         return psnr
 
-    def _draw_level(self) -> int:
-        """Pyramid level of a new keyframe."""
-        p = np.array(self.settings.levels.probabilities)
+    def _draw_level(self, view: Keyframe) -> int:
+        """Pyramid level of a new keyframe, among those that its image has."""
+        p = np.array(self.settings.levels.probabilities[: len(view.pyramid)])
         return int(self.rng.choice(len(p), p=p / p.sum()))
 
     def optimise(self, steps: int, level: int = 0) -> float | None:

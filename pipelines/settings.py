@@ -156,7 +156,10 @@ class PoseSettings(StrictModel):
 
 
 class LevelSettings(StrictModel):
-    """Image pyramid: the level that a new keyframe is optimised and densified on."""
+    """Image pyramid: the level that a new keyframe is optimised and densified on.
+
+    No level has a shorter side below 128 pixels.
+    """
 
     probabilities: tuple[float, ...] = Field(
         (0.4, 0.3, 0.2, 0.1),

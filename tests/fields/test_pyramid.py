@@ -8,11 +8,11 @@ from fields.keyframes import KeyframeStore
 from fields.pyramid import MIN_SIDE, build_pyramid
 from fields.tracked_frame import SparsePoints, TrackedFrame
 
-CAMERA = PinholeCamera(200.0, 190.0, 130.0, 60.0, 256, 128)
+CAMERA = PinholeCamera(800.0, 760.0, 520.0, 240.0, 1024, 512)
 
 
 def image() -> np.ndarray:
-    rgba = np.random.default_rng(0).integers(0, 256, (128, 256, 4), dtype=np.uint8)
+    rgba = np.random.default_rng(0).integers(0, 256, (512, 1024, 4), dtype=np.uint8)
     rgba[..., 3] = 255
     return rgba
 
@@ -20,8 +20,8 @@ def image() -> np.ndarray:
 def test_a_pixel_is_the_mean_of_those_that_it_covers() -> None:
     rgba = image()
     levels = build_pyramid(rgba, CAMERA, 3)
-    mean = rgba.reshape(64, 2, 128, 2, 4).astype(float).mean(axis=(1, 3))
-    assert [level.rgba.shape for level in levels] == [(128, 256, 4), (64, 128, 4), (32, 64, 4)]
+    mean = rgba.reshape(256, 2, 512, 2, 4).astype(float).mean(axis=(1, 3))
+    assert [level.rgba.shape for level in levels] == [(512, 1024, 4), (256, 512, 4), (128, 256, 4)]
     np.testing.assert_allclose(levels[1].rgba, mean, atol=0.51)
     assert levels[0].rgba is rgba
 
@@ -42,11 +42,11 @@ def test_a_pixel_is_valid_where_all_that_it_covers_are() -> None:
 
 
 def test_odd_sides_keep_the_field_of_view() -> None:
-    camera = PinholeCamera(100.0, 100.0, 50.5, 40.5, 101, 81)
-    half = build_pyramid(np.full((81, 101, 4), 255, dtype=np.uint8), camera, 2)[1].camera
-    assert (half.width, half.height) == (50, 40)
-    assert half.width / half.fx == pytest.approx(101 / 100.0)
-    assert half.height / half.fy == pytest.approx(81 / 100.0)
+    camera = PinholeCamera(400.0, 400.0, 150.5, 130.5, 301, 261)
+    half = build_pyramid(np.full((261, 301, 4), 255, dtype=np.uint8), camera, 2)[1].camera
+    assert (half.width, half.height) == (150, 130)
+    assert half.width / half.fx == pytest.approx(301 / 400.0)
+    assert half.height / half.fy == pytest.approx(261 / 400.0)
 
 
 def test_no_level_is_too_small_for_the_loss() -> None:
@@ -57,11 +57,11 @@ def test_no_level_is_too_small_for_the_loss() -> None:
 
 def test_a_keyframe_at_a_level_is_the_same_view_of_fewer_pixels() -> None:
     points = SparsePoints(np.array([[0.3, -0.2, 2.0]]), CAMERA.project(np.array([[0.3, -0.2, 2.0]])), np.array([7]))
-    view = np.random.default_rng(1).uniform(size=(128, 256, 3)).astype(np.float32)
+    view = np.random.default_rng(1).uniform(size=(512, 1024, 3)).astype(np.float32)
     keyframe = KeyframeStore(levels=4).append(TrackedFrame(0, 0.0, "a", view, CAMERA, np.eye(4), points))
     half = keyframe.at_level(1)
     np.testing.assert_allclose(half.points.pixels, half.camera.project(points.xyz))
-    assert half.rgba.shape == (64, 128, 4)
+    assert half.rgba.shape == (256, 512, 4)
     assert half.pyramid[0].rgba is half.rgba
     assert half.view_scale == pytest.approx(2 * keyframe.view_scale)
-    assert keyframe.at_level(9).rgba.shape == (32, 64, 4)  # the coarsest there is
+    assert keyframe.at_level(9).rgba.shape == (128, 256, 4)  # the coarsest there is
