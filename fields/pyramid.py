@@ -12,8 +12,8 @@ from fields.camera import PinholeCamera
 
 __all__ = ["ImageLevel", "build_pyramid"]
 
-# No level is made whose shorter side would have fewer pixels: with levels down to 33 pixels the maps of desk and fox lose
-# half a decibel (redkitchen, 320x240, loses nothing, and takes twice the time without).
+# No level is made whose shorter side would have fewer pixels: with levels down to 33 pixels the maps of desk and fox
+# lose half a decibel (redkitchen, 320x240, loses nothing, and takes twice the time without).
 MIN_SIDE = 128
 
 
