@@ -11,13 +11,14 @@ import taichi as ti
 
 from fields.backend import refuse_too_many_fields
 from fields.images import PAD, ImageBuffers
+from fields.parallel import HANDED_OUT
 
 __all__ = ["IDENTITY", "Development"]
 
 IDENTITY = np.eye(3, 4)
 IDENTITY.flags.writeable = False
-# Taichi hands out 512 iterations of a parallel loop at a time: one row every 64 makes tasks of eight rows.
-SPREAD = 64
+# A thread takes eight rows at a time.
+SPREAD = HANDED_OUT // 8
 
 
 @ti.data_oriented

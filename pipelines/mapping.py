@@ -148,8 +148,8 @@ class OnlineMapper:
         with self.stopwatch.measure("depth"):
             self.optimiser.compare(view, self.keyframes.scene_depth)
             images = self.renderer.images
-            warm = self._frames > self.settings.densify.warm_up
-            error = dissimilarity(images.colour_to_numpy(), view.rgba) if warm else None
+            warming_up = self._frames <= self.settings.densify.warm_up
+            error = None if warming_up else dissimilarity(images.colour_to_numpy(), view.rgba)
             opacity = images.opacity_to_numpy()
             pixels = error_pixels(view, error, self.settings.densify, self.rng)
             column, row = np.floor(pixels).astype(int).T

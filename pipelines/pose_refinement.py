@@ -74,8 +74,8 @@ class PoseRefinement:
         A tracker's poses and points agree; where they do not, the points, of which there are many, know better. The
         prior holds what they leave open.
         """
+        W = pixel_metric(view)
         for _ in range(self.ITERATIONS):
-            W = pixel_metric(view)
             gradient, H = reprojection(view, W)
             moved = np.linalg.solve(W, log_se3(view.correction))
             u = np.linalg.solve(H + self.PRIOR * np.eye(6), -gradient - self.PRIOR * moved)
