@@ -20,8 +20,8 @@ class Keyframe:
     """One keyframe. Images stay in host memory with 8 bits a channel.
 
     index: of its frame. rgba: (H, W, 4) uint8, the image and 255 where it is valid; camera: of that image. pyramid:
-    the same at halved sizes, itself first. T_tracked: the tracker's
-    T_camera_world; T_camera_world: the refined one. median_depth: of its tracked points [scene units]; view_scale:
+    the same at halved sizes, itself first. T_tracked: the tracker's T_camera_world; T_camera_world: the refined one.
+    median_depth: of its tracked points [scene units]; view_scale:
     median_depth / focal, the width of a pixel out there (Section 3.2.1). error: mean absolute error when the frame was
     optimised last (err(j) of Eq. 2). vignette: as in `TrackedFrame`, at full size. exposure: (3, 4) affine colour
     transform (A, b), image = (A colour + b) vignette; None for an identity that is not estimated.
@@ -49,13 +49,16 @@ class Keyframe:
     def view_scale(self) -> float:
         return self.median_depth / self.camera.focal
 
+    def image(self, level: int) -> ImageLevel:
+        """The image of a pyramid level; the coarsest where there are fewer."""
+        return self.pyramid[min(level, len(self.pyramid) - 1)]
+
     def at_level(self, level: int) -> Keyframe:
-        """This view with the image of a pyramid level (the coarsest where there are fewer), for reading only."""
-        level = min(level, len(self.pyramid) - 1)
-        image = self.pyramid[level]
+        """This view with the image of a pyramid level, for reading only."""
+        image = self.image(level)
         scale = np.array([image.camera.width / self.camera.width, image.camera.height / self.camera.height])
         points = replace(self.points, pixels=self.points.pixels * scale)
-        return replace(self, rgba=image.rgba, camera=image.camera, points=points, pyramid=self.pyramid[level:])
+        return replace(self, rgba=image.rgba, camera=image.camera, points=points, pyramid=(image,))
 
     @property
     def correction(self) -> NDArray[np.float64]:
@@ -95,7 +98,7 @@ class KeyframeStore:
 
     def view(self, frame: TrackedFrame, levels: int = 1) -> Keyframe:
         """`frame` as a keyframe would be, with the pose and exposure that those around it imply, but not kept."""
-        depth = frame.points.xyz @ frame.T_camera_world[2, :3] + frame.T_camera_world[2, 3]
+        depth = frame.points.depths(frame.T_camera_world)
         depth = depth[depth > 0]
         rgba = frame.rgba()
         return Keyframe(

@@ -5,6 +5,7 @@ import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from fields.backend import refuse_too_many_fields
+from fields.parallel import HANDED_OUT
 
 __all__ = ["OccupancyVoxels"]
 
@@ -19,6 +20,8 @@ POINTERS = (64, 16, 8, 2, 2)
 BRICKS = int(np.prod(POINTERS))
 SIDE = BRICK * BRICKS
 MAX_LEVELS = 16
+# Shares of the world that are admitted to at the same time.
+SHARES = 8
 # Cells are clipped to this before they become integers; no level reaches it.
 FARTHEST = 2.0**31 - 1.0
 
@@ -132,23 +135,35 @@ class OccupancyVoxels:
 
     @ti.kernel
     def _admit(self, cells: CELLS, level: LEVELS, out: FLAGS):
-        # In the order of the batch, so on one thread: a point is answered by those before it.
-        ti.loop_config(serialize=True)
-        for i in range(level.shape[0]):
-            cell = ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]])
-            asked = self._reached(cell, level[i])
-            depth = asked
-            while depth < self.levels:
-                word, bit, siblings = self._at(cell, depth)
-                # Atomic only to walk down the tree once for reading and writing.
-                marked = ti.atomic_or(self.words[word], bit)
-                if marked & bit:
-                    break
-                depth += 1
-                # A sibling has marked the parent.
-                if marked & siblings:
-                    break
-            out[i] = ti.cast(depth > asked, ti.u8)
+        # A point is answered by those before it, but only by those in its brick of the coarsest levels.
+        for spread in range(SHARES * HANDED_OUT):
+            if spread % HANDED_OUT == 0:
+                for i in range(level.shape[0]):
+                    cell = ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]])
+                    if self._share(cell) == spread // HANDED_OUT:
+                        out[i] = self._admit_one(cell, level[i])
+
+    @ti.func
+    def _share(self, cell):
+        """Which share a cell belongs to: the same for all in a brick of the coarsest levels."""
+        brick = cell >> ti.static(BRICK_LEVELS * -(-self.levels // BRICK_LEVELS))
+        return (brick[0] + 3 * brick[1] + 5 * brick[2]) & (SHARES - 1)
+
+    @ti.func
+    def _admit_one(self, cell, level):
+        asked = self._reached(cell, level)
+        depth = asked
+        while depth < self.levels:
+            word, bit, siblings = self._at(cell, depth)
+            # Atomic only to walk down the tree once for reading and writing.
+            marked = ti.atomic_or(self.words[word], bit)
+            if marked & bit:
+                break
+            depth += 1
+            # A sibling has marked the parent.
+            if marked & siblings:
+                break
+        return ti.cast(depth > asked, ti.u8)
 
     @ti.func
     def _reached(self, cell, level):

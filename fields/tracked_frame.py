@@ -40,6 +40,10 @@ class SparsePoints:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def depths(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (N,) of the points before a camera at this pose; negative behind it."""
+        return self.xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
+
 
 @dataclass(frozen=True)
 class TrackedFrame:

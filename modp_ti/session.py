@@ -9,6 +9,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from fields.backend import initialise
+from fields.camera import PinholeCamera
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
 from modp_ti.errors import InputError
@@ -62,11 +64,11 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     """
     started = time.perf_counter()
     console = console or Console(quiet=True)
+    line = ProgressLine(console)
     try:
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
-    line = ProgressLine(console)
     tick = time.perf_counter()
     tracker = open_tracker(config, line.prepare)
     frames = iter(tracker)
@@ -78,47 +80,23 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
-    offline = config.mode == "offline"
-    size = (first.camera.width, first.camera.height)
-    mapper: OnlineMapper | OfflineMapper
-    try:
-        if offline:
-            mapper = OfflineMapper(config.offline, *size, config.seed)
-        else:
-            mapper = OnlineMapper(config.mapping, *size, config.seed)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    mapper = _build_mapper(config, first.camera)
     watch = mapper.stopwatch
     watch.seconds["track"] = prepared
     with line.working("compiling kernels (the first time on this machine takes longest)"):
         mapper.compile()
-
-    poses = Poses()
     tick = time.perf_counter()
-    line.start_mapping(frame_count(tracker), "reading" if offline else "mapping")
-    for frame in _chain(first, _timed(frames, watch)):
-        if (frame.camera.width, frame.camera.height) != size:
-            raise InputError(
-                f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
-                f"{first.camera.width}x{first.camera.height}: all images of a scene must have one size"
-            )
-        poses.add(frame)
-        line.frame(None if frame.held_out else mapper.process(frame))
-    if offline:
-        _optimise_offline(mapper, line)
-    else:
-        mapper.finish()
+    line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
+    poses = _map(mapper, chain([first], _timed(frames, watch)), line)
     mapping_seconds = time.perf_counter() - tick
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
-    line.stop()
     if len(mapper.keyframes) == 0:
         raise InputError(
             f"no frame became a keyframe: none has {config.mapping.keyframes.min_points} tracked points; "
             "give a tracker with points or lower mapping.keyframes.min_points"
         )
-
     versions = {config.mode: _version(mapper, poses)}
-    if config.refine.steps and not offline:
+    if config.refine.steps and isinstance(mapper, OnlineMapper):
         line.start_refining(config.refine.steps)
         refine(mapper, config.refine, line.refined)
         line.stop()
@@ -171,6 +149,36 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     return config.output
 
 
+def _build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:
+    """The mapper of the scene's mode, for images of this camera."""
+    try:
+        if config.mode == "offline":
+            return OfflineMapper(config.offline, camera.width, camera.height, config.seed)
+        return OnlineMapper(config.mapping, camera.width, camera.height, config.seed)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def _map(mapper: OnlineMapper | OfflineMapper, frames: Iterable[TrackedFrame], line: ProgressLine) -> Poses:
+    """Take all frames in, and finish the map; their poses."""
+    poses, size = Poses(), None
+    for frame in frames:
+        size = size or (frame.camera.width, frame.camera.height)
+        if (frame.camera.width, frame.camera.height) != size:
+            raise InputError(
+                f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
+                "all images of a scene must have one size"
+            )
+        poses.add(frame)
+        line.frame(None if frame.held_out else mapper.process(frame))
+    if isinstance(mapper, OfflineMapper):
+        _optimise_offline(mapper, line)
+    else:
+        mapper.finish()
+    line.stop()
+    return poses
+
+
 def _version(mapper: OnlineMapper | OfflineMapper, poses: Poses) -> MapVersion:
     """The map as it stands."""
     store = mapper.keyframes
@@ -198,11 +206,6 @@ def _timed(frames: Iterator[TrackedFrame], watch) -> Iterator[TrackedFrame]:
         if frame is None:
             return
         yield frame
-
-
-def _chain(first: TrackedFrame, rest: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
-    yield first
-    yield from rest
 
 
 def _summaries(scores: list[FrameScore], stage: str) -> dict[str, dict]:

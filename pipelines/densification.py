@@ -44,7 +44,7 @@ def _at_pixels(view: Keyframe, pixels: NDArray[np.float64], xyz: NDArray, depth:
 
 def tracked_seeds(view: Keyframe) -> Seeds:
     """Geometry and texture complex regions: the tracked points of the view that lie in its image (P_i)."""
-    depth = view.points.xyz @ view.T_camera_world[2, :3] + view.T_camera_world[2, 3]
+    depth = view.points.depths(view.T_camera_world)
     keep = (depth > 0) & view.camera.contains(view.points.pixels)
     return _at_pixels(view, view.points.pixels[keep], view.points.xyz[keep], depth[keep])
 

@@ -42,7 +42,7 @@ class MapOptimiser:
 
     def compare(self, view: Keyframe, scene_depth: float, level: int = 0) -> LossValues:
         """Render a keyframe, develop it, and evaluate the loss against its image of a pyramid level."""
-        image = view.pyramid[min(level, len(view.pyramid) - 1)]
+        image = view.image(level)
         self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth)
         self.renderer.develop(view.exposure, view.vignette)
         self.renderer.images.set_reference(image.rgba)

@@ -158,7 +158,7 @@ class PoseSettings(StrictModel):
 class LevelSettings(StrictModel):
     """Image pyramid: the level that a new keyframe is optimised and densified on.
 
-    No level has a shorter side below 128 pixels.
+    No level has a shorter side below 96 pixels.
     """
 
     probabilities: tuple[float, ...] = Field(

@@ -63,7 +63,7 @@ def sensor_depth(folder: Path, frame: TrackedFrame, focal: float, offset: NDArra
 
 def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
     """Sensor depth over tracked depth at the frame's points."""
-    z = frame.points.xyz @ frame.T_camera_world[2, :3] + frame.T_camera_world[2, 3]
+    z = frame.points.depths(frame.T_camera_world)
     inside = frame.camera.contains(frame.points.pixels) & (z > 0)
     column, row = np.floor(frame.points.pixels[inside]).astype(int).T
     ratio = depth[row, column] / z[inside]

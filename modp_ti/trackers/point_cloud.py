@@ -105,7 +105,7 @@ def visible_points(
     if len(points) == 0:
         return points
 
-    depth = points.xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
+    depth = points.depths(T_camera_world)
     size = max(camera.width, camera.height) * CELL
     cell = (points.pixels // size).astype(np.int64)
     columns, rows = cell.max(axis=0) + 1

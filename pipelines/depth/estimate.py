@@ -36,6 +36,6 @@ def unknown_depth(count: int) -> DepthEstimate:
 
 def point_depths(view: Keyframe) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixels (N, 2) and depths (N,) of the tracked points that lie before the camera and in the image."""
-    z = view.points.xyz @ view.T_camera_world[2, :3] + view.T_camera_world[2, 3]
+    z = view.points.depths(view.T_camera_world)
     usable = (z > 0) & view.camera.contains(view.points.pixels)
     return view.points.pixels[usable], z[usable]
