@@ -1,4 +1,4 @@
-"""Starting Taichi: the one place where the compute device is chosen."""
+"""Starting Taichi: the one place where the compute device is chosen, and with it the form of storage and kernels."""
 
 from __future__ import annotations
 
@@ -9,33 +9,44 @@ import io
 import taichi as ti
 import torch
 
-__all__ = ["initialise", "refuse_too_many_fields"]
+__all__ = ["growing", "initialise", "on_gpu", "refuse_too_many_fields", "torch_device"]
 
 # Arrays of Taichi's runtime have this many entries, and it does not look.
 MAX_SNODES = 1024
+# Taichi's own pool on a CUDA device, for the nodes of sparse fields: the occupancy voxels alone [GB]. Dense fields and
+# PyTorch take what they need of the rest.
+SPARSE_POOL = 1.0
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
-    """Start Taichi on `device` and return the backend that was taken ("cpu" or "cuda").
+    """Start Taichi on `device` and return the backend that was taken ("cpu", "cuda" or "vulkan").
 
     device: "cpu", "cuda" (fails where there is none) or "auto" (CUDA where it works). Kernels are kept in
-    Taichi's offline cache, so that only the first process on a machine compiles them.
+    Taichi's offline cache, so that only the first process on a machine compiles them. "vulkan" is for the tests, which
+    run the GPU's kernels on a software driver where there is no CUDA; it has no sparse fields, hence no voxels.
 
     PyTorch is held to one thread: its problems here are small, and its waiting threads take the cores from Taichi's
     (a depth estimate took 1.9 s instead of 0.05 s).
 
-    Raises RuntimeError where "cuda" was asked for and does not start.
+    Raises RuntimeError where "cuda" or "vulkan" was asked for and does not start.
     """
     options = {"offline_cache": True, "log_level": ti.ERROR, "random_seed": seed, "default_fp": ti.f32}
     torch.set_num_threads(1)
     if threads is not None:
         options["cpu_max_num_threads"] = threads
-    if device in ("cuda", "auto") and _has_cuda_driver():
-        _start(ti.cuda, options)
+    if device in ("cuda", "auto") and _has_cuda_driver() and torch.cuda.is_available():
+        _start(ti.cuda, options | {"device_memory_GB": SPARSE_POOL})
         if ti.lang.impl.current_cfg().arch == ti.cuda:
             return "cuda"
     if device == "cuda":
-        raise RuntimeError("device: cuda was asked for, but no CUDA device starts here; use device: cpu or auto")
+        # PyTorch sorts on the device, in the same memory: a build without CUDA cannot.
+        missing = "no CUDA device starts here" if torch.version.cuda else "this PyTorch is built without CUDA"
+        raise RuntimeError(f"device: cuda was asked for, but {missing}; use device: cpu or auto")
+    if device == "vulkan":
+        _start(ti.vulkan, options)
+        if ti.lang.impl.current_cfg().arch == ti.vulkan:
+            return "vulkan"
+        raise RuntimeError("no Vulkan driver starts here")
     _start(ti.cpu, options)
     return "cpu"
 
@@ -52,6 +63,25 @@ def _has_cuda_driver() -> bool:
 def _start(arch: object, options: dict) -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=arch, **options)
+
+
+def on_gpu() -> bool:
+    """Whether Taichi runs on a GPU, or on what stands in for one: dense storage, and the kernels of `pipelines/gpu`."""
+    return ti.lang.impl.current_cfg().arch in (ti.cuda, ti.vulkan)
+
+
+def torch_device() -> torch.device:
+    """Where tensors must lie to be read and written by kernels without a copy."""
+    return torch.device("cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu")
+
+
+def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:
+    """A node of `blocks` blocks of entries, for dense children.
+
+    Sparse on the CPU, where memory follows what is written. Dense on a GPU: its allocator would run inside the kernels
+    of a step, and Vulkan has none.
+    """
+    return builder.dense(ti.i, blocks) if on_gpu() else builder.pointer(ti.i, blocks)
 
 
 def refuse_too_many_fields(last_placed: object) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from fields.backend import refuse_too_many_fields
+from fields.backend import growing, refuse_too_many_fields
 
 __all__ = ["SH_C0", "GaussianField"]
 
@@ -18,7 +18,8 @@ class GaussianField:
     """Anisotropic Gaussians in world space, with their gradients and Adam moments beside the values.
 
     SNode tree: pointer(blocks) over dense(1024), so that memory follows the number of Gaussians and no kernel is
-    compiled anew when it grows. Gaussians are `0 .. count - 1`, always contiguous.
+    compiled anew when it grows; dense on a GPU, which holds `max_gaussians` from the start. Gaussians are
+    `0 .. count - 1`, always contiguous.
 
     position (3), log_scale (3), quaternion (4; w, x, y, z, any length but zero), opacity_logit (1),
     sh (K, 3) with K = (sh_degree + 1)^2 coefficients: the layout of 3DGS files. `steps` counts the updates that
@@ -46,7 +47,7 @@ class GaussianField:
         self.touched = ti.field(ti.i32)
 
         builder = ti.FieldsBuilder()
-        blocks = builder.pointer(ti.i, self.capacity // BLOCK)
+        blocks = growing(builder, self.capacity // BLOCK)
         # One dense child a use: culling reads positions without dragging moments through the cache.
         geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
         blocks.dense(ti.i, BLOCK).place(*geometry)

@@ -3,6 +3,8 @@
 import numpy as np
 import taichi as ti
 
+from fields.backend import on_gpu
+from fields.device_images import DeviceImages
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 
 __all__ = ["PAD", "STRIPS", "ImageBuffers"]
@@ -21,9 +23,13 @@ class ImageBuffers:
     at `c * plane + (y + PAD) * stride + x + PAD`. Tile buffers hold the 256 pixels of a tile consecutively, so
     that a loop over them is one vector loop. Capacities are powers of two, so that most image sizes share the
     kernels of the offline cache.
+
+    cache_gb: device memory for copies of reference images, on a GPU.
     """
 
-    def __init__(self, builder: ti.FieldsBuilder, max_width: int, max_height: int, real=ti.f32) -> None:
+    def __init__(
+        self, builder: ti.FieldsBuilder, max_width: int, max_height: int, real=ti.f32, cache_gb: float = 2.0
+    ) -> None:
         self.real = real
         self.dtype = np.float64 if real == ti.f64 else np.float32
         self.max_width, self.max_height = max_width, max_height
@@ -34,6 +40,7 @@ class ImageBuffers:
         self.stride = (1 << (max_width - 1).bit_length()) + 2 * PAD
         self.plane = self.stride * (-(-max_height // 256) * 256 + 2 * PAD)
         self.width = self.height = 0
+        self._references = DeviceImages(cache_gb * 2**30) if on_gpu() else None
 
         def scalar():
             return ti.field(real)
@@ -100,7 +107,10 @@ class ImageBuffers:
 
     def set_reference(self, image: np.ndarray) -> None:
         """Take a reference image (H, W, 4) uint8: RGB and 255 where the pixel is valid, 0 where it is masked."""
-        self._set_reference(self.width, self.height, image)
+        if self._references is None:
+            self._set_reference(self.width, self.height, image)
+        else:
+            self._set_reference_pixels(self.width, self.height, self._references.of(image))
 
     def set_gradients(self, colour: np.ndarray, depth: np.ndarray, opacity: np.ndarray) -> None:
         """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W)."""
@@ -145,6 +155,16 @@ class ImageBuffers:
                 for c in ti.static(range(3)):
                     self.reference[c * self.plane + row + x] = ti.cast(image[y, x, c], self.real) / 255.0
                 self.valid[row + x] = ti.cast(image[y, x, 3], self.real) / 255.0
+
+    @ti.kernel
+    def _set_reference_pixels(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):
+        """The same with a thread a pixel, for a GPU."""
+        for i in range(width * height):
+            x, y = i % width, i // width
+            at = (y + PAD) * self.stride + PAD + x
+            for c in ti.static(range(3)):
+                self.reference[c * self.plane + at] = ti.cast(image[y, x, c], self.real) / 255.0
+            self.valid[at] = ti.cast(image[y, x, 3], self.real) / 255.0
 
     @ti.kernel
     def _set_gradients(

@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from fields.backend import refuse_too_many_fields
+from fields.backend import on_gpu, refuse_too_many_fields
 from fields.parallel import HANDED_OUT
 
 __all__ = ["OccupancyVoxels"]
@@ -104,9 +104,44 @@ class OccupancyVoxels:
         The admitted ones are marked. The order of the batch decides, so that every run decides alike.
         """
         cells, level = self._cells(position, size)
+        if on_gpu():
+            return self._admit_together(cells, level)
         out = np.empty(len(cells), dtype=np.uint8)
         self._admit(cells, level, out)
         return out.astype(bool)
+
+    def _admit_together(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """`admit` on a GPU, whose threads are many and slow one by one: a level at a time, each in parallel.
+
+        Points of one level are answered by those before them only in their own cell, so that the first of each cell
+        stands for it. Of different levels, the batch is cut where the level changes.
+        """
+        admitted = np.zeros(len(cells), dtype=bool)
+        cuts = np.flatnonzero(np.diff(level)) + 1
+        for run in np.split(np.arange(len(cells)), cuts):
+            if len(run) == 0:
+                continue
+            # Where the asked level does not reach, a coarser one answers: its cell is what a point stands for.
+            depth = self._depth_reached(cells[run], level[run])
+            place = np.column_stack([cells[run] >> depth[:, None], depth])
+            first = run[np.sort(np.unique(place, axis=0, return_index=True)[1])]
+            occupied = np.empty(len(first), dtype=np.uint8)
+            self._query(cells[first], level[first], occupied)
+            free = first[occupied == 0]
+            if len(free):
+                self._mark(cells[free], level[free])
+            admitted[free] = True
+        return admitted
+
+    def _depth_reached(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.int32]:
+        """`_reached` on the host: depth (N,), in levels above the finest, of the first level that reaches each cell."""
+        depth = self.levels - 1 - level
+        reach = np.maximum(cells, -1 - cells).max(axis=1)
+        for _ in range(-(-self.levels // BRICK_LEVELS)):
+            stack = depth & -BRICK_LEVELS
+            beyond = (depth < self.levels) & ((reach >> stack) >= SIDE // 2)
+            depth = np.where(beyond, stack + BRICK_LEVELS, depth)
+        return depth
 
     def _cells(self, position: ArrayLike, size: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Cells (N, 3) of the finest level, and the level (N,) that is asked for.
@@ -142,6 +177,11 @@ class OccupancyVoxels:
                     cell = ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]])
                     if self._share(cell) == spread // HANDED_OUT:
                         out[i] = self._admit_one(cell, level[i])
+
+    @ti.kernel
+    def _mark(self, cells: CELLS, level: LEVELS):
+        for i in range(level.shape[0]):
+            self._admit_one(ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]]), level[i])
 
     @ti.func
     def _share(self, cell):

@@ -2,6 +2,8 @@
 
 import taichi as ti
 
+from fields.backend import growing
+
 __all__ = ["ProjectedGaussians"]
 
 BLOCK = 1024
@@ -15,12 +17,16 @@ class ProjectedGaussians:
     (xx, xy, yy) [1/px^2]. opacity: after the anti-aliasing compensation. colour (3), depth: z in the camera frame.
     tangent (6): a copy per slot of the camera tangent xi = 0, so that its gradient is gathered without contention
     and in a fixed order. first_pair: index of the slot's first tile pair.
+
+    seen: how many slots there are, where kernels read it. count: the same as far as the host knows it: on a GPU, where
+    nothing is read back, an upper bound.
     """
 
     def __init__(self, builder: ti.FieldsBuilder, capacity: int, real=ti.f32) -> None:
         self.real = real
         self.capacity = -(-capacity // BLOCK) * BLOCK
         self.count = 0
+        self.seen = ti.field(ti.i32)
         self.gaussian = ti.field(ti.i32)
         self.first_pair = ti.field(ti.i32)
         self.mean = ti.Vector.field(2, real, needs_grad=True)
@@ -29,7 +35,8 @@ class ProjectedGaussians:
         self.colour = ti.Vector.field(3, real, needs_grad=True)
         self.depth = ti.field(real, needs_grad=True)
         self.tangent = ti.Vector.field(6, real, needs_grad=True)
-        blocks = builder.pointer(ti.i, self.capacity // BLOCK)
+        builder.place(self.seen)
+        blocks = growing(builder, self.capacity // BLOCK)
         composited = (self.mean, self.conic, self.opacity, self.colour, self.depth)
         blocks.dense(ti.i, BLOCK).place(*composited)
         blocks.dense(ti.i, BLOCK).place(*(f.grad for f in composited))

@@ -40,7 +40,7 @@ class GradientStatistics:
     def observe(self, projected: ProjectedGaussians, view: ViewField) -> None:
         """Take in the view whose gradients are in `projected`: after compositing's backward, before projection's."""
         if projected.count:
-            self._observe(projected.count, projected.gaussian, projected.mean.grad, 0.5 * view.width, 0.5 * view.height)
+            self._observe(projected.seen, projected.gaussian, projected.mean.grad, 0.5 * view.width, 0.5 * view.height)
 
     def mean(self, count: int) -> NDArray[np.float64]:
         """Mean norm of the first `count` Gaussians (count,); 0 where no view saw one."""
@@ -54,9 +54,14 @@ class GradientStatistics:
 
     @ti.kernel
     def _observe(
-        self, count: ti.i32, gaussian: ti.template(), gradient: ti.template(), half_width: ti.f32, half_height: ti.f32
+        self,
+        seen: ti.template(),
+        gaussian: ti.template(),
+        gradient: ti.template(),
+        half_width: ti.f32,
+        half_height: ti.f32,
     ):
-        for s in range(count):
+        for s in range(seen[None]):
             i = gaussian[s]
             x, y = gradient[s][0] * half_width, gradient[s][1] * half_height
             # A Gaussian has one slot a view: no other thread writes here.

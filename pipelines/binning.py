@@ -62,8 +62,8 @@ class Binning:
         self.pairs = pairs
         self._total = np.zeros(1, dtype=np.int64)
 
-    def forward(self) -> int:
-        """Bin the projected Gaussians of the current view; return the number of pairs."""
+    def forward(self, exact: bool = True) -> int:
+        """Bin the projected Gaussians of the current view; return the number of pairs. Always exact, on the CPU."""
         tiles_x = -(-self.view.width // TILE_WIDTH)
         tiles_y = -(-self.view.height // TILE_HEIGHT)
         slots = self.projected.count

@@ -8,9 +8,11 @@ loss's gradient g by the photograph and h = vignette * g, the gradients are
 import cv2
 import numpy as np
 import taichi as ti
+import torch
 
 from fields.backend import refuse_too_many_fields
 from fields.images import PAD, ImageBuffers
+from fields.late import Late
 from fields.parallel import HANDED_OUT
 
 __all__ = ["IDENTITY", "Development"]
@@ -49,17 +51,27 @@ class Development:
         self._make_buffers()
         self._load(vignette)
         self._exposure = np.ascontiguousarray(IDENTITY if exposure is None else exposure, dtype=np.float64)
-        self._forward(self.images.width, self.images.height, self._exposure)
+        self._develop()
 
     def backward(self) -> None:
         """From the gradient by the developed picture to that by the render, which comes back into `images.colour`."""
         if self._active:
-            self._backward(self.images.width, self.images.height, self._exposure, self._sums)
+            self._undevelop()
 
     def exposure_gradient(self) -> np.ndarray:
         """d loss / d (A, b) (3, 4) of the picture that was developed last, after `backward`."""
         # Row by row in a fixed order, so that two runs agree bit for bit.
         return self._sums[: self.images.height].sum(axis=0).reshape(3, 4)
+
+    def late_exposure_gradient(self) -> Late:
+        """The same; on the CPU there is nothing to wait for."""
+        return Late(torch.from_numpy(self.exposure_gradient()))
+
+    def _develop(self) -> None:
+        self._forward(self.images.width, self.images.height, self._exposure)
+
+    def _undevelop(self) -> None:
+        self._backward(self.images.width, self.images.height, self._exposure, self._sums)
 
     def _make_buffers(self) -> None:
         if self._made:

@@ -45,7 +45,12 @@ class LossValues:
 
 @ti.data_oriented
 class PhotometricLoss:
-    """Compares `images.colour` with `images.reference` where `images.valid`, and fills `images.colour_grad`."""
+    """Compares `images.colour` with `images.reference` where `images.valid`, and fills `images.colour_grad`.
+
+    lag: evaluations by which it is worth to read values late; here they are there at once.
+    """
+
+    lag = 0
 
     def __init__(self, images: ImageBuffers) -> None:
         self.images = images
@@ -64,6 +69,9 @@ class PhotometricLoss:
         l1, ssim, square, count = (float(v) for v in self._sums.sum(axis=0))
         count = max(count, 1.0)
         return LossValues(l1 / count, ssim / count, square / count)
+
+    def send(self) -> None:
+        """Let the values of the evaluations so far come to the host while it goes on."""
 
     def backward(self, ssim_weight: float, scale: float = 1.0) -> None:
         """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM)."""

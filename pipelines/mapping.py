@@ -58,7 +58,7 @@ class OnlineMapper:
         self.rng = np.random.default_rng(seed)
         self.stopwatch = Stopwatch()
         self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
-        self.renderer = Renderer(self.gaussians, max_width, max_height)
+        self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
         self.loss = self.optimiser.loss
         self.keyframes = KeyframeStore(len(settings.levels.probabilities))
@@ -118,21 +118,22 @@ class OnlineMapper:
         """
         if len(self.keyframes) == 0 or len(self.gaussians) == 0:
             return None
-        psnr, poses = None, self.settings.poses
+        poses = self.settings.poses
         with self.stopwatch.measure("select"):
             self.views.begin(self.keyframes)
         for step in range(steps):
             with self.stopwatch.measure("select"):
                 views = self.views.select(self.keyframes)
             with self.stopwatch.measure("optimise"):
-                psnr = self.optimiser.step(
+                self.optimiser.step(
                     self.keyframes,
                     views,
                     self.optimiser.rates(self.keyframes.scene_depth),
                     pose_rate=poses.learning_rate if poses.enabled and step < poses.steps else 0.0,
                     level=level,
                 )
-        return psnr
+        with self.stopwatch.measure("optimise"):
+            return self.optimiser.settle() if steps > 0 else None
 
     def prune(self) -> int:
         """Remove Gaussians that have become transparent; return how many."""
@@ -186,6 +187,7 @@ class OnlineMapper:
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
             self.optimiser.exposure.begin(view, self.renderer, self.settings.near)
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
+            self.optimiser.settle()
             self.depth.estimate(view, [store[0]], pixels)
             self.renderer.camera_gradient()
             self.renderer.images.colour_to_numpy()

@@ -14,7 +14,8 @@ from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from pipelines.adam import Adam, LearningRates
 from pipelines.adaptive_density import AdaptiveDensity
-from pipelines.losses import PhotometricLoss
+from pipelines.gpu.losses import photometric_loss
+from pipelines.losses import LossValues
 from pipelines.mapping import FrameReport
 from pipelines.point_initialisation import initialise, union_of_points
 from pipelines.refinement import decay
@@ -106,8 +107,9 @@ class OfflineMapper:
         self.rng = np.random.default_rng(seed)
         self.stopwatch = Stopwatch()
         self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
-        self.renderer = Renderer(self.gaussians, max_width, max_height)
-        self.loss = PhotometricLoss(self.renderer.images)
+        self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
+        self.loss = photometric_loss(self.renderer.images)
+        self._last: LossValues | None = None
         self.adam = Adam(self.gaussians)
         self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
         self.keyframes = KeyframeStore()
@@ -161,16 +163,19 @@ class OfflineMapper:
         )
 
     def _step(self, view: Keyframe, rates: LearningRates, sh_degree: int) -> float:
-        """One Adam step on one view; its PSNR before the step."""
+        """One Adam step on one view; its PSNR before the step, on a GPU that of the view before."""
         renderer = self.renderer
-        renderer.forward(view.camera, view.T_camera_world, self.near)
+        renderer.forward(view.camera, view.T_camera_world, self.near, exact=False)
         renderer.develop(None, view.vignette)
         renderer.images.set_reference(view.rgba)
         values = self.loss.forward()
+        self.loss.send()
         self.loss.backward(self.settings.ssim_weight)
         renderer.backward(observe=self.density.statistics.observe)
         self.adam.step(rates, sh_degree=sh_degree)
-        return values.psnr
+        known = values if self.loss.lag == 0 or self._last is None else self._last
+        self._last = values
+        return known.psnr
 
     def compile(self) -> None:
         """Compile every kernel on a scene of four Gaussians, so that timing starts warm. The map must be empty."""
@@ -188,3 +193,4 @@ class OfflineMapper:
             self.renderer.images.colour_to_numpy()
             self.gaussians.remove(np.zeros(4, dtype=bool))
             self.renderer.view_renders = 0
+            self._last = None

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from fields.gaussians import GaussianField
 from fields.keyframes import Keyframe, KeyframeStore
+from fields.late import Late
 from pipelines.adam import Adam, LearningRates
 from pipelines.exposure import ExposureRefinement
-from pipelines.losses import AspectPenalty, LossValues, PhotometricLoss
+from pipelines.gpu.losses import photometric_loss
+from pipelines.losses import AspectPenalty, LossValues
 from pipelines.pose_refinement import PoseRefinement
 from pipelines.rendering import Renderer
 from pipelines.settings import MappingSettings
@@ -23,11 +29,16 @@ class MapOptimiser:
         self.gaussians = gaussians
         self.renderer = renderer
         self.settings = settings
-        self.loss = PhotometricLoss(renderer.images)
+        self.loss = photometric_loss(renderer.images)
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
         self.poses = PoseRefinement()
         self.exposure = ExposureRefinement(settings.exposure)
+        # What steps have found that has not been taken in: values of their views, and by index of the keyframe how it
+        # is to move. On the CPU empty between steps.
+        self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
+        self._moves: dict[int, list[Callable[[], None]]] = {}
+        self._psnr = float("nan")
 
     def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
         """The settings' learning rates, positions in scene units."""
@@ -40,10 +51,13 @@ class MapOptimiser:
             colour=o.colour_rate,
         )
 
-    def compare(self, view: Keyframe, scene_depth: float, level: int = 0) -> LossValues:
-        """Render a keyframe, develop it, and evaluate the loss against its image of a pyramid level."""
+    def compare(self, view: Keyframe, scene_depth: float, level: int = 0, exact: bool = True) -> LossValues:
+        """Render a keyframe, develop it, and evaluate the loss against its image of a pyramid level.
+
+        exact: see `Renderer.forward`.
+        """
         image = view.image(level)
-        self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth)
+        self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth, exact)
         self.renderer.develop(view.exposure, view.vignette)
         self.renderer.images.set_reference(image.rgba)
         return self.loss.forward()
@@ -54,37 +68,70 @@ class MapOptimiser:
         """Adam steps on the mean loss of the views (indices into `store`), in batches; return their mean PSNR.
 
         The keyframes' errors are brought up to date, and their poses but the first are stepped at `pose_rate` [px];
-        so are their exposures where they are estimated.
+        so are their exposures where they are estimated. On a GPU, which is not waited for, errors and PSNR are those of
+        the step before (NaN at first), and a keyframe moves before it is rendered next; `settle` brings all up to date.
         """
         size = self.settings.optimise.batch
-        total = 0.0
+        seen: list[tuple[Keyframe, LossValues]] = []
         for first in range(0, len(views), size):
-            batch = views[first : first + size]
-            total += len(batch) * self._step(store, batch, rates, pose_rate, level)
-        return total / len(views)
+            seen += self._step(store, views[first : first + size], rates, pose_rate, level)
+        self.loss.send()
+        self._unread.append(seen)
+        while len(self._unread) > self.loss.lag:
+            self._read(self._unread.popleft())
+        return self._psnr
+
+    def settle(self) -> float:
+        """Take in all that the steps so far have found; return the mean PSNR of the last one's views."""
+        while self._unread:
+            self._read(self._unread.popleft())
+        self._move()
+        return self._psnr
+
+    def _read(self, seen: list[tuple[Keyframe, LossValues]]) -> None:
+        """Take in the values of a step's views."""
+        for view, values in seen:
+            view.error = values.l1
+        self._psnr = float(np.mean([values.psnr for _, values in seen]))
+
+    def _move(self, view: Keyframe | None = None) -> None:
+        """Step pose and exposure of a keyframe by the gradients of the last batch that it was in; None for all."""
+        for key in list(self._moves) if view is None else [view.index]:
+            for move in self._moves.pop(key, ()):
+                move()
 
     def _step(
         self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int
-    ) -> float:
+    ) -> list[tuple[Keyframe, LossValues]]:
         o = self.settings.optimise
-        psnr = 0.0
-        pose_gradients: dict[int, np.ndarray] = {}
-        exposure_gradients: dict[int, np.ndarray] = {}
+        seen: list[tuple[Keyframe, LossValues]] = []
+        pose_gradients: dict[int, list[Late]] = {}
+        exposure_gradients: dict[int, list[Late]] = {}
         for j in views:
             view = store[j]
-            values = self.compare(view, store.scene_depth, level)
+            self._move(view)
+            values = self.compare(view, store.scene_depth, level, exact=False)
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
             self.renderer.backward()
-            view.error = values.l1
-            psnr += values.psnr / len(views)
+            seen.append((view, values))
             if pose_rate > 0 and j > 0:
-                pose_gradients[j] = pose_gradients.get(j, 0.0) + self.renderer.camera_gradient()
+                pose_gradients.setdefault(j, []).append(self.renderer.late_camera_gradient())
             if view.exposure is not None and j > 0:
-                exposure_gradients[j] = exposure_gradients.get(j, 0.0) + self.renderer.exposure_gradient()
+                exposure_gradients.setdefault(j, []).append(self.renderer.late_exposure_gradient())
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         self.adam.step(rates, len(views))
-        for j, gradient in pose_gradients.items():
-            self.poses.step(store[j], gradient, pose_rate)
-        for j, gradient in exposure_gradients.items():
-            self.exposure.step(store[j], gradient, views.count(j) / len(views))
-        return psnr
+        for j, gradients in pose_gradients.items():
+            move = partial(self._move_pose, store[j], gradients, pose_rate)
+            self._moves.setdefault(store[j].index, []).append(move)
+        for j, gradients in exposure_gradients.items():
+            move = partial(self._move_exposure, store[j], gradients, views.count(j) / len(views))
+            self._moves.setdefault(store[j].index, []).append(move)
+        if self.loss.lag == 0:
+            self._move()
+        return seen
+
+    def _move_pose(self, view: Keyframe, gradients: list[Late], rate: float) -> None:
+        self.poses.step(view, sum(g.numpy().astype(np.float64) for g in gradients), rate)
+
+    def _move_exposure(self, view: Keyframe, gradients: list[Late], weight: float) -> None:
+        self.exposure.step(view, sum(g.numpy().astype(np.float64) for g in gradients), weight)

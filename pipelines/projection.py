@@ -6,8 +6,10 @@ tangent included, comes from Taichi's automatic differentiation.
 
 import numpy as np
 import taichi as ti
+import torch
 
 from fields.gaussians import SH_C0, GaussianField
+from fields.late import Late
 from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.se3 import ti_rotation_from_quaternion
@@ -45,17 +47,17 @@ class Projection:
         self.projected.count = count = self._visible_in_depth_order()
         if count:
             self._assign_slots(count, self._keys)
-            self.project(count)
-            self.shade(count)
+            self.project()
+            self.shade()
         return count
 
     def backward(self) -> None:
         """From the gradients in `projected` to those of the Gaussians and of the slots' camera tangents."""
         count = self.projected.count
         if count:
-            self._clear_tangent_gradients(count)
-            self.shade.grad(count)
-            self.project.grad(count)
+            self._clear_tangent_gradients()
+            self.shade.grad()
+            self.project.grad()
 
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order."""
@@ -65,6 +67,10 @@ class Projection:
         if count:
             self._sum_tangents(count, partial)
         return partial.sum(axis=0)
+
+    def late_camera_gradient(self) -> Late:
+        """The same; on the CPU there is nothing to wait for."""
+        return Late(torch.from_numpy(self.camera_gradient()))
 
     # ---- which, and in which order ---------------------------------------------------------------------------
 
@@ -96,28 +102,45 @@ class Projection:
 
     @ti.func
     def _cull_chunk(self, chunk, n, depths: ti.template(), counts: ti.template()):
-        rotation, translation = self.view.rotation[None], self.view.translation[None]
-        focal, centre, limits = self.view.focal[None], self.view.centre[None], self.view.limits[None]
-        size = self.view.size[None]
-        # The largest stretch of the linearised projection: |rows of J| <= f / z * sqrt(1 + limit^2).
-        bound = ti.max(ti.max(-limits[0], limits[1]), ti.max(-limits[2], limits[3]))
-        stretch = ti.max(focal[0], focal[1]) * ti.sqrt(1.0 + bound * bound)
+        camera, stretch = self._camera()
         seen = 0
         for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
-            p = rotation @ self.gaussians.position[i] + translation
-            visible = 0
-            if p.z > self.view.near[None]:
-                opacity = 1.0 / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
-                if opacity > ALPHA_MIN:
-                    sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch / p.z
-                    radius = ti.sqrt(2.0 * ti.log(opacity / ALPHA_MIN) * (sigma * sigma + BLUR))
-                    x = focal[0] * p.x / p.z + centre[0]
-                    y = focal[1] * p.y / p.z + centre[1]
-                    if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
-                        visible = 1
-            depths[i] = ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
-            seen += visible
+            depth = self._seen_at(i, camera, stretch)
+            depths[i] = depth
+            seen += ti.cast(depth > 0.0, ti.i32)
         counts[chunk] = seen
+
+    @ti.func
+    def _camera(self):
+        """The view's T_camera_world (3, 4), and the largest stretch of its linearised projection."""
+        rotation, translation = self.view.rotation[None], self.view.translation[None]
+        focal, limits = self.view.focal[None], self.view.limits[None]
+        camera = ti.Matrix.zero(self.projected.real, 3, 4)
+        for r in ti.static(range(3)):
+            for c in ti.static(range(3)):
+                camera[r, c] = rotation[r, c]
+            camera[r, 3] = translation[r]
+        # |rows of J| <= f / z * sqrt(1 + limit^2).
+        bound = ti.max(ti.max(-limits[0], limits[1]), ti.max(-limits[2], limits[3]))
+        return camera, ti.max(focal[0], focal[1]) * ti.sqrt(1.0 + bound * bound)
+
+    @ti.func
+    def _seen_at(self, i, camera, stretch):
+        """Depth (float32) of Gaussian i where the view may see it, else 0. camera, stretch: from `_camera`."""
+        focal, centre, size = self.view.focal[None], self.view.centre[None], self.view.size[None]
+        position = self.gaussians.position[i]
+        p = camera @ ti.Vector([position[0], position[1], position[2], ti.cast(1.0, self.projected.real)])
+        visible = 0
+        if p.z > self.view.near[None]:
+            opacity = 1.0 / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
+            if opacity > ALPHA_MIN:
+                sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch / p.z
+                radius = ti.sqrt(2.0 * ti.log(opacity / ALPHA_MIN) * (sigma * sigma + BLUR))
+                x = focal[0] * p.x / p.z + centre[0]
+                y = focal[1] * p.y / p.z + centre[1]
+                if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
+                    visible = 1
+        return ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
 
     @ti.kernel
     def _compact(self, n: ti.i32, depths: ti.types.ndarray(), first: ti.types.ndarray(), keys: ti.types.ndarray()):
@@ -137,6 +160,7 @@ class Projection:
 
     @ti.kernel
     def _assign_slots(self, count: ti.i32, keys: ti.types.ndarray()):
+        self.projected.seen[None] = count
         for s in range(count):
             self.projected.gaussian[s] = ti.cast(keys[s] & ti.u64(0xFFFFFFFF), ti.i32)
             self.projected.tangent[s].fill(0.0)
@@ -144,9 +168,9 @@ class Projection:
     # ---- the differentiable part -----------------------------------------------------------------------------
 
     @ti.kernel
-    def project(self, count: ti.i32):
+    def project(self):
         """Ellipse, depth and compensated opacity of every slot."""
-        for s in range(count):
+        for s in range(self.projected.seen[None]):
             i = self.projected.gaussian[s]
             xi = self.projected.tangent[s]
             rho, omega = ti.Vector([xi[0], xi[1], xi[2]]), ti.Vector([xi[3], xi[4], xi[5]])
@@ -182,9 +206,9 @@ class Projection:
             self.projected.opacity[s] = compensation / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
 
     @ti.kernel
-    def shade(self, count: ti.i32):
+    def shade(self):
         """Colour of every slot from its spherical harmonics and the direction it is seen in."""
-        for s in range(count):
+        for s in range(self.projected.seen[None]):
             i = self.projected.gaussian[s]
             if ti.static(self.gaussians.sh_degree == 0):
                 self.projected.colour[s] = ti.max(0.5 + SH_C0 * self.gaussians.sh[i, 0], 0.0)
@@ -198,8 +222,8 @@ class Projection:
                 self.projected.colour[s] = ti.max(0.5 + colour, 0.0)
 
     @ti.kernel
-    def _clear_tangent_gradients(self, count: ti.i32):
-        for s in range(count):
+    def _clear_tangent_gradients(self):
+        for s in range(self.projected.seen[None]):
             self.projected.tangent.grad[s].fill(0.0)
             self.gaussians.touched[self.projected.gaussian[s]] = 1
 

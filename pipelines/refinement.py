@@ -40,4 +40,6 @@ def refine(
             psnr = mapper.optimiser.step(store, batch, rates, pose_rate * slower)
         if progress is not None:
             progress(step + 1, psnr)
+    with mapper.stopwatch.measure("refine"):
+        mapper.optimiser.settle()
     mapper.prune()

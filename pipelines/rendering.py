@@ -6,19 +6,29 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from fields.backend import refuse_too_many_fields
+from fields.backend import on_gpu, refuse_too_many_fields
 from fields.camera import PinholeCamera
+from fields.device_pairs import DevicePairs
 from fields.gaussians import GaussianField
 from fields.images import ImageBuffers
+from fields.late import Late
 from fields.projected import ProjectedGaussians
 from fields.tiles import TilePairs
 from fields.view import ViewField
 from pipelines.binning import CHUNKS, Binning
 from pipelines.compositing import Compositing
 from pipelines.development import Development
+from pipelines.gpu.binning import DeviceBinning
+from pipelines.gpu.compositing import DeviceCompositing
+from pipelines.gpu.development import DeviceDevelopment
+from pipelines.gpu.projection import DeviceProjection
 from pipelines.projection import Projection
 
 __all__ = ["RenderedView", "Renderer"]
+
+
+STAGES = (Projection, Binning, Compositing, Development)
+DEVICE_STAGES = (DeviceProjection, DeviceBinning, DeviceCompositing, DeviceDevelopment)
 
 
 @dataclass(frozen=True)
@@ -40,10 +50,11 @@ class Renderer:
     `forward` leaves the picture in `images`; after a loss has filled `images.colour_grad`, `backward` adds the
     gradients of the Gaussians to their fields and returns the camera's. Images of any size up to the given one.
 
+    image_cache_gb: device memory for copies of the images compared with, on a GPU.
     view_renders: views rendered and differentiated so far, the measure of work that the modes are compared at.
     """
 
-    def __init__(self, gaussians: GaussianField, max_width: int, max_height: int) -> None:
+    def __init__(self, gaussians: GaussianField, max_width: int, max_height: int, image_cache_gb: float = 2.0) -> None:
         real = gaussians.real
         self.gaussians = gaussians
         # One SNode tree for all that compositing reads and writes: with two, Taichi fetches the trees' roots at every
@@ -51,22 +62,30 @@ class Renderer:
         builder = ti.FieldsBuilder()
         self.view = ViewField(builder, real)
         self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
-        self.images = ImageBuffers(builder, max_width, max_height, real)
-        self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
+        self.images = ImageBuffers(builder, max_width, max_height, real, image_cache_gb)
+        if on_gpu():
+            self.pairs = DevicePairs(builder, self.images.max_tiles)
+        else:
+            self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
         builder.finalize()
-        refuse_too_many_fields(self.pairs.gradient.get_scalar_field(9))
-        self.projection = Projection(gaussians, self.view, self.projected)
-        self.binning = Binning(self.view, self.projected, self.pairs)
-        self.compositing = Compositing(self.view, self.projected, self.pairs, self.images)
-        self.development = Development(self.images)
+        refuse_too_many_fields(self.pairs.reached)
+        projection, binning, compositing, development = DEVICE_STAGES if on_gpu() else STAGES
+        self.projection = projection(gaussians, self.view, self.projected)
+        self.binning = binning(self.view, self.projected, self.pairs)
+        self.compositing = compositing(self.view, self.projected, self.pairs, self.images)
+        self.development = development(self.images)
         self.view_renders = 0
 
-    def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float) -> None:
-        """Render into `images`. near: depth [scene units] below which nothing is drawn."""
+    def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float, exact: bool = True) -> None:
+        """Render into `images`. near: depth [scene units] below which nothing is drawn.
+
+        exact: on a GPU, wait until it is known how much is drawn. Steps of an optimisation do not; where a view has far
+        more to draw than those before it, it loses the farthest once.
+        """
         self.images.resize(camera.width, camera.height)
         self.view.set(camera, T_camera_world, near)
         self.projection.forward()
-        self.binning.forward()
+        self.binning.forward(exact)
         self.compositing.forward()
         self.develop(None, None)
 
@@ -95,9 +114,17 @@ class Renderer:
         """d loss / d xi (6,) of the T_camera_world that was rendered last, after `backward`."""
         return self.projection.camera_gradient()
 
+    def late_camera_gradient(self) -> Late:
+        """The same, on its way to the host, which need not wait."""
+        return self.projection.late_camera_gradient()
+
     def exposure_gradient(self) -> np.ndarray:
         """d loss / d exposure (3, 4) of the picture that was developed last, after `backward`."""
         return self.development.exposure_gradient()
+
+    def late_exposure_gradient(self) -> Late:
+        """The same, on its way to the host, which need not wait."""
+        return self.development.late_exposure_gradient()
 
     def render(
         self,

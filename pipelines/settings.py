@@ -211,6 +211,9 @@ class MappingSettings(StrictModel):
         description="size of the pool; further Gaussians are not added. Taichi's allocator sets the limit",
     )
     near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
+    image_cache: float = Field(
+        2.0, ge=0, description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed"
+    )
     keyframes: KeyframeSettings = KeyframeSettings()
     densify: DensifySettings = DensifySettings()
     depth: DepthSettings = DepthSettings()
@@ -249,6 +252,9 @@ class OfflineSettings(StrictModel):
         description="size of the pool; beyond it only the largest gradients grow. Taichi's allocator sets the limit",
     )
     near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
+    image_cache: float = Field(
+        2.0, ge=0, description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed"
+    )
     initial_opacity: float = Field(0.1, gt=0, lt=1, description="opacity of a Gaussian at the start")
     ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
     position_rate: float = Field(1.6e-4, ge=0, description="Adam step of positions at the start [extents]")

@@ -6,14 +6,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fields import occupancy
 from fields.backend import initialise
 from fields.occupancy import OccupancyVoxels
 
 
-@pytest.fixture
-def voxels(taichi_on_the_cpu: None) -> Callable[..., OccupancyVoxels]:
-    """Fresh voxels: Taichi is started anew for each test, since fields cannot be freed one by one."""
+@pytest.fixture(params=[False, True], ids=["cpu", "gpu"])
+def voxels(
+    taichi_on_the_cpu: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., OccupancyVoxels]:
+    """Fresh voxels: Taichi is started anew for each test, since fields cannot be freed one by one.
+
+    They admit in the CPU's form, and in the GPU's, whose kernels run on the CPU as well.
+    """
     initialise("cpu")
+    monkeypatch.setattr(occupancy, "on_gpu", lambda: request.param)
     return OccupancyVoxels
 
 

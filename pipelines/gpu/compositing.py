@@ -1,0 +1,350 @@
+"""Compositing on a GPU: a block of threads a tile, a thread a pixel, the tile's Gaussians through shared memory.
+
+The formulas are those of `pipelines/compositing.py`. The backward pass goes front to back as well, and adds without
+atomics, in three phases for every 16 Gaussians:
+    A  a thread a pixel walks them and leaves weight and d loss / d power of each in shared memory,
+    B  a thread a (Gaussian, row of 16 pixels) makes its ten sums over the row,
+    C  a thread a (Gaussian, sum) adds the rows.
+Against a reduction over the warps for every Gaussian (some fifty shuffles a pixel) this costs about eight accesses to
+shared memory, and the order of the sums is fixed.
+"""
+
+import taichi as ti
+import torch
+
+from fields.device_pairs import DevicePairs
+from fields.images import PAD, ImageBuffers
+from fields.projected import ProjectedGaussians
+from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
+from fields.view import ViewField
+from pipelines.compositing import ALPHA_MAX, OPAQUE
+from pipelines.projection import ALPHA_MIN
+
+__all__ = ["DeviceCompositing"]
+
+# Gaussians that pass through shared memory together, forward and backward.
+BATCH = TILE_PIXELS
+STEP = 16
+# Numbers of a Gaussian there: mean (2), conic (3), opacity, colour (3), depth, rows. One more makes pairs of them
+# aligned to eight bytes.
+WIDTH = 12
+# A row of 16 pixels takes 17 places: the threads of phase B, which are rows apart, then meet different banks.
+ROW = TILE_WIDTH + 1
+PLANE = TILE_HEIGHT * ROW
+SUMS = 10
+
+INDICES = ti.types.ndarray(dtype=ti.i32, ndim=1)
+
+
+@ti.data_oriented
+class DeviceCompositing:
+    """Composites `projected` by the lists in `pairs` into `images`, and takes gradients the other way."""
+
+    def __init__(
+        self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs, images: ImageBuffers
+    ) -> None:
+        self.view = view
+        self.projected = projected
+        self.pairs = pairs
+        self.images = images
+        self._no_indices = torch.zeros(1, dtype=torch.int32, device=pairs.device)
+
+    def forward(self) -> None:
+        """Fill `images.colour`, `.depth` and `.opacity`."""
+        pairs, any_pairs = self.pairs, self.pairs.capacity > 0
+        slot, rows = (pairs.slot, pairs.rows) if any_pairs else (self._no_indices, self._no_indices)
+        self._forward(self.view.width, self.view.height, slot, rows)
+
+    def backward(self, with_depth: bool = False) -> None:
+        """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
+        pairs = self.pairs
+        if self.projected.count:
+            backward = self._backward_with_depth if with_depth else self._backward
+            backward(self.view.width, self.view.height, pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
+            self._gather(self.projected.count, pairs.capacity, pairs.gradient)
+
+    @ti.func
+    def _load(self, store: ti.template(), place, s, rows):
+        """Put what compositing reads of slot s into shared memory."""
+        mean, conic = self.projected.mean[s], self.projected.conic[s]
+        colour = self.projected.colour[s]
+        store[place] = mean[0]
+        store[place + 1] = mean[1]
+        store[place + 2] = -0.5 * conic[0]
+        store[place + 3] = -conic[1]
+        store[place + 4] = -0.5 * conic[2]
+        store[place + 5] = self.projected.opacity[s]
+        store[place + 6] = colour[0]
+        store[place + 7] = colour[1]
+        store[place + 8] = colour[2]
+        store[place + 9] = self.projected.depth[s]
+        store[place + 10] = ti.bit_cast(rows, ti.f32)
+
+    @ti.kernel
+    def _forward(self, width: ti.i32, height: ti.i32, slot: INDICES, rows: INDICES):
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range(tiles * TILE_PIXELS):
+            splats = ti.simt.block.SharedArray((BATCH * WIDTH,), ti.f32)
+            # Of the tile: whether a pixel is still open, in turns for the batches; and the last Gaussian that counted.
+            open_pixels = ti.simt.block.SharedArray((2,), ti.i32)
+            last = ti.simt.block.SharedArray((1,), ti.i32)
+            tile, thread = i // TILE_PIXELS, i % TILE_PIXELS
+            row = thread // TILE_WIDTH
+            x = tile % tiles_x * TILE_WIDTH + thread % TILE_WIDTH
+            y = tile // tiles_x * TILE_HEIGHT + row
+            inside = (x < width) & (y < height)
+            px, py = ti.cast(x, ti.f32) + 0.5, ti.cast(y, ti.f32) + 0.5
+            first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
+            T, red, green, blue, z = 1.0, 0.0, 0.0, 0.0, 0.0
+            counted = 0
+            # The block may come from another tile, whose threads are not all done with shared memory.
+            ti.simt.block.sync()
+            if thread == 0:
+                open_pixels[0] = 0
+                open_pixels[1] = 0
+                last[0] = 0
+            start = 0
+            going = count > 0
+            while going:
+                if start + thread < count:
+                    k = first + start + thread
+                    self._load(splats, thread * WIDTH, slot[k], rows[k])
+                ti.simt.block.sync()
+                turn = start // BATCH % 2
+                for j in range(ti.min(BATCH, count - start)):
+                    at = j * WIDTH
+                    span = ti.bit_cast(splats[at + 10], ti.i32)
+                    if inside and T > OPAQUE and row >= (span & 0xFFFF) and row < (span >> 16):
+                        dx, dy = px - splats[at], py - splats[at + 1]
+                        power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
+                        alpha = ti.min(splats[at + 5] * ti.exp(power), ALPHA_MAX)
+                        if alpha >= ALPHA_MIN:
+                            weight = alpha * T
+                            red += weight * splats[at + 6]
+                            green += weight * splats[at + 7]
+                            blue += weight * splats[at + 8]
+                            z += weight * splats[at + 9]
+                            T -= weight
+                            counted = start + j + 1
+                if inside and T > OPAQUE:
+                    open_pixels[turn] = 1
+                ti.simt.block.sync()
+                start += BATCH
+                going = start < count and open_pixels[turn] == 1
+                # That of the next batch, which nobody reads before the next barrier.
+                if thread == 0:
+                    open_pixels[1 - turn] = 0
+            ti.simt.block.sync()
+            ti.atomic_max(last[0], counted)
+            ti.simt.block.sync()
+            if thread == 0:
+                self.pairs.reached[tile] = last[0]
+            if inside:
+                plane = ti.static(self.images.plane)
+                target = (y + PAD) * self.images.stride + x + PAD
+                background = self.images.background[None]
+                self.images.colour[target] = red + T * background[0]
+                self.images.colour[target + plane] = green + T * background[1]
+                self.images.colour[target + 2 * plane] = blue + T * background[2]
+                self.images.depth[target] = z
+                self.images.opacity[target] = 1.0 - T
+
+    @ti.kernel
+    def _backward(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        slot: INDICES,
+        rows: INDICES,
+        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        gradient: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    ):
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range(tiles * TILE_PIXELS):
+            self._backward_pixel(i, width, height, slot, rows, origin, gradient, False)
+
+    @ti.kernel
+    def _backward_with_depth(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        slot: INDICES,
+        rows: INDICES,
+        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        gradient: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    ):
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range(tiles * TILE_PIXELS):
+            self._backward_pixel(i, width, height, slot, rows, origin, gradient, True)
+
+    @ti.func
+    def _backward_pixel(
+        self,
+        i,
+        width,
+        height,
+        slot: ti.template(),
+        rows: ti.template(),
+        origin: ti.template(),
+        gradient: ti.template(),
+        with_depth: ti.template(),
+    ):
+        splats = ti.simt.block.SharedArray((STEP * WIDTH,), ti.f32)
+        origins = ti.simt.block.SharedArray((STEP,), ti.i32)
+        image_grad = ti.simt.block.SharedArray(((3 + with_depth) * PLANE,), ti.f32)
+        # Weights of phase A, and after phase B has read them its sums.
+        weights = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
+        power_grads = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
+
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        tile, thread = i // TILE_PIXELS, i % TILE_PIXELS
+        row, column = thread // TILE_WIDTH, thread % TILE_WIDTH
+        left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
+        x, y = left + column, top + row
+        inside = (x < width) & (y < height)
+        px, py = ti.cast(x, ti.f32) + 0.5, ti.cast(y, ti.f32) + 0.5
+        pixel = row * ROW + column
+        plane = ti.static(self.images.plane)
+        red_grad, green_grad, blue_grad, z_grad, behind = 0.0, 0.0, 0.0, 0.0, 0.0
+        # A pixel beyond the image is opaque from the start.
+        T = 0.0
+        if inside:
+            source = (y + PAD) * self.images.stride + x + PAD
+            T = 1.0
+            red_grad = self.images.colour_grad[source]
+            green_grad = self.images.colour_grad[source + plane]
+            blue_grad = self.images.colour_grad[source + 2 * plane]
+            behind = (
+                red_grad * self.images.colour[source]
+                + green_grad * self.images.colour[source + plane]
+                + blue_grad * self.images.colour[source + 2 * plane]
+                - self.images.opacity_grad[source] * (1.0 - self.images.opacity[source])
+            )
+            if ti.static(with_depth):
+                z_grad = self.images.depth_grad[source]
+                behind += z_grad * self.images.depth[source]
+        # The block may come from another tile, whose threads are not all done with shared memory.
+        ti.simt.block.sync()
+        image_grad[pixel] = red_grad
+        image_grad[PLANE + pixel] = green_grad
+        image_grad[2 * PLANE + pixel] = blue_grad
+        if ti.static(with_depth):
+            image_grad[3 * PLANE + pixel] = z_grad
+
+        first, count, reached = self.pairs.first[tile], self.pairs.tile_count[tile], self.pairs.reached[tile]
+        for step in range((reached + STEP - 1) // STEP):
+            start = step * STEP
+            here = ti.min(STEP, reached - start)
+            if thread < here:
+                k = first + start + thread
+                self._load(splats, thread * WIDTH, slot[k], rows[k])
+                origins[thread] = ti.cast(origin[k], ti.i32)
+            ti.simt.block.sync()
+
+            for j in range(here):
+                at = j * WIDTH
+                span = ti.bit_cast(splats[at + 10], ti.i32)
+                if row >= (span & 0xFFFF) and row < (span >> 16):
+                    weight, power_grad = 0.0, 0.0
+                    dx, dy = px - splats[at], py - splats[at + 1]
+                    power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
+                    unclamped = splats[at + 5] * ti.exp(power)
+                    alpha = ti.min(unclamped, ALPHA_MAX)
+                    if alpha >= ALPHA_MIN and T > OPAQUE:
+                        weight = alpha * T
+                        shade = splats[at + 6] * red_grad + splats[at + 7] * green_grad + splats[at + 8] * blue_grad
+                        if ti.static(with_depth):
+                            shade += splats[at + 9] * z_grad
+                        contribution = weight * shade
+                        behind -= contribution
+                        T -= weight
+                        # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
+                        if unclamped <= ALPHA_MAX:
+                            power_grad = contribution - behind * alpha / (1.0 - alpha)
+                    weights[j * PLANE + pixel] = weight
+                    power_grads[j * PLANE + pixel] = power_grad
+            ti.simt.block.sync()
+
+            # Phase B: this thread's Gaussian and row.
+            g, r = thread // TILE_HEIGHT, thread % TILE_HEIGHT
+            sums = ti.Vector.zero(ti.f32, SUMS)
+            if g < here:
+                at = g * WIDTH
+                span = ti.bit_cast(splats[at + 10], ti.i32)
+                if r >= (span & 0xFFFF) and r < (span >> 16):
+                    dx = ti.cast(left, ti.f32) + 0.5 - splats[at]
+                    dy = ti.cast(top + r, ti.f32) + 0.5 - splats[at + 1]
+                    s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
+                    s, s_x, s_xx = 0.0, 0.0, 0.0
+                    for c in range(TILE_WIDTH):
+                        weight = weights[g * PLANE + r * ROW + c]
+                        power_grad = power_grads[g * PLANE + r * ROW + c]
+                        s_red += weight * image_grad[r * ROW + c]
+                        s_green += weight * image_grad[PLANE + r * ROW + c]
+                        s_blue += weight * image_grad[2 * PLANE + r * ROW + c]
+                        if ti.static(with_depth):
+                            s_z += weight * image_grad[3 * PLANE + r * ROW + c]
+                        u = power_grad * dx
+                        s += power_grad
+                        s_x += u
+                        s_xx += u * dx
+                        dx += 1.0
+                    sums = ti.Vector([s_red, s_green, s_blue, s_z, s, s_x, s * dy, s_xx, s_x * dy, s * dy * dy])
+            ti.simt.block.sync()
+            for c in ti.static(range(SUMS)):
+                weights[(g * SUMS + c) * ROW + r] = sums[c]
+            ti.simt.block.sync()
+
+            # Phase C: this thread's Gaussian and sum.
+            if thread < here * SUMS:
+                total = 0.0
+                for q in range(TILE_HEIGHT):
+                    total += weights[thread * ROW + q]
+                gradient[origins[thread // SUMS] * SUMS + thread % SUMS] = total
+            ti.simt.block.sync()
+        for k in range((count - reached) * SUMS // TILE_PIXELS + 1):
+            entry = k * TILE_PIXELS + thread
+            if entry < (count - reached) * SUMS:
+                place = ti.cast(origin[first + reached + entry // SUMS], ti.i32)
+                gradient[place * SUMS + entry % SUMS] = 0.0
+
+    @ti.kernel
+    def _gather(self, slots: ti.i32, capacity: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+        """Sum every slot's pairs, in their order, into the gradients of what was composited.
+
+        Sixteen threads a slot, ten of them with a sum each: together they read a pair's gradient at once.
+        """
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range((slots + 15) // 16 * TILE_PIXELS):
+            totals = ti.simt.block.SharedArray((TILE_PIXELS,), ti.f32)
+            s, c = i // 16, i % 16
+            seen = self.projected.seen[None]
+            total = 0.0
+            if s < seen and c < SUMS:
+                end = ti.min(self.pairs.total[None], capacity)
+                if s + 1 < seen:
+                    end = self.projected.first_pair[s + 1]
+                for k in range(self.projected.first_pair[s], end):
+                    total += gradient[k * SUMS + c]
+            totals[i % TILE_PIXELS] = total
+            ti.simt.block.sync()
+            if s < seen and c == 0:
+                at = i % TILE_PIXELS
+                conic = self.projected.conic[s]
+                self.projected.colour.grad[s] = ti.Vector([totals[at], totals[at + 1], totals[at + 2]])
+                self.projected.depth.grad[s] = totals[at + 3]
+                self.projected.opacity.grad[s] = totals[at + 4] / ti.max(self.projected.opacity[s], 1e-12)
+                self.projected.mean.grad[s] = ti.Vector(
+                    [
+                        conic[0] * totals[at + 5] + conic[1] * totals[at + 6],
+                        conic[1] * totals[at + 5] + conic[2] * totals[at + 6],
+                    ]
+                )
+                self.projected.conic.grad[s] = ti.Vector(
+                    [-0.5 * totals[at + 7], -totals[at + 8], -0.5 * totals[at + 9]]
+                )
+            ti.simt.block.sync()
