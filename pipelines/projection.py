@@ -49,6 +49,8 @@ class Projection:
             self._assign_slots(count, self._keys)
             self.project()
             self.shade()
+        else:
+            self.projected.seen[None] = 0
         return count
 
     def backward(self) -> None:
