@@ -6,16 +6,17 @@ import contextlib
 import ctypes
 import io
 
+import numpy as np
 import taichi as ti
 import torch
 
-__all__ = ["growing", "initialise", "on_gpu", "refuse_too_many_fields", "torch_device"]
+__all__ = ["growing", "initialise", "on_gpu", "refuse_too_many_fields", "torch_device", "without_waiting"]
 
 # Arrays of Taichi's runtime have this many entries, and it does not look.
 MAX_SNODES = 1024
-# Taichi's own pool on a CUDA device, for the nodes of sparse fields: the occupancy voxels alone [GB]. Dense fields and
-# PyTorch take what they need of the rest.
-SPARSE_POOL = 1.0
+# Taichi's own pool on a CUDA device [GB], and the share of the device that it may be: fields at their largest and the
+# voxels. The rest is PyTorch's: pairs of tiles, sorts and images.
+POOL, POOL_SHARE = 4.0, 0.4
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
@@ -35,7 +36,8 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
     if threads is not None:
         options["cpu_max_num_threads"] = threads
     if device in ("cuda", "auto") and _has_cuda_driver() and torch.cuda.is_available():
-        _start(ti.cuda, options | {"device_memory_GB": SPARSE_POOL})
+        pool = min(POOL, POOL_SHARE * torch.cuda.mem_get_info()[1] / 2**30)
+        _start(ti.cuda, options | {"device_memory_GB": pool})
         if ti.lang.impl.current_cfg().arch == ti.cuda:
             return "cuda"
     if device == "cuda":
@@ -73,6 +75,17 @@ def on_gpu() -> bool:
 def torch_device() -> torch.device:
     """Where tensors must lie to be read and written by kernels without a copy."""
     return torch.device("cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu")
+
+
+def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
+    """A small array as an argument of a kernel that only reads it, and that the host does not wait for.
+
+    Taichi itself copies NumPy's arrays to a CUDA device and back, and waits for both; passing vectors by value takes it
+    eight microseconds a number.
+    """
+    if ti.lang.impl.current_cfg().arch != ti.cuda:
+        return array
+    return torch.from_numpy(array).pin_memory().to("cuda", non_blocking=True)
 
 
 def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:

@@ -4,14 +4,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from fields.backend import without_waiting
 from fields.camera import PinholeCamera
 
 __all__ = ["ViewField"]
 
 # Projection linearises at most this share of half the image outside the frame (1.3 tan(fov / 2), as 3DGS does).
 FRUSTUM_MARGIN = 0.3
-# By value: an array would be copied to a GPU and back, and the host wait for it.
-VALUES = ti.types.vector(21, ti.f64)
 
 
 @ti.data_oriented
@@ -24,6 +23,7 @@ class ViewField:
 
     def __init__(self, builder: ti.FieldsBuilder, real=ti.f32) -> None:
         self.real = real
+        self.dtype = np.float64 if real == ti.f64 else np.float32
         self.rotation = ti.Matrix.field(3, 3, real)
         self.translation = ti.Vector.field(3, real)
         self.focal = ti.Vector.field(2, real)
@@ -51,19 +51,19 @@ class ViewField:
             ]
         )
         self.width, self.height = camera.width, camera.height
-        self._set(values, camera.width, camera.height)
+        self._set(without_waiting(values.astype(self.dtype)), camera.width, camera.height)
 
     @ti.kernel
-    def _set(self, values: VALUES, width: ti.i32, height: ti.i32):
+    def _set(self, values: ti.types.ndarray(), width: ti.i32, height: ti.i32):
         for _ in range(1):
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
-                    self.rotation[None][r, c] = ti.cast(values[3 * r + c], self.real)
-                self.translation[None][r] = ti.cast(values[9 + r], self.real)
+                    self.rotation[None][r, c] = values[3 * r + c]
+                self.translation[None][r] = values[9 + r]
             for c in ti.static(range(2)):
-                self.focal[None][c] = ti.cast(values[12 + c], self.real)
-                self.centre[None][c] = ti.cast(values[14 + c], self.real)
+                self.focal[None][c] = values[12 + c]
+                self.centre[None][c] = values[14 + c]
             for c in ti.static(range(4)):
-                self.limits[None][c] = ti.cast(values[16 + c], self.real)
-            self.near[None] = ti.cast(values[20], self.real)
+                self.limits[None][c] = values[16 + c]
+            self.near[None] = values[20]
             self.size[None] = ti.Vector([width, height])

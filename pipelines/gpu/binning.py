@@ -1,4 +1,4 @@
-"""Binning on a GPU: pairs are emitted slot by slot, nearest first, and sorted by tile alone, which keeps their order."""
+"""Binning on a GPU: pairs are emitted slot by slot, nearest first; a stable sort by tile keeps their order."""
 
 from collections import deque
 
@@ -98,22 +98,21 @@ class DeviceBinning(Binning):
         key: ti.types.ndarray(ndim=1),
         slot: ti.types.ndarray(dtype=ti.i32, ndim=1),
     ):
-        for s in range(ends.shape[0]):
-            if s < self.projected.seen[None]:
-                place = ti.i64(0)
-                if s > 0:
-                    place = ends[s - 1]
-                pair = ti.cast(ti.min(place, ti.cast(capacity, ti.i64)), ti.i32)
-                self.projected.first_pair[s] = pair
-                e = self._ellipse(s)
-                if e[4] > 0.0 and pair < capacity:
-                    rows = self._tile_rows(s, e, tiles_y)
-                    for tile_y in range(rows[0], rows[1]):
-                        columns = self._tile_columns(s, e, tile_y, tiles_x)
-                        for tile_x in range(columns[0], ti.min(columns[1], columns[0] + capacity - pair)):
-                            key[pair] = tile_y * tiles_x + tile_x
-                            slot[pair] = s
-                            pair += 1
+        for s in range(self.projected.seen[None]):
+            place = ti.i64(0)
+            if s > 0:
+                place = ends[s - 1]
+            pair = ti.cast(ti.min(place, ti.cast(capacity, ti.i64)), ti.i32)
+            self.projected.first_pair[s] = pair
+            e = self._ellipse(s)
+            if e[4] > 0.0 and pair < capacity:
+                rows = self._tile_rows(s, e, tiles_y)
+                for tile_y in range(rows[0], rows[1]):
+                    columns = self._tile_columns(s, e, tile_y, tiles_x)
+                    for tile_x in range(columns[0], ti.min(columns[1], columns[0] + capacity - pair)):
+                        key[pair] = tile_y * tiles_x + tile_x
+                        slot[pair] = s
+                        pair += 1
         for pair in range(capacity):
             if pair >= ends[ends.shape[0] - 1]:
                 key[pair] = no_tile

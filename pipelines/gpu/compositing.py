@@ -18,6 +18,7 @@ from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 from fields.view import ViewField
 from pipelines.compositing import ALPHA_MAX, OPAQUE
+from pipelines.gpu.reductions import THREADS, max_over_block
 from pipelines.projection import ALPHA_MIN
 
 __all__ = ["DeviceCompositing"]
@@ -25,13 +26,14 @@ __all__ = ["DeviceCompositing"]
 # Gaussians that pass through shared memory together, forward and backward.
 BATCH = TILE_PIXELS
 STEP = 16
-# Numbers of a Gaussian there: mean (2), conic (3), opacity, colour (3), depth, rows. One more makes pairs of them
-# aligned to eight bytes.
-WIDTH = 12
+# Numbers of a Gaussian there: mean (2), conic (3), opacity, colour (3), depth.
+WIDTH = 10
 # A row of 16 pixels takes 17 places: the threads of phase B, which are rows apart, then meet different banks.
 ROW = TILE_WIDTH + 1
 PLANE = TILE_HEIGHT * ROW
 SUMS = 10
+
+assert THREADS == TILE_PIXELS == BATCH
 
 INDICES = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
@@ -61,10 +63,10 @@ class DeviceCompositing:
         if self.projected.count:
             backward = self._backward_with_depth if with_depth else self._backward
             backward(self.view.width, self.view.height, pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
-            self._gather(self.projected.count, pairs.capacity, pairs.gradient)
+            self._gather(pairs.capacity, pairs.gradient)
 
     @ti.func
-    def _load(self, store: ti.template(), place, s, rows):
+    def _load(self, store: ti.template(), place, s):
         """Put what compositing reads of slot s into shared memory."""
         mean, conic = self.projected.mean[s], self.projected.conic[s]
         colour = self.projected.colour[s]
@@ -78,7 +80,6 @@ class DeviceCompositing:
         store[place + 7] = colour[1]
         store[place + 8] = colour[2]
         store[place + 9] = self.projected.depth[s]
-        store[place + 10] = ti.bit_cast(rows, ti.f32)
 
     @ti.kernel
     def _forward(self, width: ti.i32, height: ti.i32, slot: INDICES, rows: INDICES):
@@ -87,9 +88,9 @@ class DeviceCompositing:
         ti.loop_config(block_dim=TILE_PIXELS)
         for i in range(tiles * TILE_PIXELS):
             splats = ti.simt.block.SharedArray((BATCH * WIDTH,), ti.f32)
-            # Of the tile: whether a pixel is still open, in turns for the batches; and the last Gaussian that counted.
+            spans = ti.simt.block.SharedArray((BATCH,), ti.i32)
+            # Whether a pixel of the tile is still open, in turns for the batches.
             open_pixels = ti.simt.block.SharedArray((2,), ti.i32)
-            last = ti.simt.block.SharedArray((1,), ti.i32)
             tile, thread = i // TILE_PIXELS, i % TILE_PIXELS
             row = thread // TILE_WIDTH
             x = tile % tiles_x * TILE_WIDTH + thread % TILE_WIDTH
@@ -104,19 +105,20 @@ class DeviceCompositing:
             if thread == 0:
                 open_pixels[0] = 0
                 open_pixels[1] = 0
-                last[0] = 0
             start = 0
             going = count > 0
             while going:
                 if start + thread < count:
                     k = first + start + thread
-                    self._load(splats, thread * WIDTH, slot[k], rows[k])
+                    self._load(splats, thread * WIDTH, slot[k])
+                    spans[thread] = rows[k]
                 ti.simt.block.sync()
                 turn = start // BATCH % 2
-                for j in range(ti.min(BATCH, count - start)):
+                j = 0
+                end = ti.select(inside, ti.min(BATCH, count - start), 0)
+                while j < end and T > OPAQUE:
                     at = j * WIDTH
-                    span = ti.bit_cast(splats[at + 10], ti.i32)
-                    if inside and T > OPAQUE and row >= (span & 0xFFFF) and row < (span >> 16):
+                    if row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
                         dx, dy = px - splats[at], py - splats[at + 1]
                         power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
                         alpha = ti.min(splats[at + 5] * ti.exp(power), ALPHA_MAX)
@@ -128,6 +130,7 @@ class DeviceCompositing:
                             z += weight * splats[at + 9]
                             T -= weight
                             counted = start + j + 1
+                    j += 1
                 if inside and T > OPAQUE:
                     open_pixels[turn] = 1
                 ti.simt.block.sync()
@@ -136,11 +139,11 @@ class DeviceCompositing:
                 # That of the next batch, which nobody reads before the next barrier.
                 if thread == 0:
                     open_pixels[1 - turn] = 0
-            ti.simt.block.sync()
-            ti.atomic_max(last[0], counted)
-            ti.simt.block.sync()
+            # All threads are behind the last batch, whose rows the counts overwrite.
+            spans[thread] = counted
+            max_over_block(spans, thread)
             if thread == 0:
-                self.pairs.reached[tile] = last[0]
+                self.pairs.reached[tile] = spans[0]
             if inside:
                 plane = ti.static(self.images.plane)
                 target = (y + PAD) * self.images.stride + x + PAD
@@ -194,6 +197,7 @@ class DeviceCompositing:
         with_depth: ti.template(),
     ):
         splats = ti.simt.block.SharedArray((STEP * WIDTH,), ti.f32)
+        spans = ti.simt.block.SharedArray((STEP,), ti.i32)
         origins = ti.simt.block.SharedArray((STEP,), ti.i32)
         image_grad = ti.simt.block.SharedArray(((3 + with_depth) * PLANE,), ti.f32)
         # Weights of phase A, and after phase B has read them its sums.
@@ -241,14 +245,14 @@ class DeviceCompositing:
             here = ti.min(STEP, reached - start)
             if thread < here:
                 k = first + start + thread
-                self._load(splats, thread * WIDTH, slot[k], rows[k])
+                self._load(splats, thread * WIDTH, slot[k])
+                spans[thread] = rows[k]
                 origins[thread] = ti.cast(origin[k], ti.i32)
             ti.simt.block.sync()
 
             for j in range(here):
                 at = j * WIDTH
-                span = ti.bit_cast(splats[at + 10], ti.i32)
-                if row >= (span & 0xFFFF) and row < (span >> 16):
+                if row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
                     weight, power_grad = 0.0, 0.0
                     dx, dy = px - splats[at], py - splats[at + 1]
                     power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
@@ -274,8 +278,7 @@ class DeviceCompositing:
             sums = ti.Vector.zero(ti.f32, SUMS)
             if g < here:
                 at = g * WIDTH
-                span = ti.bit_cast(splats[at + 10], ti.i32)
-                if r >= (span & 0xFFFF) and r < (span >> 16):
+                if r >= (spans[g] & 0xFFFF) and r < (spans[g] >> 16):
                     dx = ti.cast(left, ti.f32) + 0.5 - splats[at]
                     dy = ti.cast(top + r, ti.f32) + 0.5 - splats[at + 1]
                     s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
@@ -313,13 +316,13 @@ class DeviceCompositing:
                 gradient[place * SUMS + entry % SUMS] = 0.0
 
     @ti.kernel
-    def _gather(self, slots: ti.i32, capacity: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+    def _gather(self, capacity: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
         """Sum every slot's pairs, in their order, into the gradients of what was composited.
 
         Sixteen threads a slot, ten of them with a sum each: together they read a pair's gradient at once.
         """
         ti.loop_config(block_dim=TILE_PIXELS)
-        for i in range((slots + 15) // 16 * TILE_PIXELS):
+        for i in range((self.projected.seen[None] + 15) // 16 * TILE_PIXELS):
             totals = ti.simt.block.SharedArray((TILE_PIXELS,), ti.f32)
             s, c = i // 16, i % 16
             seen = self.projected.seen[None]

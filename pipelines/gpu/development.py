@@ -1,10 +1,10 @@
-"""Development on a GPU: a thread a pixel; the exposure comes by value, its gradient is summed on the device."""
+"""Development on a GPU: a thread a pixel; the gradient of the exposure is summed on the device."""
 
 import numpy as np
 import taichi as ti
 import torch
 
-from fields.backend import torch_device
+from fields.backend import torch_device, without_waiting
 from fields.images import PAD, ImageBuffers
 from fields.late import Late
 from pipelines.development import Development
@@ -12,7 +12,6 @@ from pipelines.gpu.reductions import THREADS, sum_over_block
 
 __all__ = ["DeviceDevelopment"]
 
-EXPOSURE = ti.types.vector(12, ti.f32)
 NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 
@@ -35,14 +34,15 @@ class DeviceDevelopment(Development):
         return Late(self._gradient.view(3, 4))
 
     def _develop(self) -> None:
-        self._develop_pixels(self.images.width, self.images.height, self._exposure.ravel())
+        self._numbers = without_waiting(self._exposure.astype(np.float32).ravel())
+        self._develop_pixels(self.images.width, self.images.height, self._numbers)
 
     def _undevelop(self) -> None:
         width, height = self.images.width, self.images.height
-        self._undevelop_pixels(width, height, self._exposure.ravel(), self._partial, self._gradient)
+        self._undevelop_pixels(width, height, self._numbers, self._partial, self._gradient)
 
     @ti.kernel
-    def _develop_pixels(self, width: ti.i32, height: ti.i32, exposure: EXPOSURE):
+    def _develop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS):
         for i in range(width * height):
             plane = ti.static(self.images.plane)
             p = (i // width + PAD) * self.images.stride + i % width + PAD
@@ -54,7 +54,7 @@ class DeviceDevelopment(Development):
                 self.images.colour[c * plane + p] = developed * self.vignette[c * plane + p]
 
     @ti.kernel
-    def _undevelop_pixels(self, width: ti.i32, height: ti.i32, exposure: EXPOSURE, partial: NUMBERS, gradient: NUMBERS):
+    def _undevelop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS, partial: NUMBERS, gradient: NUMBERS):
         blocks = (width * height + THREADS - 1) // THREADS
         ti.loop_config(block_dim=THREADS)
         for i in range(blocks * THREADS):

@@ -91,8 +91,9 @@ class DevicePhotometricLoss(PhotometricLoss):
         if self._values.written == ROWS:
             self._values = _Values()
         values, row = self._values, self._values.written
+        self._compare_tiles(self.images.width, self.images.height, self._partial, self._totals)
+        values.sums[row] = self._totals
         values.written += 1
-        self._compare_tiles(self.images.width, self.images.height, row, self._partial, self._totals, values.sums)
         return LateLossValues(values, row)
 
     def send(self) -> None:
@@ -113,15 +114,7 @@ class DevicePhotometricLoss(PhotometricLoss):
         return value
 
     @ti.kernel
-    def _compare_tiles(
-        self,
-        width: ti.i32,
-        height: ti.i32,
-        row: ti.i32,
-        partial: NUMBERS,
-        totals: NUMBERS,
-        sums: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    ):
+    def _compare_tiles(self, width: ti.i32, height: ti.i32, partial: NUMBERS, totals: NUMBERS):
         plane = ti.static(self.images.plane)
         for i in range(width * height):
             p = (i // width + PAD) * self.images.stride + i % width + PAD
@@ -212,7 +205,6 @@ class DevicePhotometricLoss(PhotometricLoss):
                 store[c * THREADS + thread] = total
             sum_over_block(store, thread, 4)
             if thread < 4:
-                sums[row, thread] = store[thread * THREADS]
                 totals[thread] = store[thread * THREADS]
 
     @ti.kernel
