@@ -14,9 +14,9 @@ __all__ = ["growing", "initialise", "on_gpu", "refuse_too_many_fields", "torch_d
 
 # Arrays of Taichi's runtime have this many entries, and it does not look.
 MAX_SNODES = 1024
-# Taichi's own pool on a CUDA device [GB], and the share of the device that it may be: fields at their largest and the
-# voxels. The rest is PyTorch's: pairs of tiles, sorts and images.
-POOL, POOL_SHARE = 4.0, 0.4
+# Taichi's own pool on a CUDA device, for the nodes of sparse fields: the occupancy voxels alone [GB]. Dense fields and
+# PyTorch take what they need of the rest.
+SPARSE_POOL = 1.0
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
@@ -36,8 +36,7 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
     if threads is not None:
         options["cpu_max_num_threads"] = threads
     if device in ("cuda", "auto") and _has_cuda_driver() and torch.cuda.is_available():
-        pool = min(POOL, POOL_SHARE * torch.cuda.mem_get_info()[1] / 2**30)
-        _start(ti.cuda, options | {"device_memory_GB": pool})
+        _start(ti.cuda, options | {"device_memory_GB": SPARSE_POOL})
         if ti.lang.impl.current_cfg().arch == ti.cuda:
             return "cuda"
     if device == "cuda":

@@ -3,8 +3,8 @@
 The formulas are those of `pipelines/compositing.py`. The backward pass goes front to back as well, and adds without
 atomics, in three phases for every 16 Gaussians:
     A  a thread a pixel walks them and leaves weight and d loss / d power of each in shared memory,
-    B  a thread a (Gaussian, row of 16 pixels) makes its ten sums over the row,
-    C  a thread a (Gaussian, sum) adds the rows.
+    B  a thread a (Gaussian, column of pixels) makes its ten sums over the rows that the ellipse reaches,
+    C  a thread a (Gaussian, sum) adds the columns.
 Against a reduction over the warps for every Gaussian (some fifty shuffles a pixel) this costs about eight accesses to
 shared memory, and the order of the sums is fixed.
 """
@@ -28,9 +28,12 @@ BATCH = TILE_PIXELS
 STEP = 16
 # Numbers of a Gaussian there: mean (2), conic (3), opacity, colour (3), depth.
 WIDTH = 10
-# A row of 16 pixels takes 17 places: the threads of phase B, which are rows apart, then meet different banks.
-ROW = TILE_WIDTH + 1
-PLANE = TILE_HEIGHT * ROW
+TILE_BITS = TILE_PIXELS.bit_length() - 1
+ROW_BITS = TILE_WIDTH.bit_length() - 1
+# Places from a Gaussian's pixels to the next one's, and from a sum's columns to the next: the two Gaussians, or the 32
+# sums, of the threads of a warp then meet different banks of shared memory.
+PLANE = TILE_PIXELS + TILE_WIDTH
+COLUMNS = TILE_WIDTH + 1
 SUMS = 10
 
 assert THREADS == TILE_PIXELS == BATCH
@@ -91,8 +94,8 @@ class DeviceCompositing:
             spans = ti.simt.block.SharedArray((BATCH,), ti.i32)
             # Whether a pixel of the tile is still open, in turns for the batches.
             open_pixels = ti.simt.block.SharedArray((2,), ti.i32)
-            tile, thread = i // TILE_PIXELS, i % TILE_PIXELS
-            row = thread // TILE_WIDTH
+            tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
+            row = thread >> ROW_BITS
             x = tile % tiles_x * TILE_WIDTH + thread % TILE_WIDTH
             y = tile // tiles_x * TILE_HEIGHT + row
             inside = (x < width) & (y < height)
@@ -114,11 +117,9 @@ class DeviceCompositing:
                     spans[thread] = rows[k]
                 ti.simt.block.sync()
                 turn = start // BATCH % 2
-                j = 0
-                end = ti.select(inside, ti.min(BATCH, count - start), 0)
-                while j < end and T > OPAQUE:
+                for j in range(ti.select(inside, ti.min(BATCH, count - start), 0)):
                     at = j * WIDTH
-                    if row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
+                    if T > OPAQUE and row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
                         dx, dy = px - splats[at], py - splats[at + 1]
                         power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
                         alpha = ti.min(splats[at + 5] * ti.exp(power), ALPHA_MAX)
@@ -130,7 +131,6 @@ class DeviceCompositing:
                             z += weight * splats[at + 9]
                             T -= weight
                             counted = start + j + 1
-                    j += 1
                 if inside and T > OPAQUE:
                     open_pixels[turn] = 1
                 ti.simt.block.sync()
@@ -199,19 +199,19 @@ class DeviceCompositing:
         splats = ti.simt.block.SharedArray((STEP * WIDTH,), ti.f32)
         spans = ti.simt.block.SharedArray((STEP,), ti.i32)
         origins = ti.simt.block.SharedArray((STEP,), ti.i32)
-        image_grad = ti.simt.block.SharedArray(((3 + with_depth) * PLANE,), ti.f32)
+        image_grad = ti.simt.block.SharedArray(((3 + with_depth) * TILE_PIXELS,), ti.f32)
         # Weights of phase A, and after phase B has read them its sums.
         weights = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
         power_grads = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
 
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-        tile, thread = i // TILE_PIXELS, i % TILE_PIXELS
-        row, column = thread // TILE_WIDTH, thread % TILE_WIDTH
+        # Shifts and masks, by which LLVM sees that no index overflows.
+        tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
+        row, column = thread >> ROW_BITS, thread & (TILE_WIDTH - 1)
         left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
         x, y = left + column, top + row
         inside = (x < width) & (y < height)
         px, py = ti.cast(x, ti.f32) + 0.5, ti.cast(y, ti.f32) + 0.5
-        pixel = row * ROW + column
         plane = ti.static(self.images.plane)
         red_grad, green_grad, blue_grad, z_grad, behind = 0.0, 0.0, 0.0, 0.0, 0.0
         # A pixel beyond the image is opaque from the start.
@@ -233,11 +233,11 @@ class DeviceCompositing:
                 behind += z_grad * self.images.depth[source]
         # The block may come from another tile, whose threads are not all done with shared memory.
         ti.simt.block.sync()
-        image_grad[pixel] = red_grad
-        image_grad[PLANE + pixel] = green_grad
-        image_grad[2 * PLANE + pixel] = blue_grad
+        image_grad[thread] = red_grad
+        image_grad[TILE_PIXELS + thread] = green_grad
+        image_grad[2 * TILE_PIXELS + thread] = blue_grad
         if ti.static(with_depth):
-            image_grad[3 * PLANE + pixel] = z_grad
+            image_grad[3 * TILE_PIXELS + thread] = z_grad
 
         first, count, reached = self.pairs.first[tile], self.pairs.tile_count[tile], self.pairs.reached[tile]
         for step in range((reached + STEP - 1) // STEP):
@@ -269,44 +269,43 @@ class DeviceCompositing:
                         # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
                         if unclamped <= ALPHA_MAX:
                             power_grad = contribution - behind * alpha / (1.0 - alpha)
-                    weights[j * PLANE + pixel] = weight
-                    power_grads[j * PLANE + pixel] = power_grad
+                    weights[j * PLANE + thread] = weight
+                    power_grads[j * PLANE + thread] = power_grad
             ti.simt.block.sync()
 
-            # Phase B: this thread's Gaussian and row.
-            g, r = thread // TILE_HEIGHT, thread % TILE_HEIGHT
+            # Phase B: this thread's Gaussian and column of pixels.
+            g = thread >> ROW_BITS
             sums = ti.Vector.zero(ti.f32, SUMS)
             if g < here:
-                at = g * WIDTH
-                if r >= (spans[g] & 0xFFFF) and r < (spans[g] >> 16):
-                    dx = ti.cast(left, ti.f32) + 0.5 - splats[at]
-                    dy = ti.cast(top + r, ti.f32) + 0.5 - splats[at + 1]
-                    s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
-                    s, s_x, s_xx = 0.0, 0.0, 0.0
-                    for c in range(TILE_WIDTH):
-                        weight = weights[g * PLANE + r * ROW + c]
-                        power_grad = power_grads[g * PLANE + r * ROW + c]
-                        s_red += weight * image_grad[r * ROW + c]
-                        s_green += weight * image_grad[PLANE + r * ROW + c]
-                        s_blue += weight * image_grad[2 * PLANE + r * ROW + c]
-                        if ti.static(with_depth):
-                            s_z += weight * image_grad[3 * PLANE + r * ROW + c]
-                        u = power_grad * dx
-                        s += power_grad
-                        s_x += u
-                        s_xx += u * dx
-                        dx += 1.0
-                    sums = ti.Vector([s_red, s_green, s_blue, s_z, s, s_x, s * dy, s_xx, s_x * dy, s * dy * dy])
+                dx = px - splats[g * WIDTH]
+                dy = ti.cast(top, ti.f32) + 0.5 - splats[g * WIDTH + 1]
+                s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
+                s, s_y, s_yy = 0.0, 0.0, 0.0
+                for r in range(spans[g] & 0xFFFF, spans[g] >> 16):
+                    at = ((r << ROW_BITS) & (TILE_PIXELS - 1)) | column
+                    weight = weights[g * PLANE + at]
+                    power_grad = power_grads[g * PLANE + at]
+                    s_red += weight * image_grad[at]
+                    s_green += weight * image_grad[TILE_PIXELS + at]
+                    s_blue += weight * image_grad[2 * TILE_PIXELS + at]
+                    if ti.static(with_depth):
+                        s_z += weight * image_grad[3 * TILE_PIXELS + at]
+                    down = dy + ti.cast(r, ti.f32)
+                    u = power_grad * down
+                    s += power_grad
+                    s_y += u
+                    s_yy += u * down
+                sums = ti.Vector([s_red, s_green, s_blue, s_z, s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy])
             ti.simt.block.sync()
             for c in ti.static(range(SUMS)):
-                weights[(g * SUMS + c) * ROW + r] = sums[c]
+                weights[(g * SUMS + c) * COLUMNS + column] = sums[c]
             ti.simt.block.sync()
 
             # Phase C: this thread's Gaussian and sum.
             if thread < here * SUMS:
                 total = 0.0
-                for q in range(TILE_HEIGHT):
-                    total += weights[thread * ROW + q]
+                for q in range(TILE_WIDTH):
+                    total += weights[thread * COLUMNS + q]
                 gradient[origins[thread // SUMS] * SUMS + thread % SUMS] = total
             ti.simt.block.sync()
         for k in range((count - reached) * SUMS // TILE_PIXELS + 1):

@@ -8,7 +8,7 @@ from fields.backend import torch_device, without_waiting
 from fields.images import PAD, ImageBuffers
 from fields.late import Late
 from pipelines.development import Development
-from pipelines.gpu.reductions import THREADS, sum_over_block
+from pipelines.gpu.reductions import THREAD_BITS, THREADS, sum_over_block, sum_over_blocks
 
 __all__ = ["DeviceDevelopment"]
 
@@ -39,7 +39,8 @@ class DeviceDevelopment(Development):
 
     def _undevelop(self) -> None:
         width, height = self.images.width, self.images.height
-        self._undevelop_pixels(width, height, self._numbers, self._partial, self._gradient)
+        self._undevelop_pixels(width, height, self._numbers, self._partial)
+        sum_over_blocks(-(-width * height // THREADS), 12, self._partial, self._gradient)
 
     @ti.kernel
     def _develop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS):
@@ -54,13 +55,13 @@ class DeviceDevelopment(Development):
                 self.images.colour[c * plane + p] = developed * self.vignette[c * plane + p]
 
     @ti.kernel
-    def _undevelop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS, partial: NUMBERS, gradient: NUMBERS):
+    def _undevelop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS, partial: NUMBERS):
         blocks = (width * height + THREADS - 1) // THREADS
         ti.loop_config(block_dim=THREADS)
         for i in range(blocks * THREADS):
             store = ti.simt.block.SharedArray((12 * THREADS,), ti.f32)
             plane = ti.static(self.images.plane)
-            thread = i % THREADS
+            thread = i & (THREADS - 1)
             # The block may come from other pixels, whose sums are not all read.
             ti.simt.block.sync()
             for c in ti.static(range(12)):
@@ -80,15 +81,4 @@ class DeviceDevelopment(Development):
                     self.images.colour[c * plane + p] = rendered[c]
             sum_over_block(store, thread, 12)
             if thread < 12:
-                partial[i // THREADS * 12 + thread] = store[thread * THREADS]
-        ti.loop_config(block_dim=THREADS)
-        for thread in range(THREADS):
-            store = ti.simt.block.SharedArray((12 * THREADS,), ti.f32)
-            for c in ti.static(range(12)):
-                total = 0.0
-                for k in range((blocks - thread + THREADS - 1) // THREADS):
-                    total += partial[(thread + k * THREADS) * 12 + c]
-                store[c * THREADS + thread] = total
-            sum_over_block(store, thread, 12)
-            if thread < 12:
-                gradient[thread] = store[thread * THREADS]
+                partial[(i >> THREAD_BITS) * 12 + thread] = store[thread * THREADS]

@@ -12,7 +12,7 @@ from fields.backend import on_gpu, torch_device
 from fields.images import PAD, ImageBuffers
 from fields.late import Late
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
-from pipelines.gpu.reductions import THREADS, sum_over_block
+from pipelines.gpu.reductions import THREAD_BITS, THREADS, sum_over_block, sum_over_blocks
 from pipelines.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
 
 __all__ = ["DevicePhotometricLoss", "LateLossValues", "photometric_loss"]
@@ -21,6 +21,7 @@ __all__ = ["DevicePhotometricLoss", "LateLossValues", "photometric_loss"]
 SIDE = TILE_WIDTH + 2 * RADIUS
 HALO = SIDE * SIDE
 BAND = SIDE * TILE_WIDTH
+ROW_BITS = TILE_WIDTH.bit_length() - 1
 # Evaluations whose values lie in one tensor and come to the host together.
 ROWS = 64
 
@@ -91,7 +92,10 @@ class DevicePhotometricLoss(PhotometricLoss):
         if self._values.written == ROWS:
             self._values = _Values()
         values, row = self._values, self._values.written
-        self._compare_tiles(self.images.width, self.images.height, self._partial, self._totals)
+        width, height = self.images.width, self.images.height
+        self._compare_tiles(width, height, self._partial)
+        blocks = 3 * -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
+        sum_over_blocks(blocks, 4, self._partial, self._totals)
         values.sums[row] = self._totals
         values.written += 1
         return LateLossValues(values, row)
@@ -114,7 +118,7 @@ class DevicePhotometricLoss(PhotometricLoss):
         return value
 
     @ti.kernel
-    def _compare_tiles(self, width: ti.i32, height: ti.i32, partial: NUMBERS, totals: NUMBERS):
+    def _compare_tiles(self, width: ti.i32, height: ti.i32, partial: NUMBERS):
         plane = ti.static(self.images.plane)
         for i in range(width * height):
             p = (i // width + PAD) * self.images.stride + i % width + PAD
@@ -132,21 +136,21 @@ class DevicePhotometricLoss(PhotometricLoss):
             b = ti.simt.block.SharedArray((HALO,), ti.f32)
             # The five moments after the horizontal window; then the four sums.
             band = ti.simt.block.SharedArray((5 * BAND,), ti.f32)
-            unit, thread = i // THREADS, i % THREADS
+            unit, thread = i >> THREAD_BITS, i & (THREADS - 1)
             channel, tile = unit // tiles, unit % tiles
             start = channel * plane
             left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
             # The block may come from another tile, whose threads are not all done with shared memory.
             ti.simt.block.sync()
-            for k in range((HALO - thread + THREADS - 1) // THREADS):
+            for k in range((HALO - thread + THREADS - 1) >> THREAD_BITS):
                 at = thread + k * THREADS
                 x, y = left - RADIUS + at % SIDE, top - RADIUS + at // SIDE
                 a[at] = self._at(self.images.colour, start, x, y, width, height)
                 b[at] = self._at(self.images.reference, start, x, y, width, height)
             ti.simt.block.sync()
-            for k in range((BAND - thread + THREADS - 1) // THREADS):
+            for k in range((BAND - thread + THREADS - 1) >> THREAD_BITS):
                 at = thread + k * THREADS
-                source = at // TILE_WIDTH * SIDE + at % TILE_WIDTH
+                source = (at >> ROW_BITS) * SIDE + (at & (TILE_WIDTH - 1))
                 mu_x, mu_y, xx, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0
                 for q in ti.static(range(2 * RADIUS + 1)):
                     va, vb = a[source + q], b[source + q]
@@ -168,7 +172,7 @@ class DevicePhotometricLoss(PhotometricLoss):
                 yy += self.weights[q] * band[3 * BAND + at]
                 xy += self.weights[q] * band[4 * BAND + at]
             l1, ssim, square, valid = 0.0, 0.0, 0.0, 0.0
-            x, y = left + thread % TILE_WIDTH, top + thread // TILE_WIDTH
+            x, y = left + (thread & (TILE_WIDTH - 1)), top + (thread >> ROW_BITS)
             if x < width and y < height:
                 var_x, var_y, covariance = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
                 # S = (A1 A2) / (B1 B2)
@@ -183,7 +187,7 @@ class DevicePhotometricLoss(PhotometricLoss):
                 self.images.ssim_partial[3 * start + plane + p] = -S * B1 * inv * valid
                 self.images.ssim_partial[3 * start + 2 * plane + p] = 2.0 * A1 * inv * valid
                 self.images.ssim[start + p] = S
-                centre = (thread // TILE_WIDTH + RADIUS) * SIDE + thread % TILE_WIDTH + RADIUS
+                centre = ((thread >> ROW_BITS) + RADIUS) * SIDE + (thread & (TILE_WIDTH - 1)) + RADIUS
                 d = a[centre] - b[centre]
                 l1, ssim, square = ti.abs(d), S * valid, d * d
             ti.simt.block.sync()
@@ -194,18 +198,6 @@ class DevicePhotometricLoss(PhotometricLoss):
             sum_over_block(band, thread, 4)
             if thread < 4:
                 partial[unit * 4 + thread] = band[thread * THREADS]
-
-        ti.loop_config(block_dim=THREADS)
-        for thread in range(THREADS):
-            store = ti.simt.block.SharedArray((4 * THREADS,), ti.f32)
-            for c in ti.static(range(4)):
-                total = 0.0
-                for k in range((3 * tiles - thread + THREADS - 1) // THREADS):
-                    total += partial[(thread + k * THREADS) * 4 + c]
-                store[c * THREADS + thread] = total
-            sum_over_block(store, thread, 4)
-            if thread < 4:
-                totals[thread] = store[thread * THREADS]
 
     @ti.kernel
     def _differentiate_tiles(
@@ -218,21 +210,21 @@ class DevicePhotometricLoss(PhotometricLoss):
         for i in range(3 * tiles * THREADS):
             halo = ti.simt.block.SharedArray((3 * HALO,), ti.f32)
             band = ti.simt.block.SharedArray((3 * BAND,), ti.f32)
-            unit, thread = i // THREADS, i % THREADS
+            unit, thread = i >> THREAD_BITS, i & (THREADS - 1)
             channel, tile = unit // tiles, unit % tiles
             start = channel * plane
             left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
             ti.simt.block.sync()
-            for k in range((HALO - thread + THREADS - 1) // THREADS):
+            for k in range((HALO - thread + THREADS - 1) >> THREAD_BITS):
                 at = thread + k * THREADS
                 x, y = left - RADIUS + at % SIDE, top - RADIUS + at // SIDE
                 for q in ti.static(range(3)):
                     source = 3 * start + q * plane
                     halo[q * HALO + at] = self._at(self.images.ssim_partial, source, x, y, width, height)
             ti.simt.block.sync()
-            for k in range((BAND - thread + THREADS - 1) // THREADS):
+            for k in range((BAND - thread + THREADS - 1) >> THREAD_BITS):
                 at = thread + k * THREADS
-                source = at // TILE_WIDTH * SIDE + at % TILE_WIDTH
+                source = (at >> ROW_BITS) * SIDE + (at & (TILE_WIDTH - 1))
                 for q in ti.static(range(3)):
                     total = 0.0
                     for j in ti.static(range(2 * RADIUS + 1)):
@@ -243,7 +235,7 @@ class DevicePhotometricLoss(PhotometricLoss):
             for q in ti.static(range(3)):
                 for j in ti.static(range(2 * RADIUS + 1)):
                     smooth[q] += self.weights[j] * band[q * BAND + thread + j * TILE_WIDTH]
-            x, y = left + thread % TILE_WIDTH, top + thread // TILE_WIDTH
+            x, y = left + (thread & (TILE_WIDTH - 1)), top + (thread >> ROW_BITS)
             if x < width and y < height:
                 p = (y + PAD) * self.images.stride + x + PAD
                 per_pixel = 1.0 / ti.max(totals[3], 1.0)

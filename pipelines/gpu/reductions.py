@@ -1,11 +1,17 @@
-"""Sums and maxima over a block of threads, in a fixed order."""
+"""Sums and maxima over a block of threads, and sums over blocks, in a fixed order.
+
+A kernel has at most one loop with shared arrays: Taichi 1.7.4 names them loop by loop, and on CUDA two of one name in a
+kernel are one, of either size.
+"""
 
 import taichi as ti
 
-__all__ = ["THREADS", "max_over_block", "sum_over_block"]
+__all__ = ["THREADS", "THREAD_BITS", "max_over_block", "sum_over_block", "sum_over_blocks"]
 
 # Of every block that adds: one of the two halves that meet at each level is a whole number of warps down to the last.
 THREADS = 256
+THREAD_BITS = THREADS.bit_length() - 1
+NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 
 @ti.func
@@ -32,3 +38,19 @@ def max_over_block(store: ti.template(), thread):
         if thread < half:
             store[thread] = ti.max(store[thread], store[thread + half])
         ti.simt.block.sync()
+
+
+@ti.kernel
+def sum_over_blocks(blocks: ti.i32, quantities: ti.template(), partial: NUMBERS, out: NUMBERS):
+    """Add what the blocks of an earlier kernel have left: number c of block b at `partial[b * quantities + c]`."""
+    ti.loop_config(block_dim=THREADS)
+    for thread in range(THREADS):
+        store = ti.simt.block.SharedArray((quantities * THREADS,), ti.f32)
+        for c in ti.static(range(quantities)):
+            total = 0.0
+            for k in range((blocks - thread + THREADS - 1) >> THREAD_BITS):
+                total += partial[(thread + k * THREADS) * quantities + c]
+            store[c * THREADS + thread] = total
+        sum_over_block(store, thread, quantities)
+        if thread < quantities:
+            out[thread] = store[thread * THREADS]
