@@ -5,6 +5,7 @@ import taichi as ti
 
 from fields.backend import on_gpu
 from fields.device_images import DeviceImages
+from fields.launch import Launch
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 
 __all__ = ["PAD", "STRIPS", "ImageBuffers"]
@@ -40,6 +41,7 @@ class ImageBuffers:
         self.stride = (1 << (max_width - 1).bit_length()) + 2 * PAD
         self.plane = self.stride * (-(-max_height // 256) * 256 + 2 * PAD)
         self.width = self.height = 0
+        self._take_reference = Launch(self._set_reference_pixels)
         self._references = DeviceImages(cache_gb * 2**30) if on_gpu() else None
 
         def scalar():
@@ -110,7 +112,7 @@ class ImageBuffers:
         if self._references is None:
             self._set_reference(self.width, self.height, image)
         else:
-            self._set_reference_pixels(self.width, self.height, self._references.of(image))
+            self._take_reference(self.width, self.height, self._references.of(image))
 
     def set_gradients(self, colour: np.ndarray, depth: np.ndarray, opacity: np.ndarray) -> None:
         """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W)."""

@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 
 from fields.backend import without_waiting
 from fields.camera import PinholeCamera
+from fields.launch import Launch
 
 __all__ = ["ViewField"]
 
@@ -32,6 +33,7 @@ class ViewField:
         self.near = ti.field(real)
         self.size = ti.Vector.field(2, ti.i32)
         builder.place(self.rotation, self.translation, self.focal, self.centre, self.limits, self.near, self.size)
+        self._write = Launch(self._set)
         self.width = 0
         self.height = 0
 
@@ -51,7 +53,7 @@ class ViewField:
             ]
         )
         self.width, self.height = camera.width, camera.height
-        self._set(without_waiting(values.astype(self.dtype)), camera.width, camera.height)
+        self._write(without_waiting(values.astype(self.dtype)), camera.width, camera.height)
 
     @ti.kernel
     def _set(self, values: ti.types.ndarray(), width: ti.i32, height: ti.i32):

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from fields.gaussians import GaussianField
+from fields.launch import Launch
 
 __all__ = ["Adam", "LearningRates"]
 
@@ -33,6 +34,7 @@ class Adam:
     def __init__(self, gaussians: GaussianField) -> None:
         self.gaussians = gaussians
         self.real = gaussians.real
+        self._update_all = Launch(self._step)
 
     def step(self, rates: LearningRates, batch: int = 1, sh_degree: int | None = None) -> None:
         """Update and clear the gradients of every touched Gaussian.
@@ -45,7 +47,8 @@ class Adam:
         root = float(np.sqrt(batch))
         beta1, beta2 = max(1.0 - 0.1 * batch, 0.0), 1.0 - 0.001 * batch
         values = [rates.position, rates.log_scale, rates.quaternion, rates.opacity_logit, rates.colour]
-        self._step(self.gaussians.count, active, *(root * v for v in values), beta1, beta2, 1e-15 / root)
+        steps = (float(root * v) for v in values)
+        self._update_all(self.gaussians.count, active, *steps, float(beta1), float(beta2), 1e-15 / root)
 
     @ti.func
     def _update(self, value, gradient, m: ti.template(), v: ti.template(), lr, betas, corrections, eps):

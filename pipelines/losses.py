@@ -13,6 +13,7 @@ import taichi as ti
 
 from fields.gaussians import GaussianField
 from fields.images import PAD, STRIPS, ImageBuffers
+from fields.launch import Launch
 from fields.parallel import HANDED_OUT
 
 __all__ = ["AspectPenalty", "LossValues", "PhotometricLoss", "window_weights"]
@@ -217,11 +218,12 @@ class AspectPenalty:
     def __init__(self, gaussians: GaussianField, max_ratio: float = 10.0) -> None:
         self.gaussians = gaussians
         self.max_ratio = max_ratio
+        self._add = Launch(self._backward)
 
     def backward(self, weight: float, scene_depth: float) -> None:
         """Add the gradient of the penalty to that of the log-scales."""
         if self.gaussians.count:
-            self._backward(self.gaussians.count, weight / self.gaussians.count, 1.0 / scene_depth)
+            self._add(self.gaussians.count, weight / self.gaussians.count, 1.0 / float(scene_depth))
 
     @ti.kernel
     def _backward(self, count: ti.i32, weight: ti.f64, per_depth: ti.f64):

@@ -8,6 +8,7 @@ import torch
 from fields.backend import torch_device
 from fields.device_pairs import NO_TILE, DevicePairs
 from fields.late import Late
+from fields.launch import Launch
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_WIDTH
 from fields.view import ViewField
@@ -29,6 +30,8 @@ class DeviceBinning(Binning):
         self.view = view
         self.projected = projected
         self.pairs = pairs
+        self._count_tiles, self._emit_pairs = Launch(self._count_all), Launch(self._emit)
+        self._arrange_pairs = Launch(self._arrange)
         self._totals: deque[Late] = deque()
         self._counts = torch.empty(0, dtype=torch.int32, device=torch_device())
 
@@ -47,12 +50,13 @@ class DeviceBinning(Binning):
         if len(self._counts) < n:
             self._counts = torch.empty(1 << (n - 1).bit_length(), dtype=torch.int32, device=torch_device())
         counts = self._counts[:n]
-        self._count_all(tiles_x, tiles_y, counts)
+        self._count_tiles(tiles_x, tiles_y, counts)
         ends = torch.cumsum(counts, 0)
         self._make_room(ends, exact)
-        self._emit(pairs.capacity, NO_TILE[pairs.key.dtype], tiles_x, tiles_y, ends, pairs.key, pairs.emitted_slot)
+        no_tile = NO_TILE[pairs.key.dtype]
+        self._emit_pairs(pairs.capacity, no_tile, tiles_x, tiles_y, ends, pairs.key, pairs.emitted_slot)
         key, pairs.origin = torch.sort(pairs.key, stable=True)
-        self._arrange(tiles_x * tiles_y, tiles_x, key, pairs.origin, pairs.emitted_slot, pairs.slot, pairs.rows)
+        self._arrange_pairs(tiles_x * tiles_y, tiles_x, key, pairs.origin, pairs.emitted_slot, pairs.slot, pairs.rows)
 
     def _make_room(self, ends: torch.Tensor, exact: bool) -> None:
         self._totals.append(Late(ends[-1:]))

@@ -14,6 +14,7 @@ import torch
 
 from fields.device_pairs import DevicePairs
 from fields.images import PAD, ImageBuffers
+from fields.launch import Launch
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 from fields.view import ViewField
@@ -52,21 +53,24 @@ class DeviceCompositing:
         self.projected = projected
         self.pairs = pairs
         self.images = images
+        self._composite, self._add_up = Launch(self._forward), Launch(self._gather)
+        self._differentiate = {False: Launch(self._backward), True: Launch(self._backward_with_depth)}
         self._no_indices = torch.zeros(1, dtype=torch.int32, device=pairs.device)
 
     def forward(self) -> None:
         """Fill `images.colour`, `.depth` and `.opacity`."""
         pairs, any_pairs = self.pairs, self.pairs.capacity > 0
         slot, rows = (pairs.slot, pairs.rows) if any_pairs else (self._no_indices, self._no_indices)
-        self._forward(self.view.width, self.view.height, slot, rows)
+        self._composite(self.view.width, self.view.height, slot, rows)
 
     def backward(self, with_depth: bool = False) -> None:
         """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
         pairs = self.pairs
         if self.projected.count:
-            backward = self._backward_with_depth if with_depth else self._backward
-            backward(self.view.width, self.view.height, pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
-            self._gather(pairs.capacity, pairs.gradient)
+            width, height = self.view.width, self.view.height
+            differentiate = self._differentiate[with_depth]
+            differentiate(width, height, pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
+            self._add_up(pairs.capacity, pairs.gradient)
 
     @ti.func
     def _load(self, store: ti.template(), place, s):

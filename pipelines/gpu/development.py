@@ -7,8 +7,9 @@ import torch
 from fields.backend import torch_device, without_waiting
 from fields.images import PAD, ImageBuffers
 from fields.late import Late
+from fields.launch import Launch
 from pipelines.development import Development
-from pipelines.gpu.reductions import THREAD_BITS, THREADS, sum_over_block, sum_over_blocks
+from pipelines.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 
 __all__ = ["DeviceDevelopment"]
 
@@ -23,6 +24,8 @@ class DeviceDevelopment(Development):
         super().__init__(images)
         blocks = -(-images.max_width * images.max_height // THREADS)
         self._partial = torch.zeros(12 * blocks, dtype=torch.float32, device=torch_device())
+        self._forward_pixels, self._backward_pixels = Launch(self._develop_pixels), Launch(self._undevelop_pixels)
+        self._sum = BlockSums(12)
         self._gradient = torch.zeros(12, dtype=torch.float32, device=torch_device())
 
     def exposure_gradient(self) -> np.ndarray:
@@ -35,12 +38,12 @@ class DeviceDevelopment(Development):
 
     def _develop(self) -> None:
         self._numbers = without_waiting(self._exposure.astype(np.float32).ravel())
-        self._develop_pixels(self.images.width, self.images.height, self._numbers)
+        self._forward_pixels(self.images.width, self.images.height, self._numbers)
 
     def _undevelop(self) -> None:
         width, height = self.images.width, self.images.height
-        self._undevelop_pixels(width, height, self._numbers, self._partial)
-        sum_over_blocks(-(-width * height // THREADS), 12, self._partial, self._gradient)
+        self._backward_pixels(width, height, self._numbers, self._partial)
+        self._sum(-(-width * height // THREADS), self._partial, self._gradient)
 
     @ti.kernel
     def _develop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS):

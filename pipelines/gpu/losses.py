@@ -11,8 +11,9 @@ import torch
 from fields.backend import on_gpu, torch_device
 from fields.images import PAD, ImageBuffers
 from fields.late import Late
+from fields.launch import Launch
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
-from pipelines.gpu.reductions import THREAD_BITS, THREADS, sum_over_block, sum_over_blocks
+from pipelines.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 from pipelines.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
 
 __all__ = ["DevicePhotometricLoss", "LateLossValues", "photometric_loss"]
@@ -82,6 +83,8 @@ class DevicePhotometricLoss(PhotometricLoss):
         self.weights = window_weights()
         self._partial = torch.zeros(12 * images.max_tiles, dtype=torch.float32, device=torch_device())
         self._totals = torch.zeros(4, dtype=torch.float32, device=torch_device())
+        self._compare, self._differentiate = Launch(self._compare_tiles), Launch(self._differentiate_tiles)
+        self._sum = BlockSums(4)
         self._values = _Values()
 
     def forward(self) -> LossValues:
@@ -93,9 +96,9 @@ class DevicePhotometricLoss(PhotometricLoss):
             self._values = _Values()
         values, row = self._values, self._values.written
         width, height = self.images.width, self.images.height
-        self._compare_tiles(width, height, self._partial)
+        self._compare(width, height, self._partial)
         blocks = 3 * -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
-        sum_over_blocks(blocks, 4, self._partial, self._totals)
+        self._sum(blocks, self._partial, self._totals)
         values.sums[row] = self._totals
         values.written += 1
         return LateLossValues(values, row)
@@ -106,7 +109,7 @@ class DevicePhotometricLoss(PhotometricLoss):
     def backward(self, ssim_weight: float, scale: float = 1.0) -> None:
         """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM)."""
         by_l1, by_ssim = scale * (1.0 - ssim_weight), -scale * ssim_weight
-        self._differentiate_tiles(self.images.width, self.images.height, by_l1, by_ssim, self._totals)
+        self._differentiate(self.images.width, self.images.height, float(by_l1), float(by_ssim), self._totals)
 
     @ti.func
     def _at(self, buffer: ti.template(), start, x, y, width, height):

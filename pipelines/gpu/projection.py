@@ -7,6 +7,7 @@ import torch
 from fields.backend import torch_device
 from fields.gaussians import GaussianField
 from fields.late import Late
+from fields.launch import Launch
 from fields.projected import ProjectedGaussians
 from fields.view import ViewField
 from pipelines.gpu.reductions import THREADS, sum_over_block
@@ -30,6 +31,11 @@ class DeviceProjection(Projection):
         self.view = view
         self.projected = projected
         self._depths = torch.empty(0, dtype=torch.float32, device=torch_device())
+        self._cull, self._assign = Launch(self._cull_all), Launch(self._assign_sorted)
+        self._project, self._shade = Launch(self.project), Launch(self.shade)
+        self._clear = Launch(self._clear_tangent_gradients)
+        self._project_back, self._shade_back = Launch(self.project, reverse=True), Launch(self.shade, reverse=True)
+        self._sum_tangents = Launch(self._sum_all_tangents)
         self._tangent = torch.zeros(6, dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
@@ -41,13 +47,20 @@ class DeviceProjection(Projection):
         if len(self._depths) < n:
             self._depths = torch.empty(1 << (n - 1).bit_length(), dtype=torch.float32, device=torch_device())
         depths = self._depths[:n]
-        self._cull_all(depths)
+        self._cull(depths)
         # Stable: equal depths stay in the Gaussians' order.
         ordered, gaussian = torch.sort(depths, stable=True)
-        self._assign_sorted(ordered, gaussian)
-        self.project()
-        self.shade()
+        self._assign(ordered, gaussian)
+        self._project()
+        self._shade()
         return n
+
+    def backward(self) -> None:
+        """From the gradients in `projected` to those of the Gaussians and of the slots' camera tangents."""
+        if self.projected.count:
+            self._clear()
+            self._shade_back()
+            self._project_back()
 
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order. Waits for the device."""
@@ -55,7 +68,7 @@ class DeviceProjection(Projection):
 
     def late_camera_gradient(self) -> Late:
         """The same in float32, on its way."""
-        self._sum_all_tangents(self._tangent)
+        self._sum_tangents(self._tangent)
         return Late(self._tangent)
 
     @ti.kernel

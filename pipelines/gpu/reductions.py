@@ -5,8 +5,11 @@ kernel are one, of either size.
 """
 
 import taichi as ti
+import torch
 
-__all__ = ["THREADS", "THREAD_BITS", "max_over_block", "sum_over_block", "sum_over_blocks"]
+from fields.launch import Launch
+
+__all__ = ["THREADS", "THREAD_BITS", "BlockSums", "max_over_block", "sum_over_block"]
 
 # Of every block that adds: one of the two halves that meet at each level is a whole number of warps down to the last.
 THREADS = 256
@@ -40,17 +43,29 @@ def max_over_block(store: ti.template(), thread):
         ti.simt.block.sync()
 
 
-@ti.kernel
-def sum_over_blocks(blocks: ti.i32, quantities: ti.template(), partial: NUMBERS, out: NUMBERS):
-    """Add what the blocks of an earlier kernel have left: number c of block b at `partial[b * quantities + c]`."""
-    ti.loop_config(block_dim=THREADS)
-    for thread in range(THREADS):
-        store = ti.simt.block.SharedArray((quantities * THREADS,), ti.f32)
-        for c in ti.static(range(quantities)):
-            total = 0.0
-            for k in range((blocks - thread + THREADS - 1) >> THREAD_BITS):
-                total += partial[(thread + k * THREADS) * quantities + c]
-            store[c * THREADS + thread] = total
-        sum_over_block(store, thread, quantities)
-        if thread < quantities:
-            out[thread] = store[thread * THREADS]
+@ti.data_oriented
+class BlockSums:
+    """Adds what the blocks of an earlier kernel have left."""
+
+    def __init__(self, quantities: int) -> None:
+        self.quantities = quantities
+        self._launch = Launch(self._add)
+
+    def __call__(self, blocks: int, partial: torch.Tensor, out: torch.Tensor) -> None:
+        """Leave the sum over the blocks of number c, which is at `partial[block * quantities + c]`, in `out[c]`."""
+        self._launch(blocks, partial, out)
+
+    @ti.kernel
+    def _add(self, blocks: ti.i32, partial: NUMBERS, out: NUMBERS):
+        quantities = ti.static(self.quantities)
+        ti.loop_config(block_dim=THREADS)
+        for thread in range(THREADS):
+            store = ti.simt.block.SharedArray((quantities * THREADS,), ti.f32)
+            for c in ti.static(range(quantities)):
+                total = 0.0
+                for k in range((blocks - thread + THREADS - 1) >> THREAD_BITS):
+                    total += partial[(thread + k * THREADS) * quantities + c]
+                store[c * THREADS + thread] = total
+            sum_over_block(store, thread, quantities)
+            if thread < quantities:
+                out[thread] = store[thread * THREADS]
