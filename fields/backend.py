@@ -10,7 +10,7 @@ import numpy as np
 import taichi as ti
 import torch
 
-__all__ = ["growing", "initialise", "on_gpu", "refuse_too_many_fields", "torch_device", "without_waiting"]
+__all__ = ["describe", "growing", "initialise", "on_gpu", "refuse_too_many_fields", "torch_device", "without_waiting"]
 
 # Arrays of Taichi's runtime have this many entries, and it does not look.
 MAX_SNODES = 1024
@@ -64,6 +64,15 @@ def _has_cuda_driver() -> bool:
 def _start(arch: object, options: dict) -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=arch, **options)
+
+
+def describe(backend: str) -> str:
+    """What a run says of the backend that it took: the device's name, or why a GPU was left alone."""
+    if backend == "cuda":
+        return f"CUDA ({torch.cuda.get_device_name()})"
+    if backend == "cpu" and _has_cuda_driver() and not torch.cuda.is_available():
+        return "CPU (there is a CUDA driver, but this PyTorch cannot use it)"
+    return backend.upper() if backend == "cpu" else backend.capitalize()
 
 
 def on_gpu() -> bool:

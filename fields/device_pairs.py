@@ -36,6 +36,7 @@ class DevicePairs:
         self.total = ti.field(ti.i32)
         builder.dense(ti.i, max_tiles).place(self.first, self.tile_count, self.reached)
         builder.place(self.total)
+        self.last_placed = self.total
 
     def make_room(self, pairs: int) -> None:
         """Hold at least `pairs` pairs, up to `max_pairs`; what the tensors held is lost where they grow."""

@@ -44,6 +44,7 @@ class TilePairs:
         blocks.dense(ti.i, BLOCK).place(self.slot, self.rows)
         blocks.dense(ti.i, BLOCK).place(self.position)
         blocks.dense(ti.i, BLOCK).place(self.gradient)
+        self.last_placed = self.gradient.get_scalar_field(9)
 
     def rows_to_numpy(self) -> np.ndarray:
         """`rows` of all pairs (count,) int32, in the order of the lists."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fields.backend import initialise
+from fields.backend import describe, initialise
 from fields.camera import PinholeCamera
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
@@ -69,6 +69,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
+    console.print(f"device: {describe(backend)}", highlight=False, soft_wrap=True)
     tick = time.perf_counter()
     tracker = open_tracker(config, line.prepare)
     frames = iter(tracker)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,12 +35,18 @@ def pixel_metric(view: Keyframe) -> NDArray[np.float64]:
     The root mean square over a grid of pixels at two depths. In these coordinates a small turn and a small shift, which
     look alike, no longer stand in one another's way, and the scale of the scene cancels.
     """
-    camera = view.camera
+    return _pixel_metric(view.camera, view.median_depth)
+
+
+@lru_cache(maxsize=64)
+def _pixel_metric(camera: PinholeCamera, median_depth: float) -> NDArray[np.float64]:
     across, down = (np.arange(0.1, 1.0, 0.2) * side for side in (camera.width, camera.height))
     grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-    p = np.concatenate([camera.unproject(grid, np.full(len(grid), d * view.median_depth)) for d in NEAR_AND_FAR])
+    p = np.concatenate([camera.unproject(grid, np.full(len(grid), d * median_depth)) for d in NEAR_AND_FAR])
     J = pixel_jacobian(camera, p).reshape(-1, 6)
-    return np.linalg.inv(np.linalg.cholesky(J.T @ J / len(p))).T
+    W = np.linalg.inv(np.linalg.cholesky(J.T @ J / len(p))).T
+    W.flags.writeable = False
+    return W
 
 
 def reprojection(view: Keyframe, W: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

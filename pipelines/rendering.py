@@ -68,7 +68,7 @@ class Renderer:
         else:
             self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
         builder.finalize()
-        refuse_too_many_fields(self.pairs.reached)
+        refuse_too_many_fields(self.pairs.last_placed)
         projection, binning, compositing, development = DEVICE_STAGES if on_gpu() else STAGES
         self.projection = projection(gaussians, self.view, self.projected)
         self.binning = binning(self.view, self.projected, self.pairs)

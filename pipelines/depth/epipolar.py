@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from fields.backend import on_gpu
 from fields.keyframes import Keyframe
 from fields.parallel import HANDED_OUT
 from fields.se3 import inverse_se3
@@ -115,14 +116,24 @@ class EpipolarDepth:
         inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
         scores: ti.types.ndarray(dtype=ti.f32, ndim=2),
     ):
-        for i in range(pixels.shape[0] * SPREAD):
-            if i % SPREAD == 0:
-                self._score_pixel(i // SPREAD, grey, others, sizes, warps, pixels, inverse, scores)
+        if ti.static(on_gpu()):
+            # A thread a sample, which sums the patch anew: a quarter more work, in a hundred times as many threads.
+            samples = inverse.shape[0]
+            for i in range(pixels.shape[0] * samples):
+                s = i % samples
+                self._score_pixel(i // samples, s, s + 1, grey, others, sizes, warps, pixels, inverse, scores)
+        else:
+            for i in range(pixels.shape[0] * SPREAD):
+                if i % SPREAD == 0:
+                    n = i // SPREAD
+                    self._score_pixel(n, 0, inverse.shape[0], grey, others, sizes, warps, pixels, inverse, scores)
 
     @ti.func
     def _score_pixel(
         self,
         n,
+        begin,
+        end,
         grey: ti.template(),
         others: ti.template(),
         sizes: ti.template(),
@@ -140,7 +151,7 @@ class EpipolarDepth:
             mean += value / PATCH
             square += value * value
         square -= PATCH * mean * mean
-        for s in range(inverse.shape[0]):
+        for s in range(begin, end):
             total, seen = 0.0, 0
             if square > PATCH * MIN_CONTRAST * MIN_CONTRAST:
                 for j in range(warps.shape[0]):

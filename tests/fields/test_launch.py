@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+import taichi as ti
+import torch
+
+from fields.launch import Launch
+
+
+@ti.data_oriented
+class Sums:
+    def __init__(self) -> None:
+        self.x = ti.field(ti.f32, 4, needs_grad=True)
+        self.y = ti.field(ti.f32, 4, needs_grad=True)
+
+    @ti.kernel
+    def add(self, shift: ti.i32, factor: ti.f32, a: ti.types.ndarray(dtype=ti.f64, ndim=1)):
+        for i in range(4):
+            self.x[i] = shift + factor * a[i]
+
+    @ti.kernel
+    def read(self, out: ti.types.ndarray(dtype=ti.f32, ndim=2)):
+        for i in range(4):
+            out[0, i] = self.x[i]
+
+    @ti.kernel
+    def square(self):
+        for i in range(4):
+            self.y[i] = self.x[i] * self.x[i]
+
+
+def test_every_call_takes_its_own_arguments() -> None:
+    """The first, which Taichi checks, and those after it; arrays of NumPy and tensors, of any size."""
+    sums = Sums()
+    add, read = Launch(sums.add), Launch(sums.read)
+    out = torch.zeros((2, 4))
+    for call, array in enumerate((np.arange(4.0), np.arange(9.0), torch.arange(4, dtype=torch.float64))):
+        add(call, 0.5, array)
+        np.testing.assert_allclose(sums.x.to_numpy(), call + 0.5 * np.arange(4))
+        read(out)
+        np.testing.assert_allclose(out[0], call + 0.5 * np.arange(4))
+
+
+def test_objects_of_one_class_keep_apart() -> None:
+    first, second = Sums(), Sums()
+    launches = [Launch(first.add), Launch(second.add)]
+    for value in (1, 2):
+        for k, launch in enumerate(launches):
+            launch(10 * k + value, 0.0, np.zeros(4))
+    assert (first.x[0], second.x[0]) == (2, 12)
+
+
+def test_a_gradient_kernel_is_launched_as_well() -> None:
+    sums = Sums()
+    sums.x.from_numpy(np.arange(4, dtype=np.float32))
+    backward = Launch(sums.square, reverse=True)
+    for weight in (1.0, 3.0):
+        sums.x.grad.fill(0.0)
+        sums.y.grad.fill(weight)
+        backward()
+        np.testing.assert_allclose(sums.x.grad.to_numpy(), 2 * weight * np.arange(4))
+
+
+def test_wrong_types_of_the_first_call_are_refused() -> None:
+    with pytest.raises(ti.TaichiRuntimeTypeError):
+        Launch(Sums().add)("one", 0.5, np.zeros(4))
