@@ -22,13 +22,15 @@ class DevicePairs:
     of a slot one after another from `projected.first_pair`). Per sorted pair: `slot` of the projected Gaussian, `rows`
     as in `TilePairs`, and `origin`: its place in the emitted order.
 
-    total: pairs of the last view, on the device; those beyond `capacity` (the farthest) were left out.
+    room: how many pairs a view may have at present, of the `capacity` of the tensors; what is beyond the used ones is
+    sorted with them. total: pairs of the last view, on the device; those beyond `room` (the farthest) are left out.
     """
 
     def __init__(self, builder: ti.FieldsBuilder, max_tiles: int, max_pairs: int = 1 << 26) -> None:
         self.max_tiles = max_tiles
         self.max_pairs = max_pairs
         self.capacity = 0
+        self.room = 0
         self.device = torch_device()
         self.first = ti.field(ti.i32)
         self.tile_count = ti.field(ti.i32)
@@ -39,10 +41,14 @@ class DevicePairs:
         self.last_placed = self.total
 
     def make_room(self, pairs: int) -> None:
-        """Hold at least `pairs` pairs, up to `max_pairs`; what the tensors held is lost where they grow."""
-        if pairs <= self.capacity or self.capacity == self.max_pairs:
+        """Have room for `pairs` pairs, and less than a step more, up to `max_pairs`.
+
+        What the tensors held is lost where they grow.
+        """
+        self.room = n = min(-(-pairs // STEP) * STEP, self.max_pairs)
+        if n <= self.capacity:
             return
-        self.capacity = n = min(-(-pairs // STEP) * STEP, self.max_pairs)
+        self.capacity = n
         kind = torch.int16 if self.max_tiles < NO_TILE[torch.int16] else torch.int32
         self.key = torch.empty(n, dtype=kind, device=self.device)
         self.emitted_slot, self.slot, self.rows = (
@@ -55,4 +61,4 @@ class DevicePairs:
     @property
     def count(self) -> int:
         """Pairs of the last view that there was room for. Waits for the device."""
-        return min(self.total[None], self.capacity)
+        return min(self.total[None], self.room)

@@ -16,8 +16,8 @@ from pipelines.binning import Binning
 
 __all__ = ["DeviceBinning"]
 
-# Room for pairs, in totals of earlier views. A view that has more loses its farthest ones for a step.
-MARGIN = 1.5
+# Room for pairs: so many times the largest total of so many views before. A view that has more loses its farthest ones.
+MARGIN, MEMORY = 1.5, 64
 # Views after which a total is looked at: it has arrived by then, and always the same view's makes room.
 PATIENCE = 2
 
@@ -33,6 +33,7 @@ class DeviceBinning(Binning):
         self._count_tiles, self._emit_pairs = Launch(self._count_all), Launch(self._emit)
         self._arrange_pairs = Launch(self._arrange)
         self._totals: deque[Late] = deque()
+        self._known: deque[int] = deque(maxlen=MEMORY)
         self._counts = torch.empty(0, dtype=torch.int32, device=torch_device())
 
     def forward(self, exact: bool = True) -> None:
@@ -54,22 +55,22 @@ class DeviceBinning(Binning):
         ends = torch.cumsum(counts, 0)
         self._make_room(ends, exact)
         no_tile = NO_TILE[pairs.key.dtype]
-        self._emit_pairs(pairs.capacity, no_tile, tiles_x, tiles_y, ends, pairs.key, pairs.emitted_slot)
-        key, pairs.origin = torch.sort(pairs.key, stable=True)
+        used = pairs.key[: pairs.room]
+        self._emit_pairs(pairs.room, no_tile, tiles_x, tiles_y, ends, used, pairs.emitted_slot)
+        key, pairs.origin = torch.sort(used, stable=True)
         self._arrange_pairs(tiles_x * tiles_y, tiles_x, key, pairs.origin, pairs.emitted_slot, pairs.slot, pairs.rows)
 
     def _make_room(self, ends: torch.Tensor, exact: bool) -> None:
         self._totals.append(Late(ends[-1:]))
         # The first view has none before it.
-        exact = exact or self.pairs.capacity == 0
+        exact = exact or not self._known
         while self._totals and (exact or len(self._totals) > PATIENCE):
-            total = int(self._totals.popleft().numpy()[0])
-            if exact and not self._totals and total > self.pairs.max_pairs:
-                raise ValueError(
-                    f"{total} tile pairs exceed the room for {self.pairs.max_pairs}; the map is degenerate"
-                )
-            if total > self.pairs.capacity or self.pairs.capacity == 0:
-                self.pairs.make_room(max(int(MARGIN * total), 1))
+            self._known.append(int(self._totals.popleft().numpy()[0]))
+        if exact and self._known[-1] > self.pairs.max_pairs:
+            raise ValueError(
+                f"{self._known[-1]} tile pairs exceed the room for {self.pairs.max_pairs}; the map is degenerate"
+            )
+        self.pairs.make_room(max(int(MARGIN * max(self._known)), 1))
 
     @ti.kernel
     def _clear(self, tiles: ti.i32):
@@ -94,7 +95,7 @@ class DeviceBinning(Binning):
     @ti.kernel
     def _emit(
         self,
-        capacity: ti.i32,
+        room: ti.i32,
         no_tile: ti.i32,
         tiles_x: ti.i32,
         tiles_y: ti.i32,
@@ -106,22 +107,22 @@ class DeviceBinning(Binning):
             place = ti.i64(0)
             if s > 0:
                 place = ends[s - 1]
-            pair = ti.cast(ti.min(place, ti.cast(capacity, ti.i64)), ti.i32)
+            pair = ti.cast(ti.min(place, ti.cast(room, ti.i64)), ti.i32)
             self.projected.first_pair[s] = pair
             e = self._ellipse(s)
-            if e[4] > 0.0 and pair < capacity:
+            if e[4] > 0.0 and pair < room:
                 rows = self._tile_rows(s, e, tiles_y)
                 for tile_y in range(rows[0], rows[1]):
                     columns = self._tile_columns(s, e, tile_y, tiles_x)
-                    for tile_x in range(columns[0], ti.min(columns[1], columns[0] + capacity - pair)):
+                    for tile_x in range(columns[0], ti.min(columns[1], columns[0] + room - pair)):
                         key[pair] = tile_y * tiles_x + tile_x
                         slot[pair] = s
                         pair += 1
-        for pair in range(capacity):
+        for pair in range(room):
             if pair >= ends[ends.shape[0] - 1]:
                 key[pair] = no_tile
         # What fits in 32 bits: at most a step beyond the room.
-        self.pairs.total[None] = ti.cast(ti.min(ends[ends.shape[0] - 1], ti.cast(capacity, ti.i64) + 1), ti.i32)
+        self.pairs.total[None] = ti.cast(ti.min(ends[ends.shape[0] - 1], ti.cast(room, ti.i64) + 1), ti.i32)
 
     @ti.kernel
     def _arrange(

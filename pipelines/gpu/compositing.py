@@ -70,7 +70,7 @@ class DeviceCompositing:
             width, height = self.view.width, self.view.height
             differentiate = self._differentiate[with_depth]
             differentiate(width, height, pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
-            self._add_up(pairs.capacity, pairs.gradient)
+            self._add_up(pairs.room, pairs.gradient)
 
     @ti.func
     def _load(self, store: ti.template(), place, s):
@@ -319,7 +319,7 @@ class DeviceCompositing:
                 gradient[place * SUMS + entry % SUMS] = 0.0
 
     @ti.kernel
-    def _gather(self, capacity: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+    def _gather(self, room: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
         """Sum every slot's pairs, in their order, into the gradients of what was composited.
 
         Sixteen threads a slot, ten of them with a sum each: together they read a pair's gradient at once.
@@ -331,7 +331,7 @@ class DeviceCompositing:
             seen = self.projected.seen[None]
             total = 0.0
             if s < seen and c < SUMS:
-                end = ti.min(self.pairs.total[None], capacity)
+                end = ti.min(self.pairs.total[None], room)
                 if s + 1 < seen:
                     end = self.projected.first_pair[s + 1]
                 for k in range(self.projected.first_pair[s], end):
