@@ -45,6 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene.write_text(SCENE)
     result = run(scene)
     assert result.returncode == 0, result.stderr
+    assert "device: CPU" in result.stdout
     assert "9 frames" in result.stdout
     return scene.parent / "out"
 
