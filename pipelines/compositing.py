@@ -77,12 +77,12 @@ class Compositing:
         top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
         first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
         reached = 0
-        clearest = ti.cast(1.0, self.real)
+        not_opaque = ti.cast(1.0, self.real)
         for block in range((count + TEST_EVERY - 1) // TEST_EVERY):
             # An empty range rather than a `while` or `break`: with those Taichi fetches every field's root anew at
             # each pixel, and LLVM gives the inner loop up.
             start = block * TEST_EVERY
-            end = ti.select(clearest > OPAQUE, ti.min(start + TEST_EVERY, count), start)
+            end = ti.select(not_opaque > 0.0, ti.min(start + TEST_EVERY, count), start)
             for k in range(first + start, first + end):
                 s, rows = self.pairs.slot[k], self.pairs.rows[k]
                 mean, conic = self.projected.mean[s], self.projected.conic[s]
@@ -106,9 +106,10 @@ class Compositing:
                     T -= weight
                     self.images.transmittance[base + p] = ti.select(T > LEAST_TRANSMITTANCE, T, LEAST_TRANSMITTANCE)
             reached = ti.select(end > start, end, reached)
-            clearest = ti.cast(0.0, self.real)
+            # Counted: LLVM makes vector code of a sum, not of a maximum of floats.
+            not_opaque = ti.cast(0.0, self.real)
             for p in range(TILE_PIXELS):
-                clearest = ti.max(clearest, self.images.transmittance[base + p])
+                not_opaque += ti.select(self.images.transmittance[base + p] > OPAQUE, 1.0, 0.0)
         self.pairs.reached[tile] = reached
 
         stride, plane = ti.static(self.images.stride, self.images.plane)
