@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
-from fields.pyramid import ImageLevel, build_pyramid
+from fields.pyramid import ImageLevel
 from fields.se3 import interpolate_se3, inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 
@@ -100,10 +100,9 @@ class KeyframeStore:
         """`frame` as a keyframe would be, with the pose and exposure that those around it imply, but not kept."""
         depth = frame.points.depths(frame.T_camera_world)
         depth = depth[depth > 0]
-        rgba = frame.rgba()
         return Keyframe(
             index=frame.index,
-            rgba=rgba,
+            rgba=frame.rgba,
             camera=frame.camera,
             T_tracked=frame.T_camera_world.copy(),
             T_camera_world=self.corrected(frame.index, frame.T_camera_world),
@@ -112,7 +111,7 @@ class KeyframeStore:
             error=float(np.mean([k.error for k in self._keyframes])) if self._keyframes else 1.0,
             vignette=frame.vignette,
             exposure=self.exposure_at(frame.index),
-            pyramid=build_pyramid(rgba, frame.camera, levels),
+            pyramid=frame.pyramid[:levels],
         )
 
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:
