@@ -36,7 +36,7 @@ from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
 from pipelines.stopwatch import breakdown_percent
 
-__all__ = ["run_scene"]
+__all__ = ["build_mapper", "run_scene"]
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Versions of a map that metrics.json has room for; null where a run does not make one.
@@ -82,7 +82,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
             console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
-        mapper = _build_mapper(config, first.camera)
+        mapper = build_mapper(config, first.camera)
         watch = mapper.stopwatch
         watch.seconds["track"] = prepared
         with line.working("compiling kernels (the first time on this machine takes longest)"):
@@ -152,8 +152,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     return config.output
 
 
-def _build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:
-    """The mapper of the scene's mode, for images of this camera."""
+def build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:
+    """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
     try:
         if config.mode == "offline":
             return OfflineMapper(config.offline, camera.width, camera.height, config.seed)

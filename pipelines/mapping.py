@@ -188,6 +188,8 @@ class OnlineMapper:
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.depth.estimate(view, [store[0]], pixels)
             self.renderer.camera_gradient()
+            self.renderer.images.clip_colour()
             self.renderer.images.colour_to_numpy()
+            self.gaussians.to_numpy()
             self.renderer.view_renders = 0
             self.gaussians.remove(np.zeros(len(self.gaussians), dtype=bool))
