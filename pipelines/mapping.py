@@ -155,7 +155,8 @@ class OnlineMapper:
             column, row = np.floor(pixels).astype(int).T
             depth = self.settings.depth
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
-            neighbours = [k for k in self.keyframes if k.index != view.index][-depth.neighbours :]
+            last = len(self.keyframes) - 1  # that of `view`
+            neighbours = [self.keyframes[j] for j in range(max(0, last - depth.neighbours), last)]
             seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit)
         self._grow(seeds, view)
 
