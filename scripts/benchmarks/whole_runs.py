@@ -1,0 +1,31 @@
+"""Whole runs of scenes, online, as a user starts them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments import Job, execute, named_scenes
+
+__all__ = ["measure_runs"]
+
+
+def measure_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Figures of metrics.json of a run of every scene file, without refinement, by the scene's name.
+
+    settings: overrides by key. Raises InputError for scenes that cannot be run.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        overrides = {"refine.steps": "0", "device": device, **settings}
+        jobs = [
+            Job(f"whole run of {name}", scene, Path(folder) / name, overrides)
+            for name, scene in named_scenes(scenes).items()
+        ]
+        results = execute(jobs)
+    kept = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "seconds", "breakdown_percent")
+    return {
+        job.folder.name: {key: metrics[key] for key in kept} | {"psnr": metrics["online"]["held_out"]["psnr"]}
+        for job, metrics in zip(jobs, results, strict=True)
+    }
