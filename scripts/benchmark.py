@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import report
+from benchmarks.whole_runs import measure_runs, planned_runs
 from experiments import command_line, write_report
 
 from modp_ti.errors import InputError
@@ -30,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="also write benchmark.md and .json there")
     parser.add_argument("--quick", action="store_true", help="the first size only; no growth, no voxels, no whole run")
-    parser.add_argument("--device", choices=("cpu", "cuda", "auto"), default="cpu", help="default cpu")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
     parser.add_argument("--scene", action="append", metavar="FILE", help="scene of a whole run (default: the demo)")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="a setting of the whole runs"
@@ -56,6 +57,9 @@ def main() -> None:
 def collect(arguments: argparse.Namespace) -> dict[str, Any]:
     """All figures, each kind under its name."""
     device, repeats = arguments.device, arguments.repeats
+    runs = (arguments.scene or [str(DEMO)], device, command_line(arguments.settings))
+    if not arguments.quick:
+        planned_runs(*runs, Path())  # bad input ends here, not after the minutes before the runs
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = [cores] if device == "cuda" else sorted({1, cores})
     on = {"device": device, "threads": cores}
@@ -73,9 +77,7 @@ def collect(arguments: argparse.Namespace) -> dict[str, Any]:
     figures["growth"] = in_process("growth", **on, repeats=repeats)
     figures["frames"] = in_process("frames", **on)
     figures["voxels"] = in_process("voxels", **on)
-    from benchmarks.whole_runs import measure_runs
-
-    figures["runs"] = measure_runs(arguments.scene or [str(DEMO)], device, command_line(arguments.settings))
+    figures["runs"] = measure_runs(*runs)
     return figures
 
 

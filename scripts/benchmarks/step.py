@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import taichi as ti
+import time
 
 from benchmarks.scene import Size, add_gaussians, noise_frame
 from benchmarks.timing import milliseconds, peak_memory_mb, stage_milliseconds
@@ -33,7 +33,9 @@ ADAM_BYTES = (14 * 4 + 2) * 4 * 2
 
 
 def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool = False) -> dict[str, float]:
-    """Milliseconds of each of STAGES and of a whole `step`, counts of pairs, and `peak_memory_mb`.
+    """Milliseconds of each of STAGES and of a whole `step`, counts of pairs, `peak_memory_mb`, and `cores_had`.
+
+    The last is how many cores worked on the steps: far fewer than threads where others use the machine.
 
     twin: also those of the plain pixel-outer compositing that the tests compare with (CPU).
     """
@@ -73,7 +75,8 @@ def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool
         plain = ReferenceCompositing(renderer.view, renderer.projected, renderer.pairs, renderer.images)
         figures["twin"] = milliseconds(plain.forward, min(repeats, 5))
         figures["twin backward"] = milliseconds(plain.backward, min(repeats, 5))
+    wall, busy = time.perf_counter(), time.process_time()
     figures["step"] = milliseconds(lambda: optimiser.step(store, [0], still, pose_rate=0.0), repeats)
-    ti.sync()
+    figures["cores_had"] = (time.process_time() - busy) / (time.perf_counter() - wall)
     figures["peak_memory_mb"] = peak_memory_mb()
     return figures

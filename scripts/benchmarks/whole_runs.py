@@ -9,20 +9,27 @@ from typing import Any
 
 from experiments import Job, execute, named_scenes
 
-__all__ = ["measure_runs"]
+__all__ = ["measure_runs", "planned_runs"]
 
 
-def measure_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Figures of metrics.json of a run of every scene file, without refinement, by the scene's name.
+def planned_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str], folder: Path) -> list[Job]:
+    """A run of every scene file, without refinement, into folders by the scenes' names in `folder`.
 
     settings: overrides by key. Raises InputError for scenes that cannot be run.
     """
+    overrides = {"refine.steps": "0", "device": device, **settings}
+    jobs = [
+        Job(f"whole run of {name}", scene, folder / name, overrides) for name, scene in named_scenes(scenes).items()
+    ]
+    for job in jobs:
+        job.check()
+    return jobs
+
+
+def measure_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Figures of metrics.json of the planned runs, by the scene's name. Raises InputError where one fails."""
     with tempfile.TemporaryDirectory() as folder:
-        overrides = {"refine.steps": "0", "device": device, **settings}
-        jobs = [
-            Job(f"whole run of {name}", scene, Path(folder) / name, overrides)
-            for name, scene in named_scenes(scenes).items()
-        ]
+        jobs = planned_runs(scenes, device, settings, Path(folder))
         results = execute(jobs)
     kept = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "seconds", "breakdown_percent")
     return {

@@ -45,6 +45,7 @@ def test_a_step_is_measured_by_stage_and_its_pairs_are_counted() -> None:
     # Rows between the first and the last that it touches count too, as do those that it only just misses.
     assert touched <= figures["pairs visited"] <= 1.1 * touched
     assert figures["pairs visited"] <= figures["pairs of whole tiles"]
+    assert 0.0 < figures["cores_had"] <= 2.05
     assert figures["pairs of whole tiles"] % (TILE_WIDTH * TILE_HEIGHT) == 0
 
 
@@ -75,7 +76,11 @@ def made_up(kind: str, **arguments: object) -> object:
         return {"3": {"query": 1.0, "update": 2.0, "admit": 3.0, "megabytes": 4.0}}
     figures = dict.fromkeys(STAGES, 4.0 / threads)
     figures |= {"step": 40.0 / threads, "pairs visited": 1e6, "pairs of whole tiles": 2e6, "visible": 1000}
-    return figures | {"peak_memory_mb": 321.0} | ({"twin": 8.0, "twin backward": 12.0} if arguments["twin"] else {})
+    return (
+        figures
+        | {"peak_memory_mb": 321.0, "cores_had": 0.9 * threads}
+        | ({"twin": 8.0, "twin backward": 12.0} if arguments["twin"] else {})
+    )
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
@@ -94,6 +99,7 @@ def test_the_tables_say_what_was_measured(monkeypatch, two_cores, tmp_path: Path
     text = (tmp_path / "benchmark.md").read_text()
     assert capsys.readouterr().out == text
     assert "1.00 million pixel-Gaussian pairs visited, 2.00 million over whole tiles" in text
+    assert "Cores at work in a step: 0.90 with 1 thread, 1.80 with 2 threads;" in text
     assert "| forward, 1 thread | 4.00 | 2.00 | 2.0 |" in text
     assert "| backward, 2 threads | 2.00 | 1.00 | – |" in text
     assert "| **whole step** | 40.00 | 20.00 | 2.00 |" in text
@@ -125,9 +131,10 @@ def test_whole_runs_are_those_of_the_scenes_that_are_named(
     assert f"| {name} | 9 | 5 | 1,000 | 0.18 | 10.0 | 2.00 | 700 | 21.00 |" in text
 
 
-def test_bad_input_gets_one_line_and_exit_code_two(monkeypatch, two_cores, capsys) -> None:
+def test_bad_input_gets_one_line_and_exit_code_two_before_anything_is_measured(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(benchmark, "in_process", lambda *_, **__: pytest.fail("measured"))
     with pytest.raises(SystemExit) as ended:
         run(monkeypatch, "--scene", "gone.yaml")
     assert ended.value.code == 2
-    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(error) == 1 and "gone.yaml" in error[0]
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and "gone.yaml" in error
