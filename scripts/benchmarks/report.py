@@ -43,7 +43,8 @@ def _step(row: Mapping[str, Any], machine: Mapping[str, Figures]) -> list[str]:
         f"## {size}",
         "",
         f"{visited / 1e6:.2f} million pixel-Gaussian pairs visited, {whole / 1e6:.2f} million over whole tiles; "
-        f"{first['visible']:,.0f} Gaussians visible; peak memory of the process {last['peak_memory_mb']:.0f} MB. Cores at work in a step: "
+        f"{first['visible']:,.0f} Gaussians visible; peak memory of the process {last['peak_memory_mb']:.0f} MB. "
+        "Cores at work in a step: "
         + ", ".join(f"{of['cores_had']:.2f} with {_threads(n)}" for n, of in runs.items())
         + "; far fewer than threads where others use the machine.",
     ]
