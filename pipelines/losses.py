@@ -74,6 +74,7 @@ class PhotometricLoss:
             self.images.height,
             scale * (1.0 - ssim_weight) / count,
             -scale * ssim_weight / count,
+            3,
         )
 
     @ti.kernel
@@ -162,13 +163,15 @@ class PhotometricLoss:
         sums[unit, 3] = count
 
     @ti.kernel
-    def _differentiate(self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64):
+    def _differentiate(self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64, partials: ti.i32):
+        # partials is 3, but not a constant: LLVM would unroll the loops over them, and compile a second longer at
+        # every start of a process for a kernel that is no faster.
         for i in range((3 * STRIPS) * SPREAD):
             if i % SPREAD == 0:
-                self._differentiate_unit(i // SPREAD, width, height, l1_scale, ssim_scale)
+                self._differentiate_unit(i // SPREAD, width, height, l1_scale, ssim_scale, partials)
 
     @ti.func
-    def _differentiate_unit(self, unit, width, height, l1_scale, ssim_scale):
+    def _differentiate_unit(self, unit, width, height, l1_scale, ssim_scale, partials):
         stride, plane = ti.static(self.images.stride, self.images.plane)
         channel = unit // STRIPS * plane
         partial = unit // STRIPS * 3 * plane
@@ -177,7 +180,7 @@ class PhotometricLoss:
         self.images.rows[scratch] = 0.0
         by_l1, by_ssim = ti.cast(l1_scale, self.real), ti.cast(ssim_scale, self.real)
         for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
-            for q in range(3):
+            for q in range(partials):
                 top = partial + q * plane + (y + PAD - RADIUS) * stride
                 target = scratch + q * stride
                 for x in range(width + 2 * PAD):
@@ -185,7 +188,7 @@ class PhotometricLoss:
                     for k in ti.static(range(2 * RADIUS + 1)):
                         total += self.weights[k] * self.images.ssim_partial[top + k * stride + x]
                     self.images.rows[target + x] = total
-            self._smooth_rows(scratch, 3, width)
+            self._smooth_rows(scratch, partials, width)
             row = (y + PAD) * stride + PAD
             smooth = scratch + 5 * stride
             for x in range(width):
