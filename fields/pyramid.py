@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 
-__all__ = ["ImageLevel", "build_pyramid"]
+__all__ = ["MAX_LEVELS", "ImageLevel", "build_pyramid"]
+
+# The eighth halving of the largest image that anyone maps is a thumbnail.
+MAX_LEVELS = 8
 
 # No level is made whose shorter side would have fewer pixels: with levels down to 33 pixels the maps of desk and fox
 # lose half a decibel and more. Half of 320x240 is still worth its speed.
@@ -25,7 +28,7 @@ class ImageLevel:
     camera: PinholeCamera
 
 
-def build_pyramid(rgba: NDArray[np.uint8], camera: PinholeCamera, levels: int) -> tuple[ImageLevel, ...]:
+def build_pyramid(rgba: NDArray[np.uint8], camera: PinholeCamera, levels: int = MAX_LEVELS) -> tuple[ImageLevel, ...]:
     """Up to `levels` levels of halved size, the given image first.
 
     A pixel is the mean of those that it covers, and valid where all of them are.

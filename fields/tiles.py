@@ -5,9 +5,10 @@ import taichi as ti
 
 __all__ = ["TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
 
-# Powers of two; a row of a tile is one AVX-512 vector of float32.
-TILE_WIDTH = 16
-TILE_HEIGHT = 16
+# Powers of two. A row of a tile is one vector of eight float32, as LLVM makes them even where there are wider ones:
+# what an ellipse does not reach of a row is wasted work. A tall tile wastes none, and keeps the pairs few.
+TILE_WIDTH = 8
+TILE_HEIGHT = 32
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 BLOCK = 4096
 

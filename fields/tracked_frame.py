@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
+from fields.pyramid import ImageLevel, build_pyramid
 
 __all__ = ["SparsePoints", "TrackedFrame"]
 
@@ -56,6 +58,8 @@ class TrackedFrame:
     vignette: (H, W, 3) float32 in (0, 1], the share of the light that reaches each pixel, one array for all frames of
     a camera; None for all of it. The image shows the scene times the vignette.
     held_out: only for evaluation; such a frame never touches the map.
+
+    `rgba` and `pyramid` are made when first asked for, which a thread may do before the mapper takes the frame in.
     """
 
     index: int
@@ -83,6 +87,7 @@ class TrackedFrame:
         if self.T_camera_world.shape != (4, 4) or not np.isfinite(self.T_camera_world).all():
             raise ValueError(f"{self.name}: T_camera_world must be a finite 4x4 matrix")
 
+    @cached_property
     def rgba(self) -> NDArray[np.uint8]:
         """The image with 8 bits a channel (H, W, 4), 255 in the last where the pixel is valid and all 0 where not."""
         rgba = np.full((*self.image.shape[:2], 4), 255, dtype=np.uint8)
@@ -90,3 +95,8 @@ class TrackedFrame:
         if self.mask is not None:
             rgba[~self.mask] = 0
         return rgba
+
+    @cached_property
+    def pyramid(self) -> tuple[ImageLevel, ...]:
+        """`rgba` and its halved sizes, as many levels as `build_pyramid` makes."""
+        return build_pyramid(self.rgba, self.camera)

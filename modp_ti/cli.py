@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from modp_ti.run import run
+from modp_ti.warmup import warmup
 
 __all__ = ["app"]
 
@@ -16,11 +17,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("run")(run)
-
-
-@app.callback()
-def _subcommands() -> None:
-    """Makes `run` a subcommand although it is, so far, the only one."""
+app.command("warmup")(warmup)
 
 
 if __name__ == "__main__":

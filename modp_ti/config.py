@@ -55,6 +55,12 @@ class SourceSettings(StrictModel):
     mask_tolerance: int = Field(
         0, ge=0, le=255, description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG"
     )
+    prefetch: int = Field(
+        4,
+        ge=0,
+        description="frames that a thread decodes, undistorts and halves ahead of the mapper; 0 for no thread. "
+        "The map is the same",
+    )
     vignette: Path | None = Field(
         None, description="image of how much light reaches each pixel, brightest where all does; empty for none"
     )

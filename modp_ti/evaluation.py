@@ -99,7 +99,7 @@ def score_frame(
     The render is developed with the frame's exposure (3, 4) and vignette, and clipped to [0, 1]. Masked pixels do not
     count and are shown as in the frame.
     """
-    rgba = frame.rgba()
+    rgba = frame.rgba
     renderer.forward(frame.camera, T_camera_world, near)
     renderer.develop(exposure, frame.vignette)
     renderer.images.clip_colour()

@@ -28,14 +28,15 @@ from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats, write_splats
 from modp_ti.exports.trajectory import write_trajectory
 from modp_ti.lpips import open_lpips
+from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
-from modp_ti.trackers import frame_count, open_tracker
+from modp_ti.trackers import frame_count, may_read_ahead, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
 from pipelines.stopwatch import breakdown_percent
 
-__all__ = ["run_scene"]
+__all__ = ["build_mapper", "run_scene"]
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Versions of a map that metrics.json has room for; null where a run does not make one.
@@ -72,24 +73,25 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     console.print(f"device: {describe(backend)}", highlight=False, soft_wrap=True)
     tick = time.perf_counter()
     tracker = open_tracker(config, line.prepare)
-    frames = iter(tracker)
-    first = next(frames, None)
-    if first is None:
-        raise InputError("the tracker delivered no frame: nothing to map")
-    prepared = time.perf_counter() - tick
-    lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
-    for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
-        console.print(f"note: {note}", highlight=False, soft_wrap=True)
+    ahead = config.source.prefetch if may_read_ahead(tracker) else 0
+    with FramesAhead(tracker, ahead) as frames:
+        first = next(frames, None)
+        if first is None:
+            raise InputError("the tracker delivered no frame: nothing to map")
+        prepared = time.perf_counter() - tick
+        lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
+        for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
+            console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
-    mapper = _build_mapper(config, first.camera)
-    watch = mapper.stopwatch
-    watch.seconds["track"] = prepared
-    with line.working("compiling kernels (the first time on this machine takes longest)"):
-        mapper.compile()
-    tick = time.perf_counter()
-    line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
-    poses = _map(mapper, chain([first], _timed(frames, watch)), line)
-    mapping_seconds = time.perf_counter() - tick
+        mapper = build_mapper(config, first.camera)
+        watch = mapper.stopwatch
+        watch.seconds["track"] = prepared
+        with line.working("compiling kernels (the first time on this machine takes longest)"):
+            mapper.compile()
+        tick = time.perf_counter()
+        line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
+        poses = _map(mapper, chain([first], _timed(frames, watch)), line)
+        mapping_seconds = time.perf_counter() - tick
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -122,7 +124,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
                 _write_pair(staging / "renders" / f"{frame.index:06d}.png", frame.image, render)
 
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
-            scores = evaluate(mapper, tracker, versions, lpips, keep)
+            with FramesAhead(tracker, ahead) as again:
+                scores = evaluate(mapper, again, versions, lpips, keep)
         write_scores(staging / "scores.csv", scores)
         metrics = {
             "frames": len(poses.index),
@@ -150,8 +153,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     return config.output
 
 
-def _build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:
-    """The mapper of the scene's mode, for images of this camera."""
+def build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:
+    """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
     try:
         if config.mode == "offline":
             return OfflineMapper(config.offline, camera.width, camera.height, config.seed)
@@ -163,20 +166,22 @@ def _build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | 
 def _map(mapper: OnlineMapper | OfflineMapper, frames: Iterable[TrackedFrame], line: ProgressLine) -> Poses:
     """Take all frames in, and finish the map; their poses."""
     poses, size = Poses(), None
-    for frame in frames:
-        size = size or (frame.camera.width, frame.camera.height)
-        if (frame.camera.width, frame.camera.height) != size:
-            raise InputError(
-                f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
-                "all images of a scene must have one size"
-            )
-        poses.add(frame)
-        line.frame(None if frame.held_out else mapper.process(frame))
-    if isinstance(mapper, OfflineMapper):
-        _optimise_offline(mapper, line)
-    else:
-        mapper.finish()
-    line.stop()
+    try:
+        for frame in frames:
+            size = size or (frame.camera.width, frame.camera.height)
+            if (frame.camera.width, frame.camera.height) != size:
+                raise InputError(
+                    f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
+                    "all images of a scene must have one size"
+                )
+            poses.add(frame)
+            line.frame(None if frame.held_out else mapper.process(frame))
+        if isinstance(mapper, OfflineMapper):
+            _optimise_offline(mapper, line)
+        else:
+            mapper.finish()
+    finally:
+        line.stop()
     return poses
 
 
@@ -200,7 +205,7 @@ def _optimise_offline(mapper: OfflineMapper, line: ProgressLine) -> None:
 
 
 def _timed(frames: Iterator[TrackedFrame], watch) -> Iterator[TrackedFrame]:
-    """The frames, the time that each takes to come counted as reading."""
+    """The frames, the time that the mapper waits for each counted as reading."""
     while True:
         with watch.measure("read"):
             frame = next(frames, None)

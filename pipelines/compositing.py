@@ -15,14 +15,16 @@ from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TilePairs
 from fields.view import ViewField
-from pipelines.fast_exp import fast_exp
+from pipelines.fast_exp2 import LOG2E, fast_exp2
 from pipelines.projection import ALPHA_MIN
 
 __all__ = ["ALPHA_MAX", "OPAQUE", "Compositing"]
 
 ALPHA_MAX = 0.99
-# A pixel takes no further Gaussian once less than this passes: below what 8 bits or the tests can see.
+# A tile takes no further Gaussian once less than this passes at all of its pixels: below what 8 bits or the tests see.
 OPAQUE = 1e-5
+# Transmittance ends here: far below what counts, and above where numbers are denormal and processors slow.
+LEAST_TRANSMITTANCE = 1e-20
 # Gaussians between two tests of whether the whole tile is opaque.
 TEST_EVERY = 16
 ROW_BITS = TILE_WIDTH.bit_length() - 1
@@ -75,36 +77,39 @@ class Compositing:
         top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
         first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
         reached = 0
-        clearest = ti.cast(1.0, self.real)
+        not_opaque = ti.cast(1.0, self.real)
         for block in range((count + TEST_EVERY - 1) // TEST_EVERY):
             # An empty range rather than a `while` or `break`: with those Taichi fetches every field's root anew at
             # each pixel, and LLVM gives the inner loop up.
             start = block * TEST_EVERY
-            end = ti.select(clearest > OPAQUE, ti.min(start + TEST_EVERY, count), start)
+            end = ti.select(not_opaque > 0.0, ti.min(start + TEST_EVERY, count), start)
             for k in range(first + start, first + end):
                 s, rows = self.pairs.slot[k], self.pairs.rows[k]
                 mean, conic = self.projected.mean[s], self.projected.conic[s]
                 opacity, colour = self.projected.opacity[s], self.projected.colour[s]
                 z = self.projected.depth[s]
                 x0, y0 = left - mean[0], top - mean[1]
-                a, b, c = -0.5 * conic[0], -conic[1], -0.5 * conic[2]
+                a, b, c = -0.5 * LOG2E * conic[0], -LOG2E * conic[1], -0.5 * LOG2E * conic[2]
                 for p in range((rows & 0xFFFF) << ROW_BITS, (rows >> 16) << ROW_BITS):
                     dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
                     dy = y0 + ti.cast(p >> ROW_BITS, self.real)
                     power = (a * dx + b * dy) * dx + c * dy * dy
-                    alpha = ti.min(opacity * fast_exp(power, self.real), ALPHA_MAX)
+                    alpha = opacity * fast_exp2(power, self.real)
+                    alpha = ti.select(alpha < ALPHA_MAX, alpha, ALPHA_MAX)
+                    alpha = ti.select(alpha >= ALPHA_MIN, alpha, 0.0)
                     T = self.images.transmittance[base + p]
-                    alpha = ti.select((alpha >= ALPHA_MIN) & (T > OPAQUE), alpha, 0.0)
                     weight = alpha * T
                     self.images.red[base + p] = self.images.red[base + p] + weight * colour[0]
                     self.images.green[base + p] = self.images.green[base + p] + weight * colour[1]
                     self.images.blue[base + p] = self.images.blue[base + p] + weight * colour[2]
                     self.images.z[base + p] = self.images.z[base + p] + weight * z
-                    self.images.transmittance[base + p] = T - weight
+                    T -= weight
+                    self.images.transmittance[base + p] = ti.select(T > LEAST_TRANSMITTANCE, T, LEAST_TRANSMITTANCE)
             reached = ti.select(end > start, end, reached)
-            clearest = ti.cast(0.0, self.real)
+            # Counted: LLVM makes vector code of a sum, not of a maximum of floats.
+            not_opaque = ti.cast(0.0, self.real)
             for p in range(TILE_PIXELS):
-                clearest = ti.max(clearest, self.images.transmittance[base + p])
+                not_opaque += ti.select(self.images.transmittance[base + p] > OPAQUE, 1.0, 0.0)
         self.pairs.reached[tile] = reached
 
         stride, plane = ti.static(self.images.stride, self.images.plane)
@@ -183,7 +188,7 @@ class Compositing:
             opacity, colour = self.projected.opacity[s], self.projected.colour[s]
             z = self.projected.depth[s]
             x0, y0 = left - mean[0], top - mean[1]
-            a, b, c = -0.5 * conic[0], -conic[1], -0.5 * conic[2]
+            a, b, c = -0.5 * LOG2E * conic[0], -LOG2E * conic[1], -0.5 * LOG2E * conic[2]
             zero = ti.cast(0.0, self.real)
             g_red, g_green, g_blue, g_z, g_power = zero, zero, zero, zero, zero
             g_x, g_y, g_xx, g_xy, g_yy = zero, zero, zero, zero, zero
@@ -191,10 +196,10 @@ class Compositing:
                 dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
                 dy = y0 + ti.cast(p >> ROW_BITS, self.real)
                 power = (a * dx + b * dy) * dx + c * dy * dy
-                unclamped = opacity * fast_exp(power, self.real)
+                unclamped = opacity * fast_exp2(power, self.real)
+                alpha = ti.select(unclamped < ALPHA_MAX, unclamped, ALPHA_MAX)
+                alpha = ti.select(alpha >= ALPHA_MIN, alpha, 0.0)
                 T = self.images.transmittance[base + p]
-                alpha = ti.min(unclamped, ALPHA_MAX)
-                alpha = ti.select((alpha >= ALPHA_MIN) & (T > OPAQUE), alpha, 0.0)
                 weight = alpha * T
                 red_grad = self.images.red_grad[base + p]
                 green_grad = self.images.green_grad[base + p]
@@ -206,7 +211,8 @@ class Compositing:
                 contribution = weight * shade
                 behind = self.images.behind[base + p] - contribution
                 self.images.behind[base + p] = behind
-                self.images.transmittance[base + p] = T - weight
+                T -= weight
+                self.images.transmittance[base + p] = ti.select(T > LEAST_TRANSMITTANCE, T, LEAST_TRANSMITTANCE)
                 # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
                 power_grad = contribution - behind * alpha / (1.0 - alpha)
                 power_grad = ti.select(unclamped > ALPHA_MAX, 0.0, power_grad)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from fields.keyframes import Keyframe
+from fields.running_median import RunningMedian
 from fields.se3 import inverse_se3
 from fields.tracked_frame import TrackedFrame
 from pipelines.settings import KeyframeSettings
@@ -63,21 +64,21 @@ class KeyframeSelector:
     def __init__(self, settings: KeyframeSettings) -> None:
         self.settings = settings
         self._previous: TrackedFrame | None = None
-        self._rotations: list[float] = []
+        self._rotations = RunningMedian()  # [degrees per frame]
 
     def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
         """Whether `frame` becomes a keyframe, `last` being the latest one."""
         previous, self._previous = self._previous, frame
+        rotation = 0.0 if previous is None else rotation_per_frame(previous, frame)
         if previous is not None:
-            self._rotations.append(rotation_per_frame(previous, frame))
+            self._rotations.add(rotation)
         if len(frame.points) < self.settings.min_points:
             return False
         if last is None or previous is None:
             return True
         if frame.index - last.index > self.settings.max_gap:
             return True
-        rotation = self._rotations[-1]
-        if rotation > max(self.settings.max_rotation, 3.0 * float(np.median(self._rotations))):
+        if rotation > max(self.settings.max_rotation, 3.0 * self._rotations.value):
             return False
         moved = np.linalg.norm(camera_centre(frame.T_camera_world) - camera_centre(last.T_camera_world))
         if moved > self.settings.baseline * last.median_depth:

@@ -3,7 +3,8 @@
 SSIM [Wang 2004] with an 11x11 Gaussian window (sigma 1.5), zeros beyond the border, as in 3DGS. With the local moments
 mu = G*x, e_xx = G*xx, e_xy = G*xy, the gradient is
     d S / d x = G*(dS/dmu) + 2 x (G*(dS/de_xx)) + y (G*(dS/de_xy)).
-Both convolutions are separable and work on strips of rows whose scratch stays in the cache.
+Both convolutions are separable and work on strips of rows whose scratch stays in the cache. S needs the sum of e_xx and
+e_yy alone: one moment less to smooth.
 """
 
 from dataclasses import dataclass
@@ -82,6 +83,7 @@ class PhotometricLoss:
             self.images.height,
             scale * (1.0 - ssim_weight) / count,
             -scale * ssim_weight / count,
+            3,
         )
 
     @ti.kernel
@@ -129,29 +131,28 @@ class PhotometricLoss:
         for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
             top = channel + (y + PAD - RADIUS) * stride
             for x in range(width + 2 * PAD):
-                mu_x, mu_y, xx, yy, xy = zero, zero, zero, zero, zero
+                mu_x, mu_y, squares, xy = zero, zero, zero, zero
                 for k in ti.static(range(2 * RADIUS + 1)):
                     a = self.images.colour[top + k * stride + x]
                     b = self.images.reference[top + k * stride + x]
                     wa, wb = self.weights[k] * a, self.weights[k] * b
                     mu_x, mu_y = mu_x + wa, mu_y + wb
-                    xx, yy, xy = xx + wa * a, yy + wb * b, xy + wa * b
+                    squares, xy = squares + (wa * a + wb * b), xy + wa * b
                 self.images.rows[scratch + x] = mu_x
                 self.images.rows[scratch + stride + x] = mu_y
-                self.images.rows[scratch + 2 * stride + x] = xx
-                self.images.rows[scratch + 3 * stride + x] = yy
-                self.images.rows[scratch + 4 * stride + x] = xy
-            self._smooth_rows(scratch, 5, width)
+                self.images.rows[scratch + 2 * stride + x] = squares
+                self.images.rows[scratch + 3 * stride + x] = xy
+            self._smooth_rows(scratch, 4, width)
             row = (y + PAD) * stride + PAD
             smooth = scratch + 5 * stride
             for x in range(width):
                 mu_x, mu_y = self.images.rows[smooth + x], self.images.rows[smooth + stride + x]
-                var_x = self.images.rows[smooth + 2 * stride + x] - mu_x * mu_x
-                var_y = self.images.rows[smooth + 3 * stride + x] - mu_y * mu_y
-                covariance = self.images.rows[smooth + 4 * stride + x] - mu_x * mu_y
+                mean_square = mu_x * mu_x + mu_y * mu_y
+                variances = self.images.rows[smooth + 2 * stride + x] - mean_square
+                covariance = self.images.rows[smooth + 3 * stride + x] - mu_x * mu_y
                 # S = (A1 A2) / (B1 B2)
-                A1, B1 = 2.0 * mu_x * mu_y + C1, mu_x * mu_x + mu_y * mu_y + C1
-                A2, B2 = 2.0 * covariance + C2, var_x + var_y + C2
+                A1, B1 = 2.0 * mu_x * mu_y + C1, mean_square + C1
+                A2, B2 = 2.0 * covariance + C2, variances + C2
                 inv = 1.0 / (B1 * B2)
                 S = A1 * A2 * inv
                 valid = self.images.valid[row + x]
@@ -171,13 +172,15 @@ class PhotometricLoss:
         sums[unit, 3] = count
 
     @ti.kernel
-    def _differentiate(self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64):
+    def _differentiate(self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64, partials: ti.i32):
+        # partials is 3, but not a constant: LLVM would unroll the loops over them, and compile a second longer at
+        # every start of a process for a kernel that is no faster.
         for i in range((3 * STRIPS) * SPREAD):
             if i % SPREAD == 0:
-                self._differentiate_unit(i // SPREAD, width, height, l1_scale, ssim_scale)
+                self._differentiate_unit(i // SPREAD, width, height, l1_scale, ssim_scale, partials)
 
     @ti.func
-    def _differentiate_unit(self, unit, width, height, l1_scale, ssim_scale):
+    def _differentiate_unit(self, unit, width, height, l1_scale, ssim_scale, partials):
         stride, plane = ti.static(self.images.stride, self.images.plane)
         channel = unit // STRIPS * plane
         partial = unit // STRIPS * 3 * plane
@@ -186,7 +189,7 @@ class PhotometricLoss:
         self.images.rows[scratch] = 0.0
         by_l1, by_ssim = ti.cast(l1_scale, self.real), ti.cast(ssim_scale, self.real)
         for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
-            for q in range(3):
+            for q in range(partials):
                 top = partial + q * plane + (y + PAD - RADIUS) * stride
                 target = scratch + q * stride
                 for x in range(width + 2 * PAD):
@@ -194,7 +197,7 @@ class PhotometricLoss:
                     for k in ti.static(range(2 * RADIUS + 1)):
                         total += self.weights[k] * self.images.ssim_partial[top + k * stride + x]
                     self.images.rows[target + x] = total
-            self._smooth_rows(scratch, 3, width)
+            self._smooth_rows(scratch, partials, width)
             row = (y + PAD) * stride + PAD
             smooth = scratch + 5 * stride
             for x in range(width):

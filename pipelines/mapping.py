@@ -156,7 +156,8 @@ class OnlineMapper:
             column, row = np.floor(pixels).astype(int).T
             depth = self.settings.depth
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
-            neighbours = [k for k in self.keyframes if k.index != view.index][-depth.neighbours :]
+            last = len(self.keyframes) - 1  # that of `view`
+            neighbours = [self.keyframes[j] for j in range(max(0, last - depth.neighbours), last)]
             seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit)
         self._grow(seeds, view)
 
@@ -190,6 +191,8 @@ class OnlineMapper:
             self.optimiser.settle()
             self.depth.estimate(view, [store[0]], pixels)
             self.renderer.camera_gradient()
+            self.renderer.images.clip_colour()
             self.renderer.images.colour_to_numpy()
+            self.gaussians.to_numpy()
             self.renderer.view_renders = 0
             self.gaussians.remove(np.zeros(len(self.gaussians), dtype=bool))

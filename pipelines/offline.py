@@ -190,7 +190,9 @@ class OfflineMapper:
             self._step(view, self._rates(1.0), self.settings.sh_degree)
             self.density.reset_opacities()
             self.density.statistics.clear()
+            self.renderer.images.clip_colour()
             self.renderer.images.colour_to_numpy()
+            self.gaussians.to_numpy()
             self.gaussians.remove(np.zeros(4, dtype=bool))
             self.renderer.view_renders = 0
             self._last = None

@@ -12,6 +12,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from fields.pyramid import MAX_LEVELS
+
 __all__ = [
     "DensifySettings",
     "DepthSettings",
@@ -164,7 +166,7 @@ class LevelSettings(StrictModel):
     probabilities: tuple[float, ...] = Field(
         (0.4, 0.3, 0.2, 0.1),
         min_length=1,
-        max_length=8,
+        max_length=MAX_LEVELS,
         description="of drawing the full size, the half, the quarter, ...; [1] for full size only: slower and finer",
     )
 

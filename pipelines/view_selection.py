@@ -25,8 +25,7 @@ class ViewSelection(Protocol):
 
 def global_probabilities(store: KeyframeStore, error_weight: float, recency_weight: float) -> np.ndarray:
     """Eq. 2: p(j) ~ exp(error_weight err(j)) exp(recency_weight (j - last)) over all keyframes (N,)."""
-    errors = np.array([k.error for k in store])
-    exponent = error_weight * errors + recency_weight * (np.arange(len(store)) - (len(store) - 1))
+    exponent = error_weight * store.errors() + recency_weight * (np.arange(len(store)) - (len(store) - 1))
     p = np.exp(exponent - exponent.max())
     return p / p.sum()
 

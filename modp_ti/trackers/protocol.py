@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 from fields.tracked_frame import TrackedFrame
 
-__all__ = ["Progress", "Tracker", "frame_count"]
+__all__ = ["Progress", "Tracker", "frame_count", "may_read_ahead"]
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(what, done, total) while a tracker prepares."""
@@ -18,8 +18,9 @@ class Tracker(Protocol):
     """Delivers frames in order, each decoded when it is asked for.
 
     notes: one-line remarks for the user, known when the tracker is opened, such as frames that were skipped.
-    A tracker that knows how many frames it will deliver has `__len__`. Iterating raises InputError where an
-    input turns out bad.
+    A tracker that knows how many frames it will deliver has `__len__`. One whose frames may be read in a thread
+    beside the mapper has `reads_ahead = True`; it must not start Taichi's kernels then, which one thread alone may do.
+    Iterating raises InputError where an input turns out bad.
     """
 
     @property
@@ -31,3 +32,8 @@ class Tracker(Protocol):
 def frame_count(tracker: Tracker) -> int | None:
     """How many frames the tracker delivers; None where it does not know, as with a live camera."""
     return len(tracker) if hasattr(tracker, "__len__") else None
+
+
+def may_read_ahead(tracker: Tracker) -> bool:
+    """Whether a thread may iterate over the tracker while the mapper works; not unless it says so."""
+    return getattr(tracker, "reads_ahead", False)

@@ -35,6 +35,8 @@ class PosedImage:
 class ReplayedTracker:
     """A `Tracker` over posed images, in the order given. Points on masked pixels are left out."""
 
+    reads_ahead = True
+
     def __init__(
         self,
         reader: FrameReader,

@@ -47,7 +47,7 @@ def test_eight_bits_hold_the_image_and_its_mask() -> None:
     image = (np.arange(6 * 8 * 3).reshape(6, 8, 3) / 255).astype(np.float32)
     mask = np.ones((6, 8), dtype=bool)
     mask[2, 3] = False
-    rgba = frame(image=image, mask=mask).rgba()
+    rgba = frame(image=image, mask=mask).rgba
     expected = np.arange(6 * 8 * 3).reshape(6, 8, 3)
     np.testing.assert_array_equal(rgba[mask][:, :3], expected[mask])
     assert (rgba[mask][:, 3] == 255).all()

@@ -17,7 +17,6 @@ from fields.camera import PinholeCamera
 
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
-OPAQUE = 1e-5
 BLUR = 0.3
 # The projection is linearised no further out than 15 % of the image beyond each border (3DGS: 1.3 tan(fov / 2)).
 MARGIN = 0.15
@@ -50,8 +49,8 @@ class Splats:
 class Picture:
     """colour (H, W, 3), depth (H, W), opacity (H, W).
 
-    margin: by which relative change of an alpha or a transmittance some pixel would fall on the other side of one of
-    the thresholds; a float32 renderer can be held against this picture only where it is far above float32 rounding.
+    margin: by which relative change of an alpha some pixel would fall on the other side of the threshold; a float32
+    renderer can be held against this picture only where it is far above float32 rounding.
     """
 
     colour: NDArray[np.float64]
@@ -128,10 +127,8 @@ def composite(
     T = np.ones((height, width))
     margin = np.inf
     for alpha, c, z in zip(splats.alpha(width, height), splats.colour, splats.depth, strict=True):
-        alive = T > OPAQUE
-        near_one = np.abs(np.log(np.maximum(alpha[alive], 1e-300) / ALPHA_MIN)).min(initial=np.inf)
-        margin = min(margin, near_one, np.abs(np.log(T / OPAQUE)).min())
-        drawn = np.where(alive & (alpha >= ALPHA_MIN), np.minimum(alpha, ALPHA_MAX), 0.0)
+        margin = min(margin, np.abs(np.log(np.maximum(alpha, 1e-300) / ALPHA_MIN)).min(initial=np.inf))
+        drawn = np.where(alpha >= ALPHA_MIN, np.minimum(alpha, ALPHA_MAX), 0.0)
         colour += (drawn * T)[..., None] * c
         depth += drawn * T * z
         T = T * (1 - drawn)

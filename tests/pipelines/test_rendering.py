@@ -8,6 +8,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
+from fields.tiles import TILE_HEIGHT, TILE_WIDTH
 from pipelines.rendering import RenderedView, Renderer
 
 from . import reference
@@ -84,14 +85,14 @@ def test_gaussians_far_outside_the_image_are_linearised_at_its_margin(renderers:
 
 
 @pytest.mark.parametrize("opacity_logit", [2.0, 9.0])
-def test_a_pixel_stops_behind_opaque_layers(renderers: Callable[..., Renderer], opacity_logit: float) -> None:
+def test_a_tile_stops_behind_opaque_layers(renderers: Callable[..., Renderer], opacity_logit: float) -> None:
     """Sixty layers that cover the picture; at a logit of 9 alpha is clamped to 0.99."""
     state = random_gaussians(60, seed=7, size=(40.0, 60.0), logit=(opacity_logit, opacity_logit), beyond=-0.3)
     picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
     assert picture.opacity.min() > 1 - 1e-5
     renderer = renderers(0, ti.f64)
-    assert_same_picture(render(renderer, state), picture, 1e-6)
-    tiles = -(-CAMERA.width // 16) * -(-CAMERA.height // 16)
+    assert_same_picture(render(renderer, state), picture, 2e-5)
+    tiles = -(-CAMERA.width // TILE_WIDTH) * -(-CAMERA.height // TILE_HEIGHT)
     reached, count = renderer.pairs.reached.to_numpy()[:tiles], renderer.pairs.tile_count.to_numpy()[:tiles]
     assert (reached < count).all()
 

@@ -1,0 +1,93 @@
+"""How the time of a step grows with pixels and Gaussians, and that of a keyframe with the keyframes before it."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from benchmarks.scene import Size, add_gaussians, arrays, camera_of, noise_frame
+from benchmarks.timing import milliseconds
+from fields.backend import initialise
+from fields.gaussians import GaussianField
+from fields.keyframes import KeyframeStore
+from fields.tracked_frame import SparsePoints, TrackedFrame
+from pipelines.adam import LearningRates
+from pipelines.mapping import OnlineMapper
+from pipelines.optimisation import MapOptimiser
+from pipelines.rendering import Renderer
+from pipelines.settings import DensifySettings, KeyframeSettings, LevelSettings, MappingSettings, OptimiseSettings
+
+__all__ = ["PIXELS", "measure_frames", "measure_growth"]
+
+# width, height, Gaussians in view, Gaussians behind the camera: the first of each group stands for one.
+PIXELS = [(320, 240, 100_000, 0), (640, 480, 100_000, 0), (1280, 960, 100_000, 0)]
+VISIBLE = [(640, 480, 25_000, 0), (640, 480, 100_000, 0), (640, 480, 400_000, 0)]
+HIDDEN = [(640, 480, 50_000, 0), (640, 480, 50_000, 200_000), (640, 480, 50_000, 800_000)]
+KEYFRAMES = (10, 100, 1000)
+TIMED = 5  # keyframes that are timed at each of these
+
+
+def measure_growth(device: str, threads: int, repeats: int) -> dict[str, list[dict[str, float]]]:
+    """Milliseconds of a step by `pixels`, `visible` and `hidden`: what varies, and its time."""
+    initialise(device, threads)
+    gaussians = GaussianField()
+    widest = max(PIXELS)
+    renderer = Renderer(gaussians, widest[0], widest[1])
+    optimiser = MapOptimiser(gaussians, renderer, MappingSettings())
+    still = LearningRates(0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def row(width: int, height: int, visible: int, hidden: int) -> dict[str, float]:
+        gaussians.remove(np.zeros(len(gaussians), dtype=bool))
+        add_gaussians(gaussians, Size(width, height, visible))
+        if hidden:
+            add_gaussians(gaussians, Size(width, height, hidden), hidden=True)
+        store = KeyframeStore()
+        store.append(noise_frame(width, height))
+        step = milliseconds(lambda: optimiser.step(store, [0], still, pose_rate=0.0), repeats)
+        return {"pixels": width * height, "visible": visible, "hidden": hidden, "step": step}
+
+    groups = {"pixels": PIXELS, "visible": VISIBLE, "hidden": HIDDEN}
+    return {name: [row(*case) for case in cases] for name, cases in groups.items()}
+
+
+def measure_frames(device: str, threads: int) -> list[dict[str, float]]:
+    """Milliseconds of a frame that becomes a keyframe, with 5 steps, by the keyframes before it, in the same map."""
+    initialise(device, threads)
+    width, height = 320, 240
+    settings = MappingSettings(
+        keyframes=KeyframeSettings(max_gap=1),
+        densify=DensifySettings(pixels=0),
+        levels=LevelSettings(probabilities=(1.0,)),
+        optimise=OptimiseSettings(steps=5),
+    )
+    mapper = OnlineMapper(settings, width, height)
+    mapper.compile()
+    add_gaussians(mapper.gaussians, Size(width, height, 10_000))
+    camera = camera_of(width, height)
+    xyz = arrays(Size(width, height, 300), seed=2)["position"]
+    image = noise_frame(width, height).image
+
+    def frame(number: int) -> TrackedFrame:
+        T = np.eye(4)
+        T[0, 3] = 0.01 * np.sin(number)
+        pixels = camera.project(xyz + T[:3, 3])
+        seen = camera.contains(pixels)
+        points = SparsePoints(xyz[seen], pixels[seen], np.flatnonzero(seen))
+        made = TrackedFrame(2 * number, 0.0, str(number), image, camera, T, points)
+        _ = made.pyramid  # as the thread that reads ahead makes it
+        return made
+
+    rows = []
+    for wanted in KEYFRAMES:
+        while len(mapper.keyframes) < wanted:
+            mapper.keyframes.append(frame(len(mapper.keyframes))).error = 0.03
+        times = []
+        for _ in range(TIMED + 1):
+            next_frame = frame(len(mapper.keyframes))
+            start = time.perf_counter()
+            report = mapper.process(next_frame)
+            times.append(time.perf_counter() - start)
+            assert report.is_keyframe, "the frames are made to be keyframes"
+        rows.append({"keyframes": wanted, "frame": 1e3 * float(np.median(times[1:]))})
+    return rows

@@ -1,0 +1,61 @@
+"""The scene of the benchmarks: Gaussians spread over depths of 2 to 6 units, as dense in the image as a map gets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.camera import PinholeCamera
+from fields.gaussians import GaussianField
+from fields.tracked_frame import TrackedFrame
+
+__all__ = ["Size", "add_gaussians", "arrays", "camera_of", "noise_frame"]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large a measurement is: pixels, and Gaussians in view."""
+
+    width: int
+    height: int
+    gaussians: int
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height}, {self.gaussians:,} Gaussians"
+
+
+def camera_of(width: int, height: int) -> PinholeCamera:
+    """A camera of some 61 degrees across."""
+    return PinholeCamera(0.85 * width, 0.85 * width, width / 2, height / 2, width, height)
+
+
+def arrays(size: Size, hidden: bool = False, seed: int = 0) -> dict[str, NDArray[np.float64]]:
+    """The Gaussians by name as `GaussianField.append` takes them; all behind the camera where `hidden`."""
+    rng = np.random.default_rng(seed)
+    camera, n = camera_of(size.width, size.height), size.gaussians
+    depth = rng.uniform(2.0, 6.0, n)
+    position = camera.unproject(rng.uniform((0, 0), (size.width, size.height), (n, 2)), depth)
+    if hidden:
+        position[:, 2] *= -1.0
+    # Half the distance to the next one: about a Gaussian for every ten pixels at 480x270 and 12,500.
+    sigma = 0.5 * np.sqrt(size.width * size.height / n) * depth / camera.focal
+    return {
+        "position": position,
+        "log_scale": np.log(sigma)[:, None] + rng.normal(0.0, 0.5, (n, 3)),
+        "quaternion": rng.normal(size=(n, 4)),
+        "opacity_logit": rng.normal(0.0, 1.5, n),
+        "sh": rng.normal(0.0, 0.5, (n, 1, 3)),
+    }
+
+
+def add_gaussians(gaussians: GaussianField, size: Size, hidden: bool = False) -> None:
+    """Append the Gaussians of the size."""
+    gaussians.append(**arrays(size, hidden))
+
+
+def noise_frame(width: int, height: int) -> TrackedFrame:
+    """A frame of noise from the origin."""
+    image = np.random.default_rng(1).random((height, width, 3), dtype=np.float32)
+    return TrackedFrame(0, 0.0, "noise", image, camera_of(width, height), np.eye(4))

@@ -1,0 +1,59 @@
+"""The occupancy voxels on 300,000 points in random order on the walls of a room 80 coarsest cells wide."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from fields.backend import initialise
+from fields.occupancy import OccupancyVoxels
+
+__all__ = ["LEVELS", "measure_voxels"]
+
+POINTS, BATCHES, ROOM = 100_000, 3, 80.0
+LEVELS = (3, 7)
+
+
+def measure_voxels(device: str, threads: int, level: int) -> dict[str, float]:
+    """Milliseconds per 100,000 points at a level of the voxels, and megabytes that 300,000 points take."""
+    initialise(device, threads)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-ROOM / 2, ROOM / 2, (BATCHES, POINTS, 3))
+    wall = rng.integers(0, 6, points.shape[:2])
+    np.put_along_axis(points, (wall // 2)[..., None], ((wall % 2) - 0.5)[..., None] * ROOM, axis=2)
+    size = 0.5**level
+    times: dict[str, list[float]] = {"query": [], "update": [], "admit": []}
+
+    def timed(name: str, call: Callable[[], object]) -> None:
+        start = time.perf_counter()
+        call()
+        times[name].append(time.perf_counter() - start)
+
+    def compiled() -> OccupancyVoxels:
+        voxels = OccupancyVoxels()
+        voxels.query(np.zeros((0, 3)), size)
+        voxels.admit(np.zeros((0, 3)), size)
+        return voxels
+
+    voxels = compiled()
+    before = _resident_mb()
+    for batch in points:
+        timed("query", lambda batch=batch: voxels.query(batch, size))
+        timed("update", lambda batch=batch: voxels.update(batch, size))
+    megabytes = _resident_mb() - before
+    voxels = compiled()
+    for batch in points:
+        timed("admit", lambda batch=batch: voxels.admit(batch, size))
+    return {name: 1e3 * float(np.median(of)) for name, of in times.items()} | {"megabytes": megabytes}
+
+
+def _resident_mb() -> float:
+    """Memory of this process that is in use now (Linux; elsewhere not a number)."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except OSError:
+        return float("nan")

@@ -1,0 +1,140 @@
+"""The benchmark's figures are those of what it measures; its tables say what they should; bad input gets one line."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import benchmark
+import numpy as np
+import pytest
+from benchmarks.growth import HIDDEN, KEYFRAMES, PIXELS, VISIBLE
+from benchmarks.scene import Size, add_gaussians, arrays, camera_of, noise_frame
+from benchmarks.step import ADAM_BYTES, BACKWARD_FLOPS, FORWARD_FLOPS, STAGES, measure_step
+
+from fields.backend import initialise
+from fields.gaussians import GaussianField
+from fields.tiles import TILE_HEIGHT, TILE_WIDTH
+from pipelines.rendering import Renderer
+
+SMALL = Size(96, 64, 300)
+
+
+def test_a_step_is_measured_by_stage_and_its_pairs_are_counted() -> None:
+    figures = measure_step("cpu", 2, SMALL, repeats=2, twin=True)
+    assert all(figures[name] > 0 for name in (*STAGES, "step", "twin", "twin backward", "peak_memory_mb"))
+
+    # Independent of the lists' rows: pixels of the tiles' rows that an alpha above the threshold touches are visited.
+    initialise("cpu", 1)
+    gaussians = GaussianField()
+    add_gaussians(gaussians, SMALL)
+    renderer = Renderer(gaussians, SMALL.width, SMALL.height)
+    frame = noise_frame(SMALL.width, SMALL.height)
+    renderer.forward(frame.camera, frame.T_camera_world, 0.01)
+    touched = 0
+    for s in range(renderer.projected.count):
+        mean, conic = renderer.projected.mean[s], renderer.projected.conic[s]
+        y, x = np.mgrid[: SMALL.height, : SMALL.width] + 0.5
+        dx, dy = x - mean[0], y - mean[1]
+        power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy
+        drawn = renderer.projected.opacity[s] * np.exp(power) >= 1 / 255
+        rows = drawn.reshape(SMALL.height, -1, TILE_WIDTH).any(axis=2)
+        touched += int(np.count_nonzero(rows)) * TILE_WIDTH
+    assert figures["visible"] == renderer.projected.count
+    # Rows between the first and the last that it touches count too, as do those that it only just misses.
+    assert touched <= figures["pairs visited"] <= 1.1 * touched
+    assert figures["pairs visited"] <= figures["pairs of whole tiles"]
+    assert 0.0 < figures["cores_had"] <= 2.05
+    assert figures["pairs of whole tiles"] % (TILE_WIDTH * TILE_HEIGHT) == 0
+
+
+def test_the_scene_lies_in_the_picture_and_hidden_gaussians_behind_the_camera() -> None:
+    camera = camera_of(SMALL.width, SMALL.height)
+    seen, hidden = arrays(SMALL)["position"], arrays(SMALL, hidden=True)["position"]
+    assert camera.contains(camera.project(seen)).all()
+    assert seen[:, 2].min() >= 2.0
+    assert hidden[:, 2].max() <= -2.0
+
+
+def made_up(kind: str, **arguments: object) -> object:
+    """Figures from which the tables' numbers can be told by hand."""
+    threads = arguments.get("threads", 1)
+    if kind == "machine":
+        return {"gflops": 100.0 * threads, "gigabytes_per_second": 20.0}
+    if kind == "gsplat":
+        return {"missing": "gsplat is not installed"}
+    if kind == "growth":
+        cases = {"pixels": PIXELS, "visible": VISIBLE, "hidden": HIDDEN}
+        return {
+            name: [{"pixels": w * h, "visible": n, "hidden": m, "step": 12.5} for w, h, n, m in of]
+            for name, of in cases.items()
+        }
+    if kind == "frames":
+        return [{"keyframes": n, "frame": 33.3} for n in KEYFRAMES]
+    if kind == "voxels":
+        return {"3": {"query": 1.0, "update": 2.0, "admit": 3.0, "megabytes": 4.0}}
+    figures = dict.fromkeys(STAGES, 4.0 / threads)
+    figures |= {"step": 40.0 / threads, "pairs visited": 1e6, "pairs of whole tiles": 2e6, "visible": 1000}
+    return (
+        figures
+        | {"peak_memory_mb": 321.0, "cores_had": 0.9 * threads}
+        | ({"twin": 8.0, "twin backward": 12.0} if arguments["twin"] else {})
+    )
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["benchmark.py", *arguments])
+    benchmark.main()
+
+
+@pytest.fixture
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(benchmark, "in_process", made_up)
+    monkeypatch.setattr(benchmark.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+
+
+def test_the_tables_say_what_was_measured(monkeypatch, two_cores, tmp_path: Path, capsys) -> None:
+    run(monkeypatch, "--quick", "-o", str(tmp_path))
+    text = (tmp_path / "benchmark.md").read_text()
+    assert capsys.readouterr().out == text
+    assert "1.00 million pixel-Gaussian pairs visited, 2.00 million over whole tiles" in text
+    assert "Cores at work in a step: 0.90 with 1 thread, 1.80 with 2 threads;" in text
+    assert "| forward, 1 thread | 4.00 | 2.00 | 2.0 |" in text
+    assert "| backward, 2 threads | 2.00 | 1.00 | – |" in text
+    assert "| **whole step** | 40.00 | 20.00 | 2.00 |" in text
+    one, two = FORWARD_FLOPS / 4.0, BACKWARD_FLOPS / 2.0  # a million pairs in so many milliseconds
+    assert f"| compositing, 1 thread | {one:.1f} | {one:.0f} | – | – |" in text
+    assert f"| compositing backward, 2 threads | {two:.1f} | {two / 2:.0f} | – | – |" in text
+    rate = ADAM_BYTES * 1000 / 4e-3 / 1e9
+    assert f"| Adam, 1 thread | – | – | {rate:.1f} | {5 * rate:.0f} |" in text
+    assert "Not compared: gsplat is not installed." in text
+    assert "Growth" not in text
+    figures = json.loads((tmp_path / "benchmark.json").read_text())
+    assert figures["machine"]["2"]["gflops"] == 200.0
+    assert figures["steps"][0]["size"] == [270, 480, 12_500]
+
+
+def test_whole_runs_are_those_of_the_scenes_that_are_named(
+    monkeypatch, two_cores, scene: Path, started: list[list[str]], capsys
+) -> None:
+    run(monkeypatch, "--scene", str(scene), "--set", "seed=5")
+    text = capsys.readouterr().out
+    assert len(started) == 1
+    assert started[0][3] == str(scene)
+    for override in ("seed=5", "refine.steps=0", "device=cpu"):
+        assert override in started[0]
+    assert text.count("pixel-Gaussian pairs visited") == 3
+    assert "| 1,000 | 33.3 |" in text
+    assert "300,000 points" in text
+    name = scene.parent.name
+    assert f"| {name} | 9 | 5 | 1,000 | 0.18 | 10.0 | 2.00 | 700 | 21.00 |" in text
+
+
+def test_bad_input_gets_one_line_and_exit_code_two_before_anything_is_measured(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(benchmark, "in_process", lambda *_, **__: pytest.fail("measured"))
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, "--scene", "gone.yaml")
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and "gone.yaml" in error
