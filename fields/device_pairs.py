@@ -5,12 +5,20 @@ import torch
 
 from fields.backend import torch_device
 
-__all__ = ["NO_TILE", "DevicePairs"]
+__all__ = ["NO_TILE", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "DevicePairs", "tile_count"]
 
+# A thread a pixel; square, for few pairs. The CPU's tiles are narrow for the sake of its vectors.
+TILE_WIDTH = TILE_HEIGHT = 16
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 # Key of the unused entries: behind all tiles. Keys have 16 bits where tiles allow, which halves the passes of the sort.
 NO_TILE = {torch.int16: 2**15 - 1, torch.int32: 2**31 - 1}
 # Room grows by whole steps, so that it seldom does.
 STEP = 1 << 16
+
+
+def tile_count(width: int, height: int) -> int:
+    """Tiles of an image."""
+    return -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
 
 
 @ti.data_oriented
@@ -26,8 +34,8 @@ class DevicePairs:
     sorted with them. total: pairs of the last view, on the device; those beyond `room` (the farthest) are left out.
     """
 
-    def __init__(self, builder: ti.FieldsBuilder, max_tiles: int, max_pairs: int = 1 << 26) -> None:
-        self.max_tiles = max_tiles
+    def __init__(self, builder: ti.FieldsBuilder, max_width: int, max_height: int, max_pairs: int = 1 << 26) -> None:
+        self.max_tiles = max_tiles = tile_count(max_width, max_height)
         self.max_pairs = max_pairs
         self.capacity = 0
         self.room = 0

@@ -54,7 +54,9 @@ def last_centre(x):
 
 @ti.data_oriented
 class Binning:
-    """Fills `pairs` from `projected` for the view in `view`."""
+    """Fills `pairs` from `projected` for the view in `view`, in tiles of `tile_width` x `tile_height` pixels."""
+
+    tile_width, tile_height = TILE_WIDTH, TILE_HEIGHT
 
     def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: TilePairs) -> None:
         self.view = view
@@ -64,8 +66,8 @@ class Binning:
 
     def forward(self, exact: bool = True) -> int:
         """Bin the projected Gaussians of the current view; return the number of pairs. Always exact, on the CPU."""
-        tiles_x = -(-self.view.width // TILE_WIDTH)
-        tiles_y = -(-self.view.height // TILE_HEIGHT)
+        tiles_x = -(-self.view.width // self.tile_width)
+        tiles_y = -(-self.view.height // self.tile_height)
         slots = self.projected.count
         self._count(slots, tiles_x, tiles_y)
         self._scan(tiles_x * tiles_y, self._total)
@@ -91,32 +93,32 @@ class Binning:
         """First tile row and the one behind the last that slot s reaches."""
         reach = ti.sqrt(e[4] * e[0] / e[3]) + SLACK
         y = self.projected.mean[s][1]
-        first = ti.max(first_centre(y - reach), 0) // TILE_HEIGHT
-        last = ti.min(last_centre(y + reach), tiles_y * TILE_HEIGHT - 1)
-        return ti.Vector([first, ti.select(last < 0, 0, last // TILE_HEIGHT + 1)])
+        first = ti.max(first_centre(y - reach), 0) // self.tile_height
+        last = ti.min(last_centre(y + reach), tiles_y * self.tile_height - 1)
+        return ti.Vector([first, ti.select(last < 0, 0, last // self.tile_height + 1)])
 
     @ti.func
     def _tile_columns(self, s, e, tile_y, tiles_x):
         """First tile column and the one behind the last that slot s reaches in a tile row."""
         mean = self.projected.mean[s]
-        top = tile_y * TILE_HEIGHT + 0.5 - mean[1]
-        span = ellipse_span(e[2], e[1], e[0], e[3], e[4], top, top + (TILE_HEIGHT - 1))
+        top = tile_y * self.tile_height + 0.5 - mean[1]
+        span = ellipse_span(e[2], e[1], e[0], e[3], e[4], top, top + (self.tile_height - 1))
         first = ti.max(first_centre(mean[0] + span[0]), 0)
-        last = ti.min(last_centre(mean[0] + span[1]), tiles_x * TILE_WIDTH - 1)
+        last = ti.min(last_centre(mean[0] + span[1]), tiles_x * self.tile_width - 1)
         return ti.select(
             (last < first) | (span[0] > span[1]),
             ti.Vector([0, 0]),
-            ti.Vector([first // TILE_WIDTH, last // TILE_WIDTH + 1]),
+            ti.Vector([first // self.tile_width, last // self.tile_width + 1]),
         )
 
     @ti.func
     def _pixel_rows(self, s, e, tile_x, tile_y):
         """Rows of a tile that slot s reaches, packed as first | behind last << 16."""
         mean = self.projected.mean[s]
-        left = tile_x * TILE_WIDTH + 0.5 - mean[0]
-        span = ellipse_span(e[0], e[1], e[2], e[3], e[4], left, left + (TILE_WIDTH - 1))
-        first = ti.max(first_centre(mean[1] + span[0]) - tile_y * TILE_HEIGHT, 0)
-        last = ti.min(last_centre(mean[1] + span[1]) - tile_y * TILE_HEIGHT, TILE_HEIGHT - 1)
+        left = tile_x * self.tile_width + 0.5 - mean[0]
+        span = ellipse_span(e[0], e[1], e[2], e[3], e[4], left, left + (self.tile_width - 1))
+        first = ti.max(first_centre(mean[1] + span[0]) - tile_y * self.tile_height, 0)
+        last = ti.min(last_centre(mean[1] + span[1]) - tile_y * self.tile_height, self.tile_height - 1)
         return ti.select((last < first) | (span[0] > span[1]), 0, first | ((last + 1) << 16))
 
     @ti.kernel

@@ -64,7 +64,7 @@ class Renderer:
         self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
         self.images = ImageBuffers(builder, max_width, max_height, real, image_cache_gb)
         if on_gpu():
-            self.pairs = DevicePairs(builder, self.images.max_tiles)
+            self.pairs = DevicePairs(builder, max_width, max_height)
         else:
             self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
         builder.finalize()

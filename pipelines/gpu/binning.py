@@ -6,11 +6,10 @@ import taichi as ti
 import torch
 
 from fields.backend import torch_device
-from fields.device_pairs import NO_TILE, DevicePairs
+from fields.device_pairs import NO_TILE, TILE_HEIGHT, TILE_WIDTH, DevicePairs
 from fields.late import Late
 from fields.launch import Launch
 from fields.projected import ProjectedGaussians
-from fields.tiles import TILE_HEIGHT, TILE_WIDTH
 from fields.view import ViewField
 from pipelines.binning import Binning
 
@@ -25,6 +24,8 @@ PATIENCE = 2
 @ti.data_oriented
 class DeviceBinning(Binning):
     """Fills `pairs` from `projected` for the view in `view`."""
+
+    tile_width, tile_height = TILE_WIDTH, TILE_HEIGHT
 
     def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs) -> None:
         self.view = view

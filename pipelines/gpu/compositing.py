@@ -1,7 +1,7 @@
 """Compositing on a GPU: a block of threads a tile, a thread a pixel, the tile's Gaussians through shared memory.
 
-The formulas are those of `pipelines/compositing.py`. The backward pass goes front to back as well, and adds without
-atomics, in three phases for every 16 Gaussians:
+The formulas are those of `pipelines/compositing.py`, but a pixel closes by itself once it is opaque, not with its tile.
+The backward pass goes front to back as well, and adds without atomics, in three phases for every 16 Gaussians:
     A  a thread a pixel walks them and leaves weight and d loss / d power of each in shared memory,
     B  a thread a (Gaussian, column of pixels) makes its ten sums over the rows that the ellipse reaches,
     C  a thread a (Gaussian, sum) adds the columns.
@@ -12,11 +12,10 @@ shared memory, and the order of the sums is fixed.
 import taichi as ti
 import torch
 
-from fields.device_pairs import DevicePairs
+from fields.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, DevicePairs
 from fields.images import PAD, ImageBuffers
 from fields.launch import Launch
 from fields.projected import ProjectedGaussians
-from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 from fields.view import ViewField
 from pipelines.compositing import ALPHA_MAX, OPAQUE
 from pipelines.gpu.reductions import THREADS, max_over_block

@@ -9,10 +9,10 @@ import taichi as ti
 import torch
 
 from fields.backend import on_gpu, torch_device
+from fields.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
 from fields.images import PAD, ImageBuffers
 from fields.late import Late
 from fields.launch import Launch
-from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 from pipelines.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 from pipelines.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
 
@@ -81,7 +81,7 @@ class DevicePhotometricLoss(PhotometricLoss):
     def __init__(self, images: ImageBuffers) -> None:
         self.images = images
         self.weights = window_weights()
-        self._partial = torch.zeros(12 * images.max_tiles, dtype=torch.float32, device=torch_device())
+        self._partial = torch.zeros(12 * tile_count(images.max_width, images.max_height), device=torch_device())
         self._totals = torch.zeros(4, dtype=torch.float32, device=torch_device())
         self._compare, self._differentiate = Launch(self._compare_tiles), Launch(self._differentiate_tiles)
         self._sum = BlockSums(4)
@@ -97,8 +97,7 @@ class DevicePhotometricLoss(PhotometricLoss):
         values, row = self._values, self._values.written
         width, height = self.images.width, self.images.height
         self._compare(width, height, self._partial)
-        blocks = 3 * -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
-        self._sum(blocks, self._partial, self._totals)
+        self._sum(3 * tile_count(width, height), self._partial, self._totals)
         values.sums[row] = self._totals
         values.written += 1
         return LateLossValues(values, row)
@@ -137,8 +136,8 @@ class DevicePhotometricLoss(PhotometricLoss):
         for i in range(3 * tiles * THREADS):
             a = ti.simt.block.SharedArray((HALO,), ti.f32)
             b = ti.simt.block.SharedArray((HALO,), ti.f32)
-            # The five moments after the horizontal window; then the four sums.
-            band = ti.simt.block.SharedArray((5 * BAND,), ti.f32)
+            # The four moments after the horizontal window; then the four sums.
+            band = ti.simt.block.SharedArray((4 * BAND,), ti.f32)
             unit, thread = i >> THREAD_BITS, i & (THREADS - 1)
             channel, tile = unit // tiles, unit % tiles
             start = channel * plane
@@ -154,33 +153,32 @@ class DevicePhotometricLoss(PhotometricLoss):
             for k in range((BAND - thread + THREADS - 1) >> THREAD_BITS):
                 at = thread + k * THREADS
                 source = (at >> ROW_BITS) * SIDE + (at & (TILE_WIDTH - 1))
-                mu_x, mu_y, xx, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0
+                mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
                 for q in ti.static(range(2 * RADIUS + 1)):
                     va, vb = a[source + q], b[source + q]
                     wa, wb = self.weights[q] * va, self.weights[q] * vb
                     mu_x, mu_y = mu_x + wa, mu_y + wb
-                    xx, yy, xy = xx + wa * va, yy + wb * vb, xy + wa * vb
+                    squares, xy = squares + (wa * va + wb * vb), xy + wa * vb
                 band[at] = mu_x
                 band[BAND + at] = mu_y
-                band[2 * BAND + at] = xx
-                band[3 * BAND + at] = yy
-                band[4 * BAND + at] = xy
+                band[2 * BAND + at] = squares
+                band[3 * BAND + at] = xy
             ti.simt.block.sync()
-            mu_x, mu_y, xx, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0
+            mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
             for q in ti.static(range(2 * RADIUS + 1)):
                 at = thread + q * TILE_WIDTH
                 mu_x += self.weights[q] * band[at]
                 mu_y += self.weights[q] * band[BAND + at]
-                xx += self.weights[q] * band[2 * BAND + at]
-                yy += self.weights[q] * band[3 * BAND + at]
-                xy += self.weights[q] * band[4 * BAND + at]
+                squares += self.weights[q] * band[2 * BAND + at]
+                xy += self.weights[q] * band[3 * BAND + at]
             l1, ssim, square, valid = 0.0, 0.0, 0.0, 0.0
             x, y = left + (thread & (TILE_WIDTH - 1)), top + (thread >> ROW_BITS)
             if x < width and y < height:
-                var_x, var_y, covariance = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
+                mean_square = mu_x * mu_x + mu_y * mu_y
+                variances, covariance = squares - mean_square, xy - mu_x * mu_y
                 # S = (A1 A2) / (B1 B2)
-                A1, B1 = 2.0 * mu_x * mu_y + C1, mu_x * mu_x + mu_y * mu_y + C1
-                A2, B2 = 2.0 * covariance + C2, var_x + var_y + C2
+                A1, B1 = 2.0 * mu_x * mu_y + C1, mean_square + C1
+                A2, B2 = 2.0 * covariance + C2, variances + C2
                 inv = 1.0 / (B1 * B2)
                 S = A1 * A2 * inv
                 p = (y + PAD) * self.images.stride + x + PAD

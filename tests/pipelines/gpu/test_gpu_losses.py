@@ -17,6 +17,7 @@ from pipelines.rendering import Renderer
 from ..scenes import CAMERA, NEAR, POSE, random_gaussians
 
 # Of several tiles and blocks, of one row of tiles, and within one tile.
+GRADIENTS = ("position", "log_scale", "quaternion", "opacity_logit", "sh")
 CAMERAS = [CAMERA, PinholeCamera(40.0, 40.0, 30.0, 8.0, 61, 16), PinholeCamera(30.0, 30.0, 5.0, 6.0, 11, 13)]
 
 
@@ -60,7 +61,9 @@ def test_every_stage_is_that_of_the_cpu(results: tuple, size: int) -> None:
     cpu, gpu = results[0][size], results[1][size]
     for name, value in cpu.items():
         assert np.abs(value).max() > 0
-        np.testing.assert_allclose(gpu[name], value, rtol=0, atol=1e-5 * np.abs(value).max(), err_msg=name)
+        # Gaussians behind opaque pixels: see test_gpu_rendering.py.
+        tolerance = 3e-4 if name in GRADIENTS else 3e-5
+        np.testing.assert_allclose(gpu[name], value, rtol=0, atol=tolerance * np.abs(value).max(), err_msg=name)
 
 
 def test_values_are_right_whenever_they_are_read(results: tuple, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,13 +6,17 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import taichi as ti
 import torch
 from numpy.typing import NDArray
 
 from fields import device_pairs
 from fields.camera import PinholeCamera
+from fields.device_pairs import TILE_HEIGHT, TILE_WIDTH, tile_count
 from fields.gaussians import GaussianField
-from fields.tiles import TILE_HEIGHT, TILE_WIDTH
+from fields.tiles import TilePairs
+from pipelines.binning import Binning
+from pipelines.compositing import OPAQUE
 from pipelines.gpu.binning import MEMORY
 from pipelines.rendering import Renderer
 
@@ -31,6 +35,13 @@ SCENES = {
 Result = dict[str, NDArray]
 
 
+@ti.data_oriented
+class SquareBinning(Binning):
+    """The CPU's, in tiles of the GPU's shape."""
+
+    tile_width, tile_height = TILE_WIDTH, TILE_HEIGHT
+
+
 def rendered(renderer: Renderer, camera: PinholeCamera, state: dict[str, NDArray]) -> Result:
     """Everything that a view of a scene leaves behind, of gradients of 1 in size."""
     renderer.gaussians.load(state)
@@ -40,12 +51,15 @@ def rendered(renderer: Renderer, camera: PinholeCamera, state: dict[str, NDArray
     shape = (camera.height, camera.width)
     renderer.images.set_gradients(rng.normal(size=(*shape, 3)), rng.normal(size=shape), rng.normal(size=shape))
     renderer.backward(with_depth=True)
-    tiles = -(-camera.width // TILE_WIDTH) * -(-camera.height // TILE_HEIGHT)
+    tiles = tile_count(camera.width, camera.height)
     result = {"colour": view.colour, "depth": view.depth, "opacity": view.opacity}
     result |= renderer.gaussians.gradients_to_numpy() | {"camera": renderer.camera_gradient()}
     result["touched"] = renderer.gaussians.touched.to_numpy()[: len(state["opacity_logit"])]
     result["order"] = renderer.projected.gaussian.to_numpy()[: renderer.projected.seen[None]]
-    for name in ("first", "tile_count", "reached"):
+    result["reached"] = renderer.pairs.reached.to_numpy()[:tiles]
+    if isinstance(renderer.pairs, TilePairs):
+        SquareBinning(renderer.view, renderer.projected, renderer.pairs).forward()
+    for name in ("first", "tile_count"):
         result[name] = getattr(renderer.pairs, name).to_numpy()[:tiles]
     n = renderer.pairs.count
     result["slot"], result["rows"] = (
@@ -74,9 +88,10 @@ def pair(request: pytest.FixtureRequest, results: tuple) -> tuple[Result, Result
 
 
 def test_pictures_are_those_of_the_cpu(pair: tuple[Result, Result]) -> None:
+    """But for what lies behind an opaque pixel: the CPU closes a tile as a whole, the GPU pixel by pixel."""
     cpu, gpu = pair
     for name in ("colour", "opacity", "depth"):
-        np.testing.assert_allclose(gpu[name], cpu[name], rtol=0, atol=1e-5 * max(cpu[name].max(), 1.0))
+        np.testing.assert_allclose(gpu[name], cpu[name], rtol=0, atol=2 * OPAQUE * max(cpu[name].max(), 1.0))
 
 
 def test_lists_are_those_of_the_cpu(pair: tuple[Result, Result]) -> None:
@@ -89,16 +104,17 @@ def test_lists_are_those_of_the_cpu(pair: tuple[Result, Result]) -> None:
 
 def test_gradients_are_those_of_the_cpu(pair: tuple[Result, Result]) -> None:
     cpu, gpu = pair
+    # Where pixels are opaque, Gaussians behind them get a little on the CPU.
+    tolerance = 1e-3 if cpu["opacity"].max() > 1 - 2 * OPAQUE else 1e-4
     for name in (*NAMES, "camera"):
-        np.testing.assert_allclose(gpu[name], cpu[name], rtol=0, atol=1e-4 * max(np.abs(cpu[name]).max(), 1e-6))
+        np.testing.assert_allclose(gpu[name], cpu[name], rtol=0, atol=tolerance * max(np.abs(cpu[name]).max(), 1e-6))
     np.testing.assert_array_equal(gpu["touched"], cpu["touched"])
 
 
 def test_opaque_tiles_end_early(results: tuple) -> None:
     layers = results[1]["layers"]
-    assert (layers["reached"] < layers["tile_count"]).all()
-    # The last Gaussian that counts lies in the CPU's last block of 16.
-    assert (layers["reached"] <= results[0]["layers"]["reached"]).all()
+    assert (layers["reached"] < 0.8 * layers["tile_count"]).all()
+    assert layers["opacity"].min() > 1 - 2e-5
 
 
 def test_two_runs_are_bit_identical(results: tuple) -> None:
