@@ -63,7 +63,7 @@ def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool
         lambda: optimiser.aspect.backward(weights.aspect_weight, store.scene_depth), lambda: optimiser.adam.step(still),
     )  # fmt: skip
     figures = stage_milliseconds(list(zip(STAGES, calls, strict=True)), repeats)
-    figures["visible"] = renderer.projected.count
+    figures["visible"] = renderer.projected.seen[None]  # `count` is a bound, on a GPU
     figures["pairs of whole tiles"] = renderer.pairs.count * TILE_PIXELS
     if on_cpu:
         rows = renderer.pairs.rows_to_numpy()
