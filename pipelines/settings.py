@@ -109,7 +109,7 @@ class DensifySettings(StrictModel):
         True, description="also add Gaussians at pixels of low SSIM, not only at tracked points"
     )
     pixels: int = Field(
-        4000,
+        6000,
         ge=0,
         description="such pixels per keyframe of 640x480; other sizes by the power 3/4 of their area",
     )
@@ -205,7 +205,7 @@ class OptimiseSettings(StrictModel):
 class MappingSettings(StrictModel):
     """The online loop."""
 
-    sh_degree: int = Field(0, ge=0, le=3, description="degree of the spherical harmonics of colour")
+    sh_degree: int = Field(1, ge=0, le=3, description="degree of the spherical harmonics of colour")
     max_gaussians: int = Field(
         1_500_000,
         ge=1024,
