@@ -69,7 +69,7 @@ def test_a_map_made_on_the_gpu_is_the_same_on_every_run(mapped: tuple, gpu: str)
         np.testing.assert_array_equal(again[name], value, err_msg=name)
 
 
-def seeds(points: SparsePoints) -> dict[str, NDArray]:
+def seeds(points: SparsePoints, sh_count: int) -> dict[str, NDArray]:
     rng = np.random.default_rng(2)
     n = len(points)
     return {
@@ -77,7 +77,7 @@ def seeds(points: SparsePoints) -> dict[str, NDArray]:
         "log_scale": np.log(0.3 * rng.uniform(0.5, 1.5, (n, 3))),
         "quaternion": rng.normal(size=(n, 4)),
         "opacity_logit": rng.uniform(-1, 1, n),
-        "sh": rng.normal(size=(n, 1, 3)),
+        "sh": rng.normal(size=(n, sh_count, 3)) / np.arange(1, sh_count + 1)[:, None],
     }
 
 
@@ -86,7 +86,7 @@ def test_dozens_of_steps_lead_to_the_same_map(on_both: Callable) -> None:
         mapper = OnlineMapper(SETTINGS, 64, 48, seed=1)
         store = KeyframeStore()
         views = [store.append(frame(i)) for i in range(2)]
-        mapper.gaussians.load(seeds(views[0].points))
+        mapper.gaussians.load(seeds(views[0].points, mapper.gaussians.sh_count))
         rates = mapper.optimiser.rates(store.scene_depth)
         psnr = [mapper.optimiser.step(store, [0, 1], rates, pose_rate=0.01 if k < 4 else 0.0) for k in range(18)]
         psnr.append(mapper.optimiser.settle())
