@@ -10,7 +10,7 @@ import pytest
 
 from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory
-from tests.modp_ti.test_session import run
+from tests.modp_ti.runs import FILES, finished_run, run
 
 SCENE = """
 mode:    offline
@@ -26,23 +26,11 @@ offline: {steps: 90, sh_every: 3000}
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of one run."""
-    scene = tmp_path_factory.mktemp("session") / "scene.yaml"
-    scene.write_text(SCENE)
-    result = run(scene)
-    assert result.returncode == 0, result.stderr
-    assert "9 frames, 6 keyframes" in result.stdout
-    return scene.parent / "out"
+    return finished_run(tmp_path_factory.mktemp("session"), SCENE, "9 frames, 6 keyframes")
 
 
 def test_a_run_leaves_the_files_that_an_online_run_leaves(folder: Path) -> None:
-    assert sorted(p.name for p in folder.iterdir()) == [
-        "config.yaml",
-        "metrics.json",
-        "renders",
-        "scores.csv",
-        "splats.ply",
-        "trajectory.txt",
-    ]
+    assert sorted(p.name for p in folder.iterdir()) == FILES
     assert sorted(p.name for p in (folder / "renders").iterdir()) == ["000000.png", "000004.png", "000008.png"]
     assert len(read_trajectory(folder / "trajectory.txt")[0]) == 9
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -19,6 +16,7 @@ from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory
 from modp_ti.lpips import open_lpips
 from modp_ti.trackers import open_tracker
+from tests.modp_ti.runs import FILES, finished_run, run
 
 SCENE = """
 source:  {scale: 0.25, holdout: 4, stop: 9, fps: 10}
@@ -31,34 +29,14 @@ refine:  {steps: 5}
 """
 
 
-def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """A run on a machine whose torch has no weights in its cache."""
-    command = [sys.executable, "-m", "modp_ti.run", str(scene), *arguments]
-    environment = {**os.environ, "TORCH_HOME": str(scene.parent / "no-torch")}
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of one run."""
-    scene = tmp_path_factory.mktemp("session") / "scene.yaml"
-    scene.write_text(SCENE)
-    result = run(scene)
-    assert result.returncode == 0, result.stderr
-    assert "device: CPU" in result.stdout
-    assert "9 frames" in result.stdout
-    return scene.parent / "out"
+    return finished_run(tmp_path_factory.mktemp("session"), SCENE, "device: CPU")
 
 
 def test_a_run_leaves_all_its_files_and_nothing_half_written(folder: Path) -> None:
-    assert sorted(p.name for p in folder.iterdir()) == [
-        "config.yaml",
-        "metrics.json",
-        "renders",
-        "scores.csv",
-        "splats.ply",
-        "trajectory.txt",
-    ]
+    assert sorted(p.name for p in folder.iterdir()) == FILES
     assert sorted(p.name for p in folder.parent.iterdir()) == ["out", "scene.yaml"]
     assert sorted(p.name for p in (folder / "renders").iterdir()) == ["000000.png", "000004.png", "000008.png"]
 

@@ -1,0 +1,27 @@
+"""Runs as a user starts them: in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+FILES = ["config.yaml", "metrics.json", "renders", "scores.csv", "splats.ply", "trajectory.txt"]
+
+
+def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A run on a machine whose torch has no weights in its cache."""
+    command = [sys.executable, "-m", "modp_ti.run", str(scene), *arguments]
+    environment = {**os.environ, "TORCH_HOME": str(scene.parent / "no-torch")}
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+
+
+def finished_run(folder: Path, scene: str, said: str) -> Path:
+    """The output folder of a run of the scene file's text, which says `said` on the terminal."""
+    file = folder / "scene.yaml"
+    file.write_text(scene)
+    result = run(file)
+    assert result.returncode == 0, result.stderr
+    assert said in result.stdout
+    return folder / "out"
