@@ -1,4 +1,4 @@
-"""`ProjectedGaussians`: the visible Gaussians of one view in image space, nearest first."""
+"""`ProjectedGaussians`: the visible Gaussians of one view in image space."""
 
 import taichi as ti
 
@@ -11,12 +11,14 @@ BLOCK = 1024
 
 @ti.data_oriented
 class ProjectedGaussians:
-    """One slot per visible Gaussian, in order of depth, with the gradients of all that compositing reads.
+    """One slot per visible Gaussian, with the gradients of all that compositing reads.
 
-    gaussian: index in the `GaussianField`. mean (2): pixel position. conic (3): inverse 2D covariance
-    (xx, xy, yy) [1/px^2]. opacity: after the anti-aliasing compensation. colour (3), depth: z in the camera frame.
+    gaussian: index in the `GaussianField`, rising with the slot on the CPU, so that memory is read in its order. order:
+    the slots, nearest first; on a GPU they are in that order themselves. mean (2): pixel position. conic (3): inverse
+    2D covariance (xx, xy, yy) [1/px^2]. opacity: after the anti-aliasing compensation. colour (3), depth: z in the
+    camera frame.
     tangent (6): a copy per slot of the camera tangent xi = 0, so that its gradient is gathered without contention
-    and in a fixed order. first_pair: index of the slot's first tile pair.
+    and in a fixed order. first_pair, end_pair: index of the slot's first tile pair, and of the one behind its last.
 
     seen: how many slots there are, where kernels read it. count: the same as far as the host knows it: on a GPU, where
     nothing is read back, an upper bound.
@@ -28,7 +30,9 @@ class ProjectedGaussians:
         self.count = 0
         self.seen = ti.field(ti.i32)
         self.gaussian = ti.field(ti.i32)
+        self.order = ti.field(ti.i32)
         self.first_pair = ti.field(ti.i32)
+        self.end_pair = ti.field(ti.i32)
         self.mean = ti.Vector.field(2, real, needs_grad=True)
         self.conic = ti.Vector.field(3, real, needs_grad=True)
         self.opacity = ti.field(real, needs_grad=True)
@@ -41,4 +45,4 @@ class ProjectedGaussians:
         blocks.dense(ti.i, BLOCK).place(*composited)
         blocks.dense(ti.i, BLOCK).place(*(f.grad for f in composited))
         blocks.dense(ti.i, BLOCK).place(self.tangent, self.tangent.grad)
-        blocks.dense(ti.i, BLOCK).place(self.gaussian, self.first_pair)
+        blocks.dense(ti.i, BLOCK).place(self.gaussian, self.order, self.first_pair, self.end_pair)

@@ -20,7 +20,7 @@ class TilePairs:
     Per tile: `first` and `count` of its pairs, `reached`: how many of them were composited before it was opaque.
     Per pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse reaches
     in the tile (first | last << 16), `gradient`: ten sums over the tile's pixels (see `compositing.py`).
-    `position[first_pair[s] + k]` is the place of slot s's k-th pair.
+    `position[e]` for e from slot s's `first_pair` to its `end_pair` are the places of its pairs.
     """
 
     def __init__(

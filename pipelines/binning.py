@@ -132,7 +132,8 @@ class Binning:
         for t in range(tiles_x * tiles_y):
             self.pairs.histogram[chunk, t] = 0
         n = 0
-        for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+        for k in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+            s = self.projected.order[k]
             self.projected.first_pair[s] = n
             e = self._ellipse(s)
             if e[4] > 0.0:
@@ -172,7 +173,8 @@ class Binning:
 
     @ti.func
     def _scatter_chunk(self, chunk, slots, tiles_x, tiles_y):
-        for s in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+        for k in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
+            s = self.projected.order[k]
             pair = self.projected.first_pair[s] + self.pairs.chunk_pairs[chunk]
             self.projected.first_pair[s] = pair
             e = self._ellipse(s)
@@ -188,3 +190,4 @@ class Binning:
                         self.pairs.rows[place] = self._pixel_rows(s, e, tile_x, tile_y)
                         self.pairs.position[pair] = place
                         pair += 1
+            self.projected.end_pair[s] = pair

@@ -53,7 +53,7 @@ class Compositing:
             self._backward_with_depth(self.view.width, self.view.height)
         else:
             self._backward(self.view.width, self.view.height)
-        self._gather(self.projected.count, self.pairs.count)
+        self._gather(self.projected.count)
 
     @ti.kernel
     def _forward(self, width: ti.i32, height: ti.i32):
@@ -231,14 +231,11 @@ class Compositing:
             self.pairs.gradient[k].fill(0.0)
 
     @ti.kernel
-    def _gather(self, slots: ti.i32, pairs: ti.i32):
+    def _gather(self, slots: ti.i32):
         """Sum every slot's pairs, in their order, into the gradients of what was composited."""
         for s in range(slots):
-            end = pairs
-            if s + 1 < slots:
-                end = self.projected.first_pair[s + 1]
             total = ti.Vector.zero(self.real, 10)
-            for e in range(self.projected.first_pair[s], end):
+            for e in range(self.projected.first_pair[s], self.projected.end_pair[s]):
                 total += self.pairs.gradient[self.pairs.position[e]]
             conic = self.projected.conic[s]
             self.projected.colour.grad[s] = ti.Vector([total[0], total[1], total[2]])

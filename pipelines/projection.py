@@ -1,4 +1,4 @@
-"""Projection: which Gaussians a view sees, nearest first, and their ellipses and colours in the image.
+"""Projection: which Gaussians a view sees, in which order, and their ellipses and colours in the image.
 
 EWA splatting [Zwicker 2001] with the opacity compensation of Mip-Splatting [Yu 2024]; the gradient, camera
 tangent included, comes from Taichi's automatic differentiation.
@@ -44,9 +44,11 @@ class Projection:
 
     def forward(self) -> int:
         """Fill `projected` for the current view; return how many Gaussians it sees."""
-        self.projected.count = count = self._visible_in_depth_order()
+        self.projected.count = count = self._visible()
         if count:
-            self._assign_slots(count, self._keys)
+            # Keys are unique (depth above, slot below), so any sort of them is stable in the Gaussians' order.
+            self._keys[:count].sort()
+            self._set_order(count, self._keys)
             self.project()
             self.shade()
         else:
@@ -76,7 +78,8 @@ class Projection:
 
     # ---- which, and in which order ---------------------------------------------------------------------------
 
-    def _visible_in_depth_order(self) -> int:
+    def _visible(self) -> int:
+        """Give every Gaussian that the view may see a slot and a key to sort by; return how many."""
         n = self.gaussians.count
         if n == 0:
             return 0
@@ -91,10 +94,7 @@ class Projection:
         self._chunk_counts[1:chunks] = ends[:-1]
         self._chunk_counts[0] = 0
         self._compact(n, self._depths, self._chunk_counts, self._keys)
-        count = int(ends[-1])
-        # Keys are unique (depth above, index below), so any sort of them is stable in the Gaussians' order.
-        self._keys[:count].sort()
-        return count
+        return int(ends[-1])
 
     @ti.kernel
     def _cull(self, n: ti.i32, depths: ti.types.ndarray(), counts: ti.types.ndarray()):
@@ -157,15 +157,16 @@ class Projection:
             if depths[i] > 0.0:
                 # The bits of a positive float rise with it.
                 bits = ti.cast(ti.bit_cast(depths[i], ti.u32), ti.u64)
-                keys[slot] = (bits << 32) | ti.cast(i, ti.u64)
+                keys[slot] = (bits << 32) | ti.cast(slot, ti.u64)
+                self.projected.gaussian[slot] = i
+                self.projected.tangent[slot].fill(0.0)
                 slot += 1
 
     @ti.kernel
-    def _assign_slots(self, count: ti.i32, keys: ti.types.ndarray()):
+    def _set_order(self, count: ti.i32, keys: ti.types.ndarray()):
         self.projected.seen[None] = count
-        for s in range(count):
-            self.projected.gaussian[s] = ti.cast(keys[s] & ti.u64(0xFFFFFFFF), ti.i32)
-            self.projected.tangent[s].fill(0.0)
+        for k in range(count):
+            self.projected.order[k] = ti.cast(keys[k] & ti.u64(0xFFFFFFFF), ti.i32)
 
     # ---- the differentiable part -----------------------------------------------------------------------------
 
