@@ -18,7 +18,8 @@ class TilePairs:
     """Pairs (tile, Gaussian), sorted by tile and within a tile by depth.
 
     Per tile: `first` and `count` of its pairs, `reached`: how many of them were composited before it was opaque.
-    Per pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse reaches
+    Per pair, in the order of depth, chunk by chunk: `emitted_tile` and `emitted_rows`, before they are sorted.
+    Per sorted pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse reaches
     in the tile (first | last << 16), `gradient`: ten sums over the tile's pixels (see `compositing.py`).
     `position[e]` for e from slot s's `first_pair` to its `end_pair` are the places of its pairs.
     """
@@ -28,12 +29,16 @@ class TilePairs:
     ) -> None:
         self.max_tiles = max_tiles
         self.max_pairs = max_pairs
+        # Pairs of one chunk at most: the nearest have the largest ellipses.
+        self.segment = max_pairs // 4
         self.count = 0
         self.first = ti.field(ti.i32)
         self.tile_count = ti.field(ti.i32)
         self.reached = ti.field(ti.i32)
         self.histogram = ti.field(ti.i32)
         self.chunk_pairs = ti.field(ti.i32)
+        self.emitted_tile = ti.field(ti.i32)
+        self.emitted_rows = ti.field(ti.i32)
         self.slot = ti.field(ti.i32)
         self.rows = ti.field(ti.i32)
         self.position = ti.field(ti.i32)
@@ -45,6 +50,8 @@ class TilePairs:
         blocks.dense(ti.i, BLOCK).place(self.slot, self.rows)
         blocks.dense(ti.i, BLOCK).place(self.position)
         blocks.dense(ti.i, BLOCK).place(self.gradient)
+        segments = builder.pointer(ti.i, chunks * self.segment // BLOCK)
+        segments.dense(ti.i, BLOCK).place(self.emitted_tile, self.emitted_rows)
         self.last_placed = self.gradient.get_scalar_field(9)
 
     def rows_to_numpy(self) -> np.ndarray:

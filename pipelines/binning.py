@@ -74,7 +74,7 @@ class Binning:
         total = int(self._total[0])
         if total > self.pairs.max_pairs:
             raise ValueError(f"{total} tile pairs exceed the room for {self.pairs.max_pairs}; the map is degenerate")
-        self._scatter(slots, tiles_x, tiles_y)
+        self._scatter(slots)
         self.pairs.count = total
         return total
 
@@ -131,7 +131,7 @@ class Binning:
     def _count_chunk(self, chunk, slots, tiles_x, tiles_y):
         for t in range(tiles_x * tiles_y):
             self.pairs.histogram[chunk, t] = 0
-        n = 0
+        n, segment = 0, ti.static(self.pairs.segment)
         for k in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
             s = self.projected.order[k]
             self.projected.first_pair[s] = n
@@ -143,7 +143,11 @@ class Binning:
                     for tile_x in range(columns[0], columns[1]):
                         t = tile_y * tiles_x + tile_x
                         self.pairs.histogram[chunk, t] = self.pairs.histogram[chunk, t] + 1
+                        if n < segment:
+                            self.pairs.emitted_tile[chunk * segment + n] = t
+                            self.pairs.emitted_rows[chunk * segment + n] = self._pixel_rows(s, e, tile_x, tile_y)
                         n += 1
+            self.projected.end_pair[s] = n
         self.pairs.chunk_pairs[chunk] = n
 
     @ti.kernel
@@ -162,32 +166,29 @@ class Binning:
             pairs = 0
             for chunk in range(CHUNKS):
                 n = self.pairs.chunk_pairs[chunk]
+                if n > self.pairs.segment:
+                    total[0] = self.pairs.max_pairs + 1
                 self.pairs.chunk_pairs[chunk] = pairs
                 pairs += n
 
     @ti.kernel
-    def _scatter(self, slots: ti.i32, tiles_x: ti.i32, tiles_y: ti.i32):
+    def _scatter(self, slots: ti.i32):
         for i in range(CHUNKS * SPREAD):
             if i % SPREAD == 0:
-                self._scatter_chunk(i // SPREAD, slots, tiles_x, tiles_y)
+                self._scatter_chunk(i // SPREAD, slots)
 
     @ti.func
-    def _scatter_chunk(self, chunk, slots, tiles_x, tiles_y):
+    def _scatter_chunk(self, chunk, slots):
+        offset, segment = self.pairs.chunk_pairs[chunk], ti.static(self.pairs.segment)
         for k in range(slots * chunk // CHUNKS, slots * (chunk + 1) // CHUNKS):
             s = self.projected.order[k]
-            pair = self.projected.first_pair[s] + self.pairs.chunk_pairs[chunk]
-            self.projected.first_pair[s] = pair
-            e = self._ellipse(s)
-            if e[4] > 0.0:
-                rows = self._tile_rows(s, e, tiles_y)
-                for tile_y in range(rows[0], rows[1]):
-                    columns = self._tile_columns(s, e, tile_y, tiles_x)
-                    for tile_x in range(columns[0], columns[1]):
-                        t = tile_y * tiles_x + tile_x
-                        place = self.pairs.histogram[chunk, t]
-                        self.pairs.histogram[chunk, t] = place + 1
-                        self.pairs.slot[place] = s
-                        self.pairs.rows[place] = self._pixel_rows(s, e, tile_x, tile_y)
-                        self.pairs.position[pair] = place
-                        pair += 1
-            self.projected.end_pair[s] = pair
+            first, end = self.projected.first_pair[s], self.projected.end_pair[s]
+            for e in range(first, end):
+                t = self.pairs.emitted_tile[chunk * segment + e]
+                place = self.pairs.histogram[chunk, t]
+                self.pairs.histogram[chunk, t] = place + 1
+                self.pairs.slot[place] = s
+                self.pairs.rows[place] = self.pairs.emitted_rows[chunk * segment + e]
+                self.pairs.position[offset + e] = place
+            self.projected.first_pair[s] = offset + first
+            self.projected.end_pair[s] = offset + end
