@@ -19,8 +19,8 @@ class TilePairs:
 
     Per tile: `first` and `count` of its pairs, `reached`: how many of them were composited before it was opaque.
     Per pair, in the order of depth, chunk by chunk: `emitted_tile` and `emitted_rows`, before they are sorted.
-    Per sorted pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse reaches
-    in the tile (first | last << 16), `gradient`: ten sums over the tile's pixels (see `compositing.py`).
+    Per sorted pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse
+    reaches in the tile (first | last << 16), `gradient`: ten sums over the tile's pixels (see `compositing.py`).
     `position[e]` for e from slot s's `first_pair` to its `end_pair` are the places of its pairs.
     """
 
