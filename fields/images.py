@@ -6,6 +6,7 @@ import taichi as ti
 from fields.backend import on_gpu
 from fields.device_images import DeviceImages
 from fields.launch import Launch
+from fields.parallel import HANDED_OUT
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 
 __all__ = ["PAD", "STRIPS", "ImageBuffers"]
@@ -14,6 +15,8 @@ __all__ = ["PAD", "STRIPS", "ImageBuffers"]
 PAD = 8
 # Strips of rows that the loss works on in parallel, each channel of each with scratch rows of its own.
 STRIPS = 32
+# A thread takes eight rows at a time.
+SPREAD = HANDED_OUT // 8
 
 
 @ti.data_oriented
@@ -151,12 +154,14 @@ class ImageBuffers:
 
     @ti.kernel
     def _set_reference(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):
-        for y in range(height):
-            row = (y + PAD) * self.stride + PAD
-            for x in range(width):
-                for c in ti.static(range(3)):
-                    self.reference[c * self.plane + row + x] = ti.cast(image[y, x, c], self.real) / 255.0
-                self.valid[row + x] = ti.cast(image[y, x, 3], self.real) / 255.0
+        for i in range(height * SPREAD):
+            if i % SPREAD == 0:
+                y = i // SPREAD
+                row = (y + PAD) * self.stride + PAD
+                for x in range(width):
+                    for c in ti.static(range(3)):
+                        self.reference[c * self.plane + row + x] = ti.cast(image[y, x, c], self.real) / 255.0
+                    self.valid[row + x] = ti.cast(image[y, x, 3], self.real) / 255.0
 
     @ti.kernel
     def _set_reference_pixels(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):

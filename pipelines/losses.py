@@ -22,7 +22,7 @@ __all__ = ["AspectPenalty", "LossValues", "PhotometricLoss", "window_weights"]
 RADIUS = 5
 C1 = 0.01**2
 C2 = 0.03**2
-# A thread takes four strips of a channel at a time.
+# A thread takes four strips of a channel at a time, or rows.
 SPREAD = HANDED_OUT // 4
 
 
@@ -88,13 +88,14 @@ class PhotometricLoss:
 
     @ti.kernel
     def _mask(self, width: ti.i32, height: ti.i32):
-        for y in range(height):
-            row = (y + PAD) * self.images.stride + PAD
-            for c in range(3):
-                for x in range(row, row + width):
-                    r = self.images.reference[c * self.images.plane + x]
-                    d = self.images.colour[c * self.images.plane + x] - r
-                    self.images.colour[c * self.images.plane + x] = r + d * self.images.valid[x]
+        for i in range(height * SPREAD):
+            if i % SPREAD == 0:
+                row = (i // SPREAD + PAD) * self.images.stride + PAD
+                for c in range(3):
+                    for x in range(row, row + width):
+                        r = self.images.reference[c * self.images.plane + x]
+                        d = self.images.colour[c * self.images.plane + x] - r
+                        self.images.colour[c * self.images.plane + x] = r + d * self.images.valid[x]
 
     @ti.func
     def _smooth_rows(self, scratch, rows, width):
