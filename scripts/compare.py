@@ -146,13 +146,7 @@ def offline_row(metrics: Mapping[str, Any]) -> Figures:
 
 def time_breakdown(metrics: Mapping[str, Any]) -> Figures:
     """Percent of the online run's time by the paper's columns, and frames per second."""
-    percent = metrics.get("breakdown_percent")
-    if percent is None:
-        total = mapping_seconds(metrics, refined=False)
-        percent = {
-            stage: 100.0 * metrics["seconds"][stage] / total for stage in BREAKDOWN.values() if stage != "others"
-        }
-        percent["others"] = 100.0 - sum(percent.values())
+    percent = metrics["breakdown_percent"]
     return {label: percent[stage] for label, stage in BREAKDOWN.items()} | {"FPS": metrics["frames_per_second"]}
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from modp_ti.config import dump_scene, load_scene
+from pipelines.stopwatch import breakdown_percent
 
 SCENE = """
 source:  {scale: 0.25, holdout: 4, stop: 9}
@@ -40,7 +41,7 @@ def metrics_of(psnr: float, gaussians: int = 1000, refined: float | None = None,
     seconds = {"total": 100.0, "compile": 10.0, "read": 2.0, "track": 5.0, "select": 1.0, "depth": 2.0}
     seconds |= {"occupancy": 1.0, "optimise": 40.0, "refine": 30.0, "evaluate": 5.0, "other": 4.0}
     metrics = {"frames": 9, "keyframes": 5, "gaussians": gaussians, "frames_per_second": 0.18}
-    metrics |= {"peak_memory_mb": 700.0, "breakdown_percent": {}, "online": section(psnr)}
+    metrics |= {"peak_memory_mb": 700.0, "breakdown_percent": breakdown_percent(seconds, 50.0), "online": section(psnr)}
     return metrics | {"refined": section(refined), "seconds": seconds, "view_renders": 5000} | more
 
 
