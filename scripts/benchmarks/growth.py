@@ -56,6 +56,7 @@ def measure_frames(device: str, threads: int) -> list[dict[str, float]]:
     initialise(device, threads)
     width, height = 320, 240
     settings = MappingSettings(
+        sh_degree=0,
         keyframes=KeyframeSettings(max_gap=1),
         densify=DensifySettings(pixels=0),
         levels=LevelSettings(probabilities=(1.0,)),
