@@ -52,7 +52,7 @@ class TilePairs:
         blocks.dense(ti.i, BLOCK).place(self.gradient)
         segments = builder.pointer(ti.i, chunks * self.segment // BLOCK)
         segments.dense(ti.i, BLOCK).place(self.emitted_tile, self.emitted_rows)
-        self.last_placed = self.gradient.get_scalar_field(9)
+        self.last_placed = self.emitted_rows
 
     def rows_to_numpy(self) -> np.ndarray:
         """`rows` of all pairs (count,) int32, in the order of the lists."""
