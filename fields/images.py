@@ -44,8 +44,10 @@ class ImageBuffers:
         self.stride = (1 << (max_width - 1).bit_length()) + 2 * PAD
         self.plane = self.stride * (-(-max_height // 256) * 256 + 2 * PAD)
         self.width = self.height = 0
-        self._take_reference = Launch(self._set_reference_pixels)
         self._references = DeviceImages(cache_gb * 2**30) if on_gpu() else None
+        self._take_reference = Launch(
+            self._set_reference_rows if self._references is None else self._set_reference_pixels
+        )
 
         def scalar():
             return ti.field(real)
@@ -112,10 +114,8 @@ class ImageBuffers:
 
     def set_reference(self, image: np.ndarray) -> None:
         """Take a reference image (H, W, 4) uint8: RGB and 255 where the pixel is valid, 0 where it is masked."""
-        if self._references is None:
-            self._set_reference(self.width, self.height, image)
-        else:
-            self._take_reference(self.width, self.height, self._references.of(image))
+        pixels = np.ascontiguousarray(image) if self._references is None else self._references.of(image)
+        self._take_reference(self.width, self.height, pixels)
 
     def set_gradients(self, colour: np.ndarray, depth: np.ndarray, opacity: np.ndarray) -> None:
         """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W)."""
@@ -153,7 +153,7 @@ class ImageBuffers:
         return out
 
     @ti.kernel
-    def _set_reference(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):
+    def _set_reference_rows(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):
         for i in range(height * SPREAD):
             if i % SPREAD == 0:
                 y = i // SPREAD

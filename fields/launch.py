@@ -42,9 +42,11 @@ class Launch:
                 context.set_arg_float((place,), value)
             elif kind is torch.Tensor:
                 context.set_arg_external_array_with_shape((place,), value.data_ptr(), value.nbytes, value.shape, 0)
-            else:
+            elif kind is np.ndarray:
                 address = value.__array_interface__["data"][0]
                 context.set_arg_external_array_with_shape((place,), address, value.nbytes, value.shape, 0)
+            else:
+                raise TypeError(f"argument {place} of a kernel is a {kind.__name__}, which Launch does not hand over")
         self._program.launch_kernel(self._compiled, context)
 
     def _settle(self, arguments: tuple) -> None:

@@ -57,6 +57,7 @@ class ViewField:
 
     @ti.kernel
     def _set(self, values: ti.types.ndarray(), width: ti.i32, height: ti.i32):
+        ti.loop_config(serialize=True)
         for _ in range(1):
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):

@@ -7,6 +7,7 @@ them are taken in depth order, and the same for any number of threads.
 import numpy as np
 import taichi as ti
 
+from fields.launch import Launch
 from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_WIDTH, TilePairs
@@ -63,6 +64,8 @@ class Binning:
         self.projected = projected
         self.pairs = pairs
         self._total = np.zeros(1, dtype=np.int64)
+        self._count, self._scan = Launch(self._count_chunks), Launch(self._scan_counts)
+        self._scatter = Launch(self._scatter_chunks)
 
     def forward(self, exact: bool = True) -> int:
         """Bin the projected Gaussians of the current view; return the number of pairs. Always exact, on the CPU."""
@@ -122,7 +125,7 @@ class Binning:
         return ti.select((last < first) | (span[0] > span[1]), 0, first | ((last + 1) << 16))
 
     @ti.kernel
-    def _count(self, slots: ti.i32, tiles_x: ti.i32, tiles_y: ti.i32):
+    def _count_chunks(self, slots: ti.i32, tiles_x: ti.i32, tiles_y: ti.i32):
         for i in range(CHUNKS * SPREAD):
             if i % SPREAD == 0:
                 self._count_chunk(i // SPREAD, slots, tiles_x, tiles_y)
@@ -151,8 +154,9 @@ class Binning:
         self.pairs.chunk_pairs[chunk] = n
 
     @ti.kernel
-    def _scan(self, tiles: ti.i32, total: ti.types.ndarray()):
-        # One serial pass over tiles x chunks: microseconds, and nothing to synchronise.
+    def _scan_counts(self, tiles: ti.i32, total: ti.types.ndarray()):
+        # One pass over tiles x chunks: microseconds, and nothing to synchronise.
+        ti.loop_config(serialize=True)
         for _ in range(1):
             place = 0
             for t in range(tiles):
@@ -172,7 +176,7 @@ class Binning:
                 pairs += n
 
     @ti.kernel
-    def _scatter(self, slots: ti.i32):
+    def _scatter_chunks(self, slots: ti.i32):
         for i in range(CHUNKS * SPREAD):
             if i % SPREAD == 0:
                 self._scatter_chunk(i // SPREAD, slots)

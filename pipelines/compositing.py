@@ -11,6 +11,7 @@ Gaussian outside, pixels inside: the transpose of the form for GPUs). Only rows 
 import taichi as ti
 
 from fields.images import PAD, ImageBuffers
+from fields.launch import Launch
 from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TilePairs
@@ -42,18 +43,17 @@ class Compositing:
         self.pairs = pairs
         self.images = images
         self.real = images.real
+        self._composite, self._add_up = Launch(self._forward), Launch(self._gather)
+        self._differentiate = {False: Launch(self._backward), True: Launch(self._backward_with_depth)}
 
     def forward(self) -> None:
         """Fill `images.colour`, `.depth` and `.opacity`."""
-        self._forward(self.view.width, self.view.height)
+        self._composite(self.view.width, self.view.height)
 
     def backward(self, with_depth: bool = False) -> None:
         """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
-        if with_depth:
-            self._backward_with_depth(self.view.width, self.view.height)
-        else:
-            self._backward(self.view.width, self.view.height)
-        self._gather(self.projected.count)
+        self._differentiate[with_depth](self.view.width, self.view.height)
+        self._add_up(self.projected.count)
 
     @ti.kernel
     def _forward(self, width: ti.i32, height: ti.i32):

@@ -59,6 +59,8 @@ class PhotometricLoss:
         self.real = images.real
         self.weights = window_weights()
         self._sums = np.zeros((3 * STRIPS, 4), dtype=np.float64)
+        self._mask, self._compare = Launch(self._mask_rows), Launch(self._compare_strips)
+        self._differentiate = Launch(self._differentiate_strips)
 
     def forward(self) -> LossValues:
         """Evaluate the loss, leaving the SSIM map in `images.ssim`.
@@ -87,7 +89,7 @@ class PhotometricLoss:
         )
 
     @ti.kernel
-    def _mask(self, width: ti.i32, height: ti.i32):
+    def _mask_rows(self, width: ti.i32, height: ti.i32):
         for i in range(height * SPREAD):
             if i % SPREAD == 0:
                 row = (i // SPREAD + PAD) * self.images.stride + PAD
@@ -113,7 +115,7 @@ class PhotometricLoss:
                 self.images.rows[target + x] = total
 
     @ti.kernel
-    def _compare(self, width: ti.i32, height: ti.i32, sums: ti.types.ndarray()):
+    def _compare_strips(self, width: ti.i32, height: ti.i32, sums: ti.types.ndarray()):
         for i in range((3 * STRIPS) * SPREAD):
             if i % SPREAD == 0:
                 self._compare_unit(i // SPREAD, width, height, sums)
@@ -173,7 +175,9 @@ class PhotometricLoss:
         sums[unit, 3] = count
 
     @ti.kernel
-    def _differentiate(self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64, partials: ti.i32):
+    def _differentiate_strips(
+        self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64, partials: ti.i32
+    ):
         # partials is 3, but not a constant: LLVM would unroll the loops over them, and compile a second longer at
         # every start of a process for a kernel that is no faster.
         for i in range((3 * STRIPS) * SPREAD):

@@ -10,6 +10,7 @@ import torch
 
 from fields.gaussians import SH_C0, GaussianField
 from fields.late import Late
+from fields.launch import Launch
 from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.se3 import ti_rotation_from_quaternion
@@ -41,6 +42,14 @@ class Projection:
         self._keys = np.zeros(1, dtype=np.uint64)
         self._depths = np.zeros(1, dtype=np.float32)
         self._chunk_counts = np.zeros(1, dtype=np.int32)
+        self._cull, self._compact = Launch(self._cull_chunks), Launch(self._compact_chunks)
+        self._set_order, self._sum_tangents = Launch(self._set_sorted), Launch(self._sum_tangents_of_chunks)
+        self._prepare_differentiable()
+
+    def _prepare_differentiable(self) -> None:
+        self._project, self._shade = Launch(self.project), Launch(self.shade)
+        self._project_back, self._shade_back = Launch(self.project, reverse=True), Launch(self.shade, reverse=True)
+        self._clear = Launch(self._clear_tangent_gradients)
 
     def forward(self) -> int:
         """Fill `projected` for the current view; return how many Gaussians it sees."""
@@ -49,19 +58,18 @@ class Projection:
             # Keys are unique (depth above, slot below), so any sort of them is stable in the Gaussians' order.
             self._keys[:count].sort()
             self._set_order(count, self._keys)
-            self.project()
-            self.shade()
+            self._project()
+            self._shade()
         else:
             self.projected.seen[None] = 0
         return count
 
     def backward(self) -> None:
         """From the gradients in `projected` to those of the Gaussians and of the slots' camera tangents."""
-        count = self.projected.count
-        if count:
-            self._clear_tangent_gradients()
-            self.shade.grad()
-            self.project.grad()
+        if self.projected.count:
+            self._clear()
+            self._shade_back()
+            self._project_back()
 
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order."""
@@ -97,7 +105,7 @@ class Projection:
         return int(ends[-1])
 
     @ti.kernel
-    def _cull(self, n: ti.i32, depths: ti.types.ndarray(), counts: ti.types.ndarray()):
+    def _cull_chunks(self, n: ti.i32, depths: ti.types.ndarray(), counts: ti.types.ndarray()):
         for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
             if i % SPREAD == 0:
                 self._cull_chunk(i // SPREAD, n, depths, counts)
@@ -145,7 +153,9 @@ class Projection:
         return ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
 
     @ti.kernel
-    def _compact(self, n: ti.i32, depths: ti.types.ndarray(), first: ti.types.ndarray(), keys: ti.types.ndarray()):
+    def _compact_chunks(
+        self, n: ti.i32, depths: ti.types.ndarray(), first: ti.types.ndarray(), keys: ti.types.ndarray()
+    ):
         for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
             if i % SPREAD == 0:
                 self._compact_chunk(i // SPREAD, n, depths, first, keys)
@@ -163,7 +173,7 @@ class Projection:
                 slot += 1
 
     @ti.kernel
-    def _set_order(self, count: ti.i32, keys: ti.types.ndarray()):
+    def _set_sorted(self, count: ti.i32, keys: ti.types.ndarray()):
         self.projected.seen[None] = count
         for k in range(count):
             self.projected.order[k] = ti.cast(keys[k] & ti.u64(0xFFFFFFFF), ti.i32)
@@ -231,7 +241,7 @@ class Projection:
             self.gaussians.touched[self.projected.gaussian[s]] = 1
 
     @ti.kernel
-    def _sum_tangents(self, count: ti.i32, partial: ti.types.ndarray()):
+    def _sum_tangents_of_chunks(self, count: ti.i32, partial: ti.types.ndarray()):
         for i in range(((count + CHUNK - 1) // CHUNK) * SPREAD):
             if i % SPREAD == 0:
                 self._sum_tangents_chunk(i // SPREAD, count, partial)

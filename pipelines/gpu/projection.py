@@ -32,10 +32,8 @@ class DeviceProjection(Projection):
         self.projected = projected
         self._depths = torch.empty(0, dtype=torch.float32, device=torch_device())
         self._cull, self._assign = Launch(self._cull_all), Launch(self._assign_sorted)
-        self._project, self._shade = Launch(self.project), Launch(self.shade)
-        self._clear = Launch(self._clear_tangent_gradients)
-        self._project_back, self._shade_back = Launch(self.project, reverse=True), Launch(self.shade, reverse=True)
         self._sum_tangents = Launch(self._sum_all_tangents)
+        self._prepare_differentiable()
         self._tangent = torch.zeros(6, dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
@@ -54,13 +52,6 @@ class DeviceProjection(Projection):
         self._project()
         self._shade()
         return n
-
-    def backward(self) -> None:
-        """From the gradients in `projected` to those of the Gaussians and of the slots' camera tangents."""
-        if self.projected.count:
-            self._clear()
-            self._shade_back()
-            self._project_back()
 
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order. Waits for the device."""

@@ -63,3 +63,10 @@ def test_a_gradient_kernel_is_launched_as_well() -> None:
 def test_wrong_types_of_the_first_call_are_refused() -> None:
     with pytest.raises(ti.TaichiRuntimeTypeError):
         Launch(Sums().add)("one", 0.5, np.zeros(4))
+
+
+def test_wrong_types_of_a_later_call_are_refused() -> None:
+    add = Launch(Sums().add)
+    add(1, 0.5, np.zeros(4))
+    with pytest.raises(TypeError, match="argument 0 of a kernel is a int64"):
+        add(np.int64(1), 0.5, np.zeros(4))
