@@ -22,6 +22,13 @@ class LearningRates:
     colour: float
 
 
+@ti.func
+def _one_over_complement(x):
+    """1 / (1 - exp(x)) for x < 0, by the series where the difference would be all rounding."""
+    series = -x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0))))
+    return 1.0 / ti.select(x > -0.05, series, 1.0 - ti.exp(x))
+
+
 @ti.data_oriented
 class Adam:
     """Adam [Kingma 2015] with every Gaussian's own step count for the bias correction.
@@ -48,14 +55,16 @@ class Adam:
         beta1, beta2 = max(1.0 - 0.1 * batch, 0.0), 1.0 - 0.001 * batch
         values = [rates.position, rates.log_scale, rates.quaternion, rates.opacity_logit, rates.colour]
         steps = (float(root * v) for v in values)
-        self._update_all(self.gaussians.count, active, *steps, float(beta1), float(beta2), 1e-15 / root)
+        # beta^t is exp(t log beta), which is cheaper than a power; log 0 as far below as any t makes nothing of.
+        logs = (float(np.log(max(beta, 1e-30))) for beta in (beta1, beta2))
+        self._update_all(self.gaussians.count, active, *steps, float(beta1), float(beta2), *logs, 1e-15 / root)
 
     @ti.func
     def _update(self, value, gradient, m: ti.template(), v: ti.template(), lr, betas, corrections, eps):
         g = ti.select(ti.abs(gradient) < 1e18, gradient, 0.0)
         m = betas[0] * m + (1.0 - betas[0]) * g
         v = betas[1] * v + (1.0 - betas[1]) * g * g
-        return value - lr * (m / corrections[0]) / (ti.sqrt(v / corrections[1]) + eps)
+        return value - lr * (m * corrections[0]) / (ti.sqrt(v * corrections[1]) + eps)
 
     @ti.kernel
     def _step(
@@ -69,15 +78,17 @@ class Adam:
         lr_colour: ti.f32,
         beta1: ti.f32,
         beta2: ti.f32,
+        log_beta1: ti.f32,
+        log_beta2: ti.f32,
         eps: ti.f32,
     ):
         for i in range(count):
             if self.gaussians.touched[i] != 0:
                 self.gaussians.touched[i] = 0
-                t = self.gaussians.steps[i] + 1
-                self.gaussians.steps[i] = t
+                self.gaussians.steps[i] = self.gaussians.steps[i] + 1
+                t = ti.cast(self.gaussians.steps[i], ti.f32)
                 betas = ti.Vector([beta1, beta2])
-                corrections = ti.Vector([1.0 - ti.pow(beta1, t), 1.0 - ti.pow(beta2, t)])
+                corrections = ti.Vector([_one_over_complement(t * log_beta1), _one_over_complement(t * log_beta2)])
                 for c in ti.static(range(3)):
                     self.gaussians.position[i][c] = self._update(
                         self.gaussians.position[i][c], self.gaussians.position.grad[i][c],

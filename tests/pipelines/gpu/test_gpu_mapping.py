@@ -117,4 +117,4 @@ def test_offline_optimisation_is_as_good(on_both: Callable) -> None:
     assert gpu[0] == pytest.approx(cpu[0], abs=0.01)
     assert gpu[1:] == pytest.approx(cpu[:-1], abs=0.1)
     assert gpu_count == pytest.approx(count, rel=0.05)
-    assert cpu[-1] > cpu[0] + 1
+    assert cpu[-1] > cpu[0] + 0.5
