@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from fields.keyframes import Keyframe
-from fields.running_median import RunningMedian
 from fields.se3 import inverse_se3
 from fields.tracked_frame import TrackedFrame
 from pipelines.settings import KeyframeSettings
+from pipelines.sharpness import sharpness
 
 __all__ = ["KeyframeSelector", "SeenPoints", "covisibility"]
 
@@ -57,33 +57,32 @@ def covisibility(a: SeenPoints, b: SeenPoints) -> float:
 class KeyframeSelector:
     """Decides frame by frame.
 
-    A frame that turned more than `max_rotation` since the last one is taken for blurred, unless turning that much is
-    usual here (within three times the median of the frames so far): image collections are no videos.
+    The paper takes a frame that turned more than 10 degrees since the one before for blurred. Here it must look so as
+    well: a collection of photographs turns as it likes, and what only a rejected one shows would be missing.
     """
 
     def __init__(self, settings: KeyframeSettings) -> None:
         self.settings = settings
         self._previous: TrackedFrame | None = None
-        self._rotations = RunningMedian()  # [degrees per frame]
 
     def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
         """Whether `frame` becomes a keyframe, `last` being the latest one."""
         previous, self._previous = self._previous, frame
-        rotation = 0.0 if previous is None else rotation_per_frame(previous, frame)
-        if previous is not None:
-            self._rotations.add(rotation)
         if len(frame.points) < self.settings.min_points:
             return False
         if last is None or previous is None:
             return True
         if frame.index - last.index > self.settings.max_gap:
             return True
-        if rotation > max(self.settings.max_rotation, 3.0 * self._rotations.value):
+        if rotation_per_frame(previous, frame) > self.settings.max_rotation and self._is_blurred(frame, last):
             return False
         moved = np.linalg.norm(camera_centre(frame.T_camera_world) - camera_centre(last.T_camera_world))
         if moved > self.settings.baseline * last.median_depth:
             return True
         return covisibility(SeenPoints.of(frame), SeenPoints.of(last)) < self.settings.covisibility
+
+    def _is_blurred(self, frame: TrackedFrame, last: Keyframe) -> bool:
+        return sharpness(frame.rgba) < self.settings.min_sharpness * sharpness(last.rgba)
 
 
 def rotation_per_frame(a: TrackedFrame, b: TrackedFrame) -> float:

@@ -1,0 +1,37 @@
+"""How sharp a picture is, whatever it shows: tells motion blur from mere motion."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["sharpness"]
+
+
+def sharpness(rgb: NDArray[np.uint8]) -> float:
+    """Detail of the picture (H, W, 3 or more) relative to that of itself at half the size, where it is least.
+
+    Detail is the mean absolute second difference along rows, columns or a diagonal, and the least of the four counts:
+    motion blurs along one line only. Some 0.5 to 0.7 for a photograph, a quarter less for one that is smeared over two
+    pixels. 0 for a picture without any detail, or of less than 6 pixels a side.
+    """
+    if min(rgb.shape[:2]) < 6:
+        return 0.0
+    full = cv2.cvtColor(np.ascontiguousarray(rgb[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    half = cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    fine, coarse = _detail(full), _detail(half)
+    return float((fine / np.maximum(coarse, 1e-6)).min()) if coarse.min() > 0 else 0.0
+
+
+def _detail(grey: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Mean absolute second difference (4,) along a row, a column and the two diagonals."""
+    height, width = grey.shape
+    centre = 2.0 * grey[1:-1, 1:-1]
+
+    def difference(dy: int, dx: int) -> float:
+        ahead = grey[1 + dy : height - 1 + dy, 1 + dx : width - 1 + dx]
+        behind = grey[1 - dy : height - 1 - dy, 1 - dx : width - 1 - dx]
+        return float(np.abs(centre - ahead - behind).mean())
+
+    return np.array([difference(0, 1), difference(1, 0), difference(1, 1), difference(1, -1)])
