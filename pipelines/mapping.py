@@ -12,6 +12,7 @@ from fields.keyframes import Keyframe, KeyframeStore
 from fields.occupancy import OccupancyVoxels
 from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
+from pipelines.contribution import Contribution
 from pipelines.densification import dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.depth import DepthEstimator, build_depth
 from pipelines.keyframe_selection import KeyframeSelector
@@ -61,6 +62,7 @@ class OnlineMapper:
         self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
         self.loss = self.optimiser.loss
+        self.contribution = Contribution(self.gaussians, self.renderer)
         self.keyframes = KeyframeStore(len(settings.levels.probabilities))
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
@@ -190,6 +192,7 @@ class OnlineMapper:
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.optimiser.settle()
             self.depth.estimate(view, [store[0]], pixels)
+            self.contribution.measure(store, self.settings.near)
             self.renderer.camera_gradient()
             self.renderer.images.clip_colour()
             self.renderer.images.colour_to_numpy()

@@ -53,7 +53,10 @@ class KeyframeSettings(StrictModel):
     max_rotation: float = Field(
         10.0,
         gt=0,
-        description="degrees per frame beyond which a frame of a video counts as blurred, and is no keyframe",
+        description="degrees per frame beyond which a frame is a keyframe only if it is not blurred",
+    )
+    min_sharpness: float = Field(
+        0.75, ge=0, le=1, description="sharpness, as a factor on the last keyframe's, below which it is"
     )
     min_points: int = Field(10, ge=0, description="tracked points that a keyframe needs")
 
@@ -235,6 +238,11 @@ class RefineSettings(StrictModel):
     poses: bool = Field(False, description="also refine poses, at a rate that decays as that of positions does")
     position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
     scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")
+    min_contribution: float = Field(
+        0.5,
+        ge=0,
+        description="pixels covered where it shows most, below which a Gaussian is removed beforehand; 0 for none",
+    )
 
 
 class OfflineSettings(StrictModel):

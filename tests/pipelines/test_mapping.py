@@ -74,11 +74,24 @@ def test_refinement_improves_the_map_and_leaves_the_poses(mapped: OnlineMapper) 
     seen = []
     renders = mapped.renderer.view_renders
     refine(mapped, RefineSettings(steps=40, views=4), lambda step, _: seen.append(step))
-    assert mapped.renderer.view_renders == renders + 40 * 4
+    # Once over the keyframes for what shows, then the steps.
+    assert mapped.renderer.view_renders == renders + len(mapped.keyframes) + 40 * 4
     assert np.mean([psnr(mapped, i) for i in range(7)]) > before
     assert seen == list(range(1, 41))
     for keyframe, T in zip(mapped.keyframes, poses, strict=True):
         np.testing.assert_array_equal(keyframe.T_camera_world, T)
+
+
+def test_refinement_removes_what_no_keyframe_shows(mapped: OnlineMapper) -> None:
+    state, count = mapped.gaussians.to_numpy(), len(mapped.gaussians)
+    behind = {name: values[:5].copy() for name, values in state.items()}
+    behind["position"] -= [0.0, 0.0, 100.0]
+    mapped.gaussians.append(**behind)
+    refine(mapped, RefineSettings(steps=1, views=1, min_contribution=0.0))
+    assert len(mapped.gaussians) == count + 5
+    refine(mapped, RefineSettings(steps=1, views=1, min_contribution=1e-3))
+    assert (mapped.gaussians.to_numpy()["position"][:, 2] > -50).all()
+    mapped.gaussians.load(state)
 
 
 def test_a_perturbed_pose_comes_back(mapped: OnlineMapper) -> None:
