@@ -47,11 +47,15 @@ class Mapper(Protocol):
 
 @dataclass(frozen=True)
 class MapVersion:
-    """A map at one time: Gaussians by name as `GaussianField.to_numpy`, T_camera_world and exposure of every frame."""
+    """A map at one time: Gaussians by name as `GaussianField.to_numpy`, T_camera_world and exposure of every frame.
+
+    view_renders: views that were rendered and differentiated to make it.
+    """
 
     gaussians: dict[str, NDArray]
     trajectory: list[NDArray[np.float64]]
     exposures: list[NDArray[np.float64] | None]
+    view_renders: int
 
 
 @dataclass(frozen=True)

@@ -135,8 +135,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             "seed": config.seed,
             "frames_per_second": round(len(poses.index) / mapping_seconds, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "view_renders": mapper.renderer.view_renders,
-            **{stage: _summaries(scores, stage) if stage in versions else None for stage in MAPS},
+            **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
             "lpips_note": no_lpips,
             "seconds": _seconds(watch.seconds, time.perf_counter() - started),
             "breakdown_percent": breakdown,
@@ -192,6 +191,7 @@ def _version(mapper: OnlineMapper | OfflineMapper, poses: Poses) -> MapVersion:
         mapper.gaussians.to_numpy(),
         [store.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)],
         [store.exposure_at(i) for i in poses.index],
+        mapper.renderer.view_renders,
     )
 
 
@@ -214,10 +214,15 @@ def _timed(frames: Iterator[TrackedFrame], watch) -> Iterator[TrackedFrame]:
         yield frame
 
 
-def _summaries(scores: list[FrameScore], stage: str) -> dict[str, dict]:
-    """A version's means over all frames and over those held out."""
+def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
+    """A version's means over all frames and over those held out, and what it took."""
     of = [score for score in scores if score.stage == stage]
-    return {"all": summary(of), "held_out": summary([score for score in of if score.held_out])}
+    return {
+        "all": summary(of),
+        "held_out": summary([score for score in of if score.held_out]),
+        "gaussians": len(version.gaussians["position"]),
+        "view_renders": version.view_renders,
+    }
 
 
 def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:

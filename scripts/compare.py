@@ -81,10 +81,11 @@ def main() -> None:
                 offline_job(scene, file, arguments.output / scene, 1, common).check()
         for (scene, file), of_scene in jobs.items():
             runs = execute(of_scene, arguments.fresh)
-            figures[scene] = online_rows(runs, [job.check()["refine"] for job in of_scene])
+            figures[scene] = online_rows(runs, [job.check()["refine"]["steps"] for job in of_scene])
             breakdown[scene] = time_breakdown(runs[0])
             if not arguments.no_offline:
-                job = offline_job(scene, file, arguments.output / scene, view_renders(runs[0]), common)
+                renders = counts(runs[0], "refined")["view_renders"]
+                job = offline_job(scene, file, arguments.output / scene, renders, common)
                 figures[scene][OFFLINE] = offline_row(execute([job], arguments.fresh)[0])
     except InputError as error:
         sys.exit(f"error: {error}")
@@ -105,43 +106,28 @@ def offline_job(scene: str, file: Path, folder: Path, renders: int, common: Mapp
     return Job(f"{scene}, {OFFLINE}", file, folder / "offline", overrides)
 
 
-def view_renders(metrics: Mapping[str, Any]) -> int:
-    """Views that a whole run rendered forward and backward."""
-    if "view_renders" not in metrics:
+def counts(metrics: Mapping[str, Any], stage: str) -> Figures:
+    """Gaussians of a map, and views that were rendered forward and backward to make it."""
+    if "view_renders" not in metrics[stage]:
         raise InputError("metrics.json does not count view renders: made by an older version; run again with --fresh")
-    return metrics["view_renders"]
+    return {name: metrics[stage][name] for name in ("gaussians", "view_renders")}
 
 
-def online_rows(runs: Sequence[Mapping[str, Any]], refinements: Sequence[Mapping[str, Any]]) -> dict[str, Figures]:
-    """The rows of the online map and of each post refinement. refinements: the `refine` settings of each run."""
-    first, refine = runs[0], refinements[0]
-    rows: dict[str, Figures] = {
-        ONLINE: quality(first["online"])
-        | {
-            "steps": 0,
-            "gaussians": first["gaussians"],
-            "view_renders": view_renders(first) - refine["steps"] * refine["views"],
-            "seconds": mapping_seconds(first, refined=False),
-        }
-    }
-    for metrics, refine in zip(runs, refinements, strict=True):
-        rows[f"{ONLINE} + {refine['steps']:,} steps"] = quality(metrics["refined"]) | {
-            "steps": refine["steps"],
-            "gaussians": metrics["gaussians"],
-            "view_renders": view_renders(metrics),
-            "seconds": mapping_seconds(metrics, refined=True),
-        }
+def online_rows(runs: Sequence[Mapping[str, Any]], refinements: Sequence[int]) -> dict[str, Figures]:
+    """The rows of the online map and of each post refinement. refinements: the steps of each run."""
+    seconds = mapping_seconds(runs[0], refined=False)
+    first = quality(runs[0]["online"]) | counts(runs[0], "online") | {"steps": 0, "seconds": seconds}
+    rows: dict[str, Figures] = {ONLINE: first}
+    for metrics, steps in zip(runs, refinements, strict=True):
+        row = quality(metrics["refined"]) | counts(metrics, "refined")
+        rows[f"{ONLINE} + {steps:,} steps"] = row | {"steps": steps, "seconds": mapping_seconds(metrics, refined=True)}
     return rows
 
 
 def offline_row(metrics: Mapping[str, Any]) -> Figures:
     """The row of offline 3DGS, all of whose steps are optimisation."""
-    return quality(metrics["offline"]) | {
-        "steps": view_renders(metrics),
-        "gaussians": metrics["gaussians"],
-        "view_renders": view_renders(metrics),
-        "seconds": mapping_seconds(metrics, refined=True),
-    }
+    row = quality(metrics["offline"]) | counts(metrics, "offline")
+    return row | {"steps": row["view_renders"], "seconds": mapping_seconds(metrics, refined=True)}
 
 
 def time_breakdown(metrics: Mapping[str, Any]) -> Figures:

@@ -37,7 +37,7 @@ def test_a_run_leaves_the_files_that_an_online_run_leaves(folder: Path) -> None:
 
 def test_the_metrics_say_what_happened(folder: Path) -> None:
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert (metrics["frames"], metrics["keyframes"], metrics["view_renders"]) == (9, 6, 90)
+    assert (metrics["frames"], metrics["keyframes"], metrics["offline"]["view_renders"]) == (9, 6, 90)
     assert metrics["online"] is metrics["refined"] is None
     assert metrics["offline"]["all"]["count"] == 9
     assert metrics["offline"]["held_out"]["count"] == 3

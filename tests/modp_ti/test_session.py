@@ -47,7 +47,12 @@ def test_the_metrics_say_what_happened(folder: Path) -> None:
     assert metrics["backend"] == "cpu"
     assert metrics["seed"] == 3
     assert 1 <= metrics["keyframes"] <= 6
-    assert metrics["gaussians"] == len(read_splats(folder / "splats.ply")["position"])
+    assert (
+        metrics["gaussians"] == metrics["refined"]["gaussians"] == len(read_splats(folder / "splats.ply")["position"])
+    )
+    assert metrics["refined"]["gaussians"] <= metrics["online"]["gaussians"]
+    # Once over the keyframes for what shows, then five steps of four views.
+    assert metrics["refined"]["view_renders"] == metrics["online"]["view_renders"] + metrics["keyframes"] + 5 * 4
     assert metrics["online"]["all"]["count"] == metrics["refined"]["all"]["count"] == 9
     assert metrics["online"]["held_out"]["count"] == 3
     assert metrics["refined"]["held_out"]["psnr"] > metrics["online"]["held_out"]["psnr"]

@@ -29,20 +29,27 @@ def scene(tmp_path: Path) -> Path:
     return file
 
 
-def metrics_of(psnr: float, gaussians: int = 1000, refined: float | None = None, **more: object) -> dict:
+def metrics_of(
+    psnr: float, gaussians: int = 1000, refined: float | None = None, view_renders: int = 5000, **more: object
+) -> dict:
     """metrics.json of a run with these held-out PSNRs; those of all frames are 1 dB higher."""
 
-    def section(value: float | None) -> dict | None:
+    def section(value: float | None, view_renders: int) -> dict | None:
         if value is None:
             return None
         scores = {"ssim": value / 40, "lpips": None}
-        return {"all": {"psnr": value + 1, "count": 9, **scores}, "held_out": {"psnr": value, "count": 3, **scores}}
+        means = {"all": {"psnr": value + 1, "count": 9, **scores}, "held_out": {"psnr": value, "count": 3, **scores}}
+        return means | {"gaussians": gaussians, "view_renders": view_renders}
 
     seconds = {"total": 100.0, "compile": 10.0, "read": 2.0, "track": 5.0, "select": 1.0, "depth": 2.0}
     seconds |= {"occupancy": 1.0, "optimise": 40.0, "refine": 30.0, "evaluate": 5.0, "other": 4.0}
     metrics = {"frames": 9, "keyframes": 5, "gaussians": gaussians, "frames_per_second": 0.18}
-    metrics |= {"peak_memory_mb": 700.0, "breakdown_percent": breakdown_percent(seconds, 50.0), "online": section(psnr)}
-    return metrics | {"refined": section(refined), "seconds": seconds, "view_renders": 5000} | more
+    metrics |= {
+        "peak_memory_mb": 700.0,
+        "breakdown_percent": breakdown_percent(seconds, 50.0),
+        "online": section(psnr, 1000),
+    }
+    return metrics | {"refined": section(refined, view_renders), "seconds": seconds} | more
 
 
 @pytest.fixture

@@ -20,9 +20,9 @@ def test_offline_gets_as_many_steps_as_the_online_run_rendered_views(scene: Path
 
 def test_the_tables_show_what_each_map_cost(make_metrics: Callable[..., dict]) -> None:
     runs = [make_metrics(24.0, 1000, 26.0), make_metrics(24.0, 1100, 27.0, view_renders=81_000)]
-    rows = compare.online_rows(runs, [{"steps": 1000, "views": 4}, {"steps": 20_000, "views": 4}])
-    offline = make_metrics(0.0, 3000, view_renders=5000)
-    offline |= {"online": None, "offline": make_metrics(25.0)["online"]}
+    rows = compare.online_rows(runs, [1000, 20_000])
+    offline = make_metrics(0.0, 3000, 25.0)
+    offline |= {"online": None, "refined": None, "offline": offline["refined"]}
     offline["seconds"] |= {"total": 220.0, "refine": 0.0}
     rows[compare.OFFLINE] = compare.offline_row(offline)
     text = compare.report({"desk": rows}, {"desk": compare.time_breakdown(runs[0])})
@@ -50,9 +50,8 @@ Held-out frames; all frames where none is held out. Time without compiling, the 
 
 
 def test_several_scenes_have_a_mean(make_metrics: Callable[..., dict]) -> None:
-    refine = [{"steps": 1000, "views": 4}]
     runs = {"desk": make_metrics(24.0, refined=26.0), "fox": make_metrics(20.0, 3000, 21.0)}
-    rows = {scene: compare.online_rows([run], refine) for scene, run in runs.items()}
+    rows = {scene: compare.online_rows([run], [1000]) for scene, run in runs.items()}
     text = compare.report(rows, {scene: compare.time_breakdown(run) for scene, run in runs.items()})
     assert "## Mean of 2 scenes" in text
     assert "| online | 22.00 | 0.550 | – | 0 | 2,000 | 1,000 | 50 |" in text
@@ -67,7 +66,7 @@ def test_the_breakdown_of_the_metrics_is_taken_where_there_is_one(make_metrics: 
 
 def test_metrics_without_a_count_of_renders_are_refused() -> None:
     with pytest.raises(InputError, match="--fresh"):
-        compare.view_renders({})
+        compare.counts({"online": {}}, "online")
 
 
 def test_the_script_runs_each_refinement_once(
