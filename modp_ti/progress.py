@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -12,15 +13,19 @@ from pipelines.mapping import FrameReport
 
 __all__ = ["ProgressLine"]
 
+# Seconds between the lines of a log.
+LOG_EVERY = 30.0
+
 
 class ProgressLine:
-    """Shows what a run is at, on one line of `console`; on a console that is no terminal only the results."""
+    """Shows what a run is at, on one line of `console`; where that is no terminal, in a line now and then."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
         self._progress: Progress | None = None
         self._task = None
         self._state = ""
+        self._logged = 0.0
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
@@ -32,7 +37,7 @@ class ProgressLine:
         """Show a tracker's preparation; the Progress callback of trackers."""
         if self._progress is None:
             self._begin(what, total)
-        self._progress.update(self._task, description=what, completed=done, total=total)
+        self._update(description=what, completed=done, total=total)
         if done >= total:
             self.stop()
 
@@ -47,20 +52,20 @@ class ProgressLine:
             self._state = f"{report.keyframes} keyframes{gaussians}{psnr}"
         task = self._progress.tasks[0]
         speed = f"  {task.speed:.2f} frames/s" if task.speed else ""
-        self._progress.update(self._task, advance=1, state=self._state + speed)
+        self._update(advance=1, state=self._state + speed)
 
     def start_refining(self, steps: int) -> None:
         self._begin("refining", steps)
 
     def refined(self, step: int, psnr: float) -> None:
-        self._progress.update(self._task, completed=step, state=f"{psnr:.2f} dB")
+        self._update(completed=step, state=f"{psnr:.2f} dB")
 
     def start_offline(self, steps: int) -> None:
         self._begin("optimising", steps)
 
     def optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Show a step of offline optimisation that is done."""
-        self._progress.update(self._task, completed=step, state=f"{gaussians:,} Gaussians  {psnr:.2f} dB")
+        self._update(completed=step, state=f"{gaussians:,} Gaussians  {psnr:.2f} dB")
 
     def stop(self) -> None:
         """End the line, leaving its last state on the screen."""
@@ -82,9 +87,20 @@ class ProgressLine:
             soft_wrap=True,
         )
 
+    def _update(self, **changes: object) -> None:
+        self._progress.update(self._task, **changes)
+        if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
+            return
+        self._logged = time.monotonic()
+        task = self._progress.tasks[0]
+        total = "" if task.total is None else f"/{task.total:.0f}"
+        line = f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}"
+        self.console.print(line, highlight=False, soft_wrap=True)
+
     def _begin(self, what: str, total: int | None) -> None:
         self.stop()
         self._state = ""
+        self._logged = time.monotonic()
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=8),
