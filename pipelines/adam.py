@@ -55,7 +55,7 @@ class Adam:
         beta1, beta2 = max(1.0 - 0.1 * batch, 0.0), 1.0 - 0.001 * batch
         values = [rates.position, rates.log_scale, rates.quaternion, rates.opacity_logit, rates.colour]
         steps = (float(root * v) for v in values)
-        # beta^t is exp(t log beta), which is cheaper than a power; log 0 as far below as any t makes nothing of.
+        # beta^t is exp(t log beta), cheaper than a power. A beta of 0 counts as 1e-30, whose powers vanish too.
         logs = (float(np.log(max(beta, 1e-30))) for beta in (beta1, beta2))
         self._update_all(self.gaussians.count, active, *steps, float(beta1), float(beta2), *logs, 1e-15 / root)
 

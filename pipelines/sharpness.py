@@ -21,7 +21,7 @@ def sharpness(rgb: NDArray[np.uint8]) -> float:
     full = cv2.cvtColor(np.ascontiguousarray(rgb[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
     half = cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA)
     fine, coarse = _detail(full), _detail(half)
-    return float((fine / np.maximum(coarse, 1e-6)).min()) if coarse.min() > 0 else 0.0
+    return float((fine / coarse).min()) if coarse.min() > 0 else 0.0
 
 
 def _detail(grey: NDArray[np.float32]) -> NDArray[np.float64]:
