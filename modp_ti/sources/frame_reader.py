@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
-from modp_ti.sources.image_folder import ImageFolder
 from modp_ti.sources.masks import MaskFolder, differs_from_colour
+from modp_ti.sources.protocol import ImageSource
 from modp_ti.sources.undistortion import Undistorter
 from modp_ti.sources.vignette import LEAST_LIGHT, read_vignette
 
@@ -34,12 +34,12 @@ class Picture:
 
 
 class FrameReader:
-    """Reads frames of a folder with what `source.masks`, `mask_colour` and `vignette` add to them.
+    """Reads frames of a source with what `source.masks`, `mask_colour` and `vignette` add to them.
 
     Raises InputError for a folder of masks or a vignette that cannot be used.
     """
 
-    def __init__(self, images: ImageFolder, source: SourceSettings) -> None:
+    def __init__(self, images: ImageSource, source: SourceSettings) -> None:
         self.images = images
         self._source = source
         self._masks = None if source.masks is None else MaskFolder(source.masks)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
 from modp_ti.sources.image_header import read_image_header
+from modp_ti.sources.intrinsics import Intrinsics
 
 __all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key"]
 
@@ -29,11 +30,15 @@ class ImageFolder:
     """The images under one folder, subfolders included, hidden files left out.
 
     Names are relative to the folder, with forward slashes. Raises InputError where there is no such folder or
-    no image. setting: the key that named the folder, for messages.
+    no image. fps: images a second, where their place is all that is known of their time. setting: the key that named
+    the folder, for messages.
     """
 
-    def __init__(self, path: str | os.PathLike[str], setting: str = "source.path") -> None:
+    def __init__(self, path: str | os.PathLike[str], fps: float = 30.0, setting: str = "source.path") -> None:
         self.path = Path(path)
+        self.intrinsics: Intrinsics | None = None
+        self.notes: list[str] = []
+        self._fps = fps
         if not self.path.exists():
             raise InputError(f"{self.path}: no such folder of images ({setting})")
         if not self.path.is_dir():
@@ -61,6 +66,10 @@ class ImageFolder:
     def position(self, name: str) -> int:
         """Place of an image in the natural order, from 0."""
         return self._position[name]
+
+    def timestamp(self, name: str) -> float:
+        """Seconds since the first image of the folder."""
+        return self._position[name] / self._fps
 
     def find(self, name: str) -> str | None:
         """The image that a tracker's file name means, or None.
@@ -90,6 +99,10 @@ class ImageFolder:
                 f"{self.path}: source.start={start} leaves no frame of the {len(self.names)} in the folder"
             )
         return names
+
+    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
+        """The same names, one by one."""
+        return iter(self.selected(start, stop, step))
 
     def size(self, name: str) -> tuple[int, int]:
         """(width, height) as stored. Raises InputError for an image that is unreadable or cut off."""
@@ -131,6 +144,9 @@ class ImageFolder:
         if image is None:
             raise self._unreadable(name, "it is damaged or no image")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    def close(self) -> None:
+        """Nothing stays open."""
 
     def _unreadable(self, name: str, reason: str) -> InputError:
         return InputError(f"{self.path / name}: unreadable image: {reason}; replace it or take it out of the folder")

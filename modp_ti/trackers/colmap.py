@@ -13,7 +13,7 @@ from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import FrameReader, ImageFolder, Undistorter
+from modp_ti.sources import FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.sources.distortion import colmap_intrinsics
 from modp_ti.trackers.colmap_files import require_whole_binary_model
 from modp_ti.trackers.replay import (
@@ -37,7 +37,7 @@ def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTra
     supported, where no image of the model is in the folder, and for images that do not fit their cameras.
     """
     assert source.path is not None, "the configuration asks for it"
-    images = ImageFolder(source.path)
+    images = open_source(source)
     selected = set(images.selected(source.start, source.stop, source.step))
     folder = _model_folder(source.path, tracker.path)
     model = _read_model(folder)
@@ -121,7 +121,7 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def _no_match(images: ImageFolder, folder: Path, absent: Sequence[str]) -> str:
+def _no_match(images: ImageSource, folder: Path, absent: Sequence[str]) -> str:
     if not absent:
         return f"{folder}: no image of the COLMAP model has a pose"
     return (

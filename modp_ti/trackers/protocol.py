@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol, runtime_checkable
 
+from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 
-__all__ = ["Progress", "Tracker", "frame_count", "may_read_ahead"]
+__all__ = ["Progress", "Tracker", "events", "frame_count", "may_read_ahead"]
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(what, done, total) while a tracker prepares."""
@@ -20,6 +21,9 @@ class Tracker(Protocol):
     notes: one-line remarks for the user, known when the tracker is opened, such as frames that were skipped.
     A tracker that knows how many frames it will deliver has `__len__`. One whose frames may be read in a thread
     beside the mapper has `reads_ahead = True`; it must not start Taichi's kernels then, which one thread alone may do.
+    A tracker that revises poses has `events()`, an iterator over its frames and, between them, `PoseCorrection`s of
+    frames before. It may be live; the frames are there again, with the poses that they had last, when the tracker is
+    iterated over afterwards. One that holds a camera or a socket open has `close()`.
     Iterating raises InputError where an input turns out bad.
     """
 
@@ -27,6 +31,11 @@ class Tracker(Protocol):
     def notes(self) -> list[str]: ...
 
     def __iter__(self) -> Iterator[TrackedFrame]: ...
+
+
+def events(tracker: Tracker) -> Iterator[TrackedFrame | PoseCorrection]:
+    """What the tracker delivers: its frames, and corrections where it makes any."""
+    return tracker.events() if hasattr(tracker, "events") else iter(tracker)
 
 
 def frame_count(tracker: Tracker) -> int | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.config import SourceSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import FrameReader, ImageFolder, Undistorter
+from modp_ti.sources import FrameReader, ImageSource, Undistorter
 
 __all__ = ["PosedImage", "ReplayedTracker", "checked_pose", "points_inside", "require_fitting_sizes"]
 
@@ -21,7 +21,7 @@ MAX_ROTATION_DEFECT = 1e-2
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image of the folder with its pose and its points, in pixels of the delivered image."""
+    """An image of the source with its pose and its points, in pixels of the delivered image."""
 
     name: str
     undistorter: Undistorter
@@ -57,7 +57,7 @@ class ReplayedTracker:
             picture = self._reader.read(frame.name, frame.undistorter)
             yield TrackedFrame(
                 index=index,
-                timestamp=self._reader.images.position(frame.name) / self._source.fps,
+                timestamp=self._reader.images.timestamp(frame.name),
                 name=frame.name,
                 image=picture.image,
                 camera=frame.undistorter.camera,
@@ -105,7 +105,7 @@ def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
     return pose
 
 
-def require_fitting_sizes(images: ImageFolder, frames: Sequence[tuple[str, Undistorter]], intrinsics: str) -> None:
+def require_fitting_sizes(images: ImageSource, frames: Sequence[tuple[str, Undistorter]], intrinsics: str) -> None:
     """Raises InputError for the first image that is unreadable or not of its camera's size.
 
     intrinsics: where the cameras come from, for the message. Reads the headers only, so that a run fails at

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import Distortion, FrameReader, ImageFolder, Undistorter
+from modp_ti.sources import Distortion, FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.trackers.point_cloud import read_ply_points, visible_points
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import (
@@ -45,7 +45,7 @@ def open_transforms(
     poses that are none, no image at all, and images that do not fit the intrinsics.
     """
     assert source.path is not None, "the configuration asks for it"
-    images = ImageFolder(source.path)
+    images = open_source(source)
     selected = set(images.selected(source.start, source.stop, source.step))
     file = _transforms_file(source.path, tracker.path)
     data = _read_json(file)
@@ -147,7 +147,7 @@ def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:
 
 
 def _intrinsics(
-    values: Mapping[str, Any], images: ImageFolder, name: str, file: Path
+    values: Mapping[str, Any], images: ImageSource, name: str, file: Path
 ) -> tuple[PinholeCamera, Distortion]:
     """Camera of the stored image; `values` are the file's keys with those of the frame over them."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.sources import ImageFolder
+from modp_ti.sources import ImageSource
 from modp_ti.trackers.feature_tracks import feature_tracks
 from modp_ti.trackers.features import Features, detect_features, essential_matrix, match_features
 from modp_ti.trackers.protocol import Progress
@@ -56,7 +56,7 @@ class Observations:
 
 
 def triangulated_frames(
-    images: ImageFolder,
+    images: ImageSource,
     frames: Sequence[PosedImage],
     solves: NDArray[np.bool_],
     progress: Progress | None = None,
