@@ -76,9 +76,10 @@ class KeyframeStore:
     are a few microseconds.
     """
 
-    def __init__(self, levels: int = 1) -> None:
-        """levels: of the keyframes' image pyramids."""
+    def __init__(self, levels: int = 1, min_side: int = 1) -> None:
+        """levels: of the keyframes' image pyramids; all but the first have sides of at least min_side [px]."""
         self.levels = levels
+        self.min_side = min_side
         self._keyframes: list[Keyframe] = []
         self._depths = RunningMedian()
 
@@ -99,6 +100,9 @@ class KeyframeStore:
     def errors(self) -> NDArray[np.float64]:
         """The keyframes' errors (N,)."""
         return np.fromiter((k.error for k in self._keyframes), np.float64, len(self._keyframes))
+
+    def _is_kept(self, image: ImageLevel) -> bool:
+        return min(image.camera.width, image.camera.height) >= self.min_side
 
     def append(self, frame: TrackedFrame) -> Keyframe:
         """Keep `frame`. It starts at the mean error of the others (1 for the first), so that it is drawn soon."""
@@ -122,7 +126,7 @@ class KeyframeStore:
             error=float(self.errors().mean()) if self._keyframes else 1.0,
             vignette=frame.vignette,
             exposure=self.exposure_at(frame.index),
-            pyramid=frame.pyramid[:levels],
+            pyramid=tuple(image for i, image in enumerate(frame.pyramid[:levels]) if i == 0 or self._is_kept(image)),
         )
 
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:

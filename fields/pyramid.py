@@ -15,9 +15,8 @@ __all__ = ["MAX_LEVELS", "ImageLevel", "build_pyramid"]
 # The eighth halving of the largest image that anyone maps is a thumbnail.
 MAX_LEVELS = 8
 
-# No level is made whose shorter side would have fewer pixels: with levels down to 33 pixels the maps of desk and fox
-# lose half a decibel and more. Half of 320x240 is still worth its speed.
-MIN_SIDE = 96
+# No level is made whose shorter side would have fewer pixels: two windows of the loss.
+MIN_SIDE = 22
 
 
 @dataclass(frozen=True)

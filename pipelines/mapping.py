@@ -63,7 +63,7 @@ class OnlineMapper:
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
         self.loss = self.optimiser.loss
         self.contribution = Contribution(self.gaussians, self.renderer)
-        self.keyframes = KeyframeStore(len(settings.levels.probabilities))
+        self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side)
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
         self.selector = KeyframeSelector(settings.keyframes)

@@ -58,10 +58,18 @@ def test_no_level_is_too_small_for_the_loss() -> None:
 def test_a_keyframe_at_a_level_is_the_same_view_of_fewer_pixels() -> None:
     points = SparsePoints(np.array([[0.3, -0.2, 2.0]]), CAMERA.project(np.array([[0.3, -0.2, 2.0]])), np.array([7]))
     view = np.random.default_rng(1).uniform(size=(512, 1024, 3)).astype(np.float32)
-    keyframe = KeyframeStore(levels=4).append(TrackedFrame(0, 0.0, "a", view, CAMERA, np.eye(4), points))
+    keyframe = KeyframeStore(levels=3).append(TrackedFrame(0, 0.0, "a", view, CAMERA, np.eye(4), points))
     half = keyframe.at_level(1)
     np.testing.assert_allclose(half.points.pixels, half.camera.project(points.xyz))
     assert half.rgba.shape == (256, 512, 4)
     assert half.pyramid[0].rgba is half.rgba
     assert half.view_scale == pytest.approx(2 * keyframe.view_scale)
     assert keyframe.at_level(9).rgba.shape == (128, 256, 4)  # the coarsest there is
+
+
+def test_a_keyframe_keeps_the_levels_that_are_large_enough() -> None:
+    view = np.full((512, 1024, 3), 0.5, dtype=np.float32)
+    frame = TrackedFrame(0, 0.0, "a", view, CAMERA, np.eye(4))
+    for levels, min_side, kept in ((4, 1, 4), (4, 128, 3), (4, 129, 2), (2, 128, 2), (4, 4000, 1)):
+        pyramid = KeyframeStore(levels, min_side).append(frame).pyramid
+        assert [image.camera.height for image in pyramid] == [512, 256, 128, 64][:kept]
