@@ -36,7 +36,7 @@ class LiveSource:
     seconds of the Unix clock.
 
     It ends when the stream does, when `arriving` comes to its `stop`, with `finish`, and with the first Ctrl-C (where
-    it was opened in the main thread): the frames until then are all there are. Ctrl-C after the end interrupts as usual.
+    it was opened in the main thread): the frames until then are all there are. After the end Ctrl-C interrupts.
 
     frame_size: (width, height). Raises InputError where the stream cannot be opened or sends no frame.
     """
