@@ -23,25 +23,96 @@ from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings,
 
 __all__ = [
     "EvaluationSettings",
+    "IntrinsicsSettings",
     "SceneConfig",
     "SourceSettings",
     "TrackerSettings",
+    "VrsSettings",
     "dump_scene",
     "load_scene",
 ]
 
 
+class IntrinsicsSettings(StrictModel):
+    """The camera's calibration, for the stored size of the images."""
+
+    fx: float | None = Field(
+        None,
+        gt=0,
+        description="focal length in pixels of the stored images; this section wins over what the source itself says "
+        "of its camera. Empty for no such section",
+    )
+    fy: float | None = Field(None, gt=0, description="vertical focal length; empty for fx")
+    cx: float | None = Field(
+        None,
+        description="principal point; pixel centres lie at +0.5, so add 0.5 to what OpenCV or ROS calibrated. "
+        "Empty for the middle",
+    )
+    cy: float | None = Field(None, description="as cx")
+    k1: float = Field(0.0, description="radial distortion, as in OpenCV")
+    k2: float = Field(0.0, description="as k1")
+    p1: float = Field(0.0, description="tangential distortion, as in OpenCV")
+    p2: float = Field(0.0, description="as p1")
+    k3: float = Field(0.0, description="as k1")
+    k4: float = Field(0.0, description="as k1; with `fisheye` only")
+    fisheye: bool = Field(False, description="k1 to k4 are those of OpenCV's fisheye model")
+    width: int | None = Field(
+        None, ge=1, description="width that this calibration is for; the images are then checked against it"
+    )
+    height: int | None = Field(None, ge=1, description="as width")
+
+    @property
+    def given(self) -> bool:
+        return self.fx is not None
+
+    @model_validator(mode="after")
+    def _one_model(self) -> IntrinsicsSettings:
+        if not self.given and self.model_fields_set - {"fx"} and self != IntrinsicsSettings():
+            raise ValueError("source.intrinsics.fx is missing: the focal length in pixels of the stored images")
+        if self.fisheye and (self.p1 or self.p2):
+            raise ValueError("source.intrinsics: OpenCV's fisheye model has no p1 and p2; take them out")
+        if self.k4 and not self.fisheye:
+            raise ValueError("source.intrinsics.k4 is for `fisheye: true` alone; take it out")
+        if (self.width is None) != (self.height is None):
+            raise ValueError("source.intrinsics: give width and height, or neither")
+        return self
+
+
+class VrsSettings(StrictModel):
+    """The pinhole camera that Aria's fisheye images are undistorted to."""
+
+    width: int = Field(800, ge=8, description="width of the undistorted image (Aria VRS only)")
+    height: int = Field(800, ge=8, description="height of the undistorted image (Aria VRS only)")
+    focal: float = Field(400.0, gt=0, description="its focal length in pixels; 400 at 800x800 sees 90 degrees")
+
+
 class SourceSettings(StrictModel):
     """Where the frames are."""
 
-    path: Path | None = Field(
-        None, description="folder of the images; subfolders are searched too (not used by `synthetic`)"
+    kind: Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] = Field(
+        "auto",
+        description="what `path` or `stream` is; `auto` recognises it. `images`: a folder of images; `release`: the "
+        "folder of an Aria sequence as the paper's authors publish it; `vrs`: a Project Aria recording",
     )
+    path: Path | None = Field(
+        None,
+        description="folder of the images (subfolders are searched too), data set, video file or recording "
+        "(not used by `synthetic`)",
+    )
+    stream: int | str | None = Field(
+        None, description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live"
+    )
+    intrinsics: IntrinsicsSettings = IntrinsicsSettings()
+    vrs: VrsSettings = VrsSettings()
     scale: float = Field(1.0, gt=0, le=1, description="factor on width and height of every frame")
     holdout: int | None = Field(
         None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
     )
-    fps: float = Field(30.0, gt=0, description="frames per second: time stamp = position in the folder / fps")
+    fps: float = Field(
+        30.0,
+        gt=0,
+        description="frames per second: time stamp = position in the folder / fps, where the source has no times",
+    )
     start: int = Field(0, ge=0, description="first frame, as position in the folder")
     stop: int | None = Field(None, ge=1, description="position after the last frame; empty for all")
     step: int = Field(1, ge=1, description="every n-th frame")
@@ -62,7 +133,9 @@ class SourceSettings(StrictModel):
         "The map is the same",
     )
     vignette: Path | None = Field(
-        None, description="image of how much light reaches each pixel, brightest where all does; empty for none"
+        None,
+        description="image of how much light reaches each pixel, brightest where all does; with `vrs` Aria's "
+        "vignetting mask, of the recorded image; empty for none, or for the source's own",
     )
 
     @field_validator("mask_colour")
@@ -71,6 +144,16 @@ class SourceSettings(StrictModel):
         if colour is not None and not all(0 <= value <= 255 for value in colour):
             raise ValueError(f"source.mask_colour must be three numbers from 0 to 255, not {list(colour)}")
         return colour
+
+    @model_validator(mode="after")
+    def _one_place(self) -> SourceSettings:
+        if self.stream is None and self.kind == "live":
+            raise ValueError("source.stream is missing: `source.kind: live` needs a camera number or a URL")
+        if self.stream is not None and self.kind not in ("auto", "live"):
+            raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; take one of them out")
+        if self.stream is not None and self.path is not None:
+            raise ValueError("source.path and source.stream cannot both be given; take one of them out")
+        return self
 
     @model_validator(mode="after")
     def _range_is_not_empty(self) -> SourceSettings:
@@ -124,8 +207,12 @@ class SceneConfig(StrictModel):
 
     @model_validator(mode="after")
     def _images_are_named(self) -> SceneConfig:
-        if self.source.path is None and self.tracker.kind != "synthetic":
+        if self.source.path is None and self.source.stream is None and self.tracker.kind != "synthetic":
             raise ValueError("source.path is missing: give the folder that holds the images")
+        if self.source.intrinsics.given and self.tracker.kind in ("colmap", "transforms", "synthetic"):
+            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
+        if self.source.stream is not None and self.tracker.kind in ("colmap", "transforms", "synthetic"):
+            raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
         if self.tracker.exposure_change and self.tracker.kind != "synthetic":
             raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
         return self
