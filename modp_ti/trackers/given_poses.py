@@ -1,8 +1,8 @@
-"""Frames of which a file gives the poses alone: their camera comes from the source, their points from a file or from us."""
+"""Frames of which a file gives the poses alone: the source knows their camera, a file or triangulation their points."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from fields.tracked_frame import SparsePoints
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import FrameReader, ImageSource, Intrinsics, Undistorter
+from modp_ti.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.sources.intrinsics import require_intrinsics
 from modp_ti.trackers.point_cloud import visible_points
 from modp_ti.trackers.point_file import read_point_file
 from modp_ti.trackers.protocol import Progress
@@ -24,7 +25,6 @@ __all__ = [
     "missing_frames_note",
     "replay_poses",
     "selected_frames",
-    "source_intrinsics",
     "spread_points",
 ]
 
@@ -32,15 +32,6 @@ __all__ = [
 def selected_frames(images: ImageSource, source: SourceSettings) -> list[str]:
     """The images that source.start/stop/step select, in their order."""
     return list(images.selected(source.start, source.stop, source.step))
-
-
-def source_intrinsics(images: ImageSource) -> Intrinsics:
-    """The camera of the source's images. Raises InputError where nobody has said what it is."""
-    if images.intrinsics is None:
-        raise InputError(
-            f"{images.path}: nothing says what camera took these images: give source.intrinsics (fx, fy, cx, cy)"
-        )
-    return images.intrinsics
 
 
 def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
@@ -83,7 +74,9 @@ def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], or
     missing = [name for name in selected if name not in posed]
     if not missing:
         return []
-    return [f"{len(missing)} of {len(selected)} images have no pose in {origin.name}: skipped (the first: {missing[0]})"]
+    return [
+        f"{len(missing)} of {len(selected)} images have no pose in {origin.name}: skipped (the first: {missing[0]})"
+    ]
 
 
 def replay_poses(
@@ -100,13 +93,14 @@ def replay_poses(
     triangulated here with the poses, before the first frame is delivered. Raises InputError for a camera that nobody
     knows, images that do not fit it, and a point file that is none.
     """
-    undistorter = source_intrinsics(images).undistorter(source.scale)
+    undistorter = require_intrinsics(images).undistorter(source.scale)
     names = sorted(poses, key=images.position)
     reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
     frames = [PosedImage(name, undistorter, poses[name]) for name in names]
     if tracker.points is not None:
         xyz = read_point_file(tracker.points)
-        frames = [frame.with_points(spread_points(xyz, frame, tracker.max_points)) for frame in frames]
+        numbers = np.arange(len(xyz))
+        frames = [frame.with_points(spread_points(xyz, numbers, frame, tracker.max_points)) for frame in frames]
         if not any(len(frame.points) for frame in frames):
             raise InputError(
                 f"{tracker.points}: none of its {len(xyz)} points is seen by any of the {len(frames)} frames: "
@@ -118,22 +112,18 @@ def replay_poses(
     return ReplayedTracker(reader, frames, source, [*images.notes, *notes])
 
 
-def spread_points(
-    xyz: NDArray[np.float64],
-    frame: PosedImage,
-    limit: int,
-    visible: Callable[..., SparsePoints] = visible_points,
-) -> SparsePoints:
-    """The points (N, 3) that the frame sees by projection, `limit` of them at most.
+def spread_points(xyz: NDArray[np.float64], numbers: NDArray[np.int64], frame: PosedImage, limit: int) -> SparsePoints:
+    """The points (N, 3), called by their numbers (N,), that the frame sees by projection, `limit` of them at most.
 
     Which ones are left out is drawn once for all frames, so that frames of the same place keep the same points.
     """
-    points = visible(xyz, frame.undistorter, frame.T_camera_world)
+    points = visible_points(xyz, frame.undistorter, frame.T_camera_world)
+    ids = numbers[points.ids]
     if len(points) <= limit:
-        return points
-    # A bijection on 64-bit numbers (splitmix64) gives every id its place in one random order.
-    order = points.ids.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+        return SparsePoints(points.xyz, points.pixels, ids)
+    # A bijection on 64-bit numbers (splitmix64) gives every number its place in one random order.
+    order = ids.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
     order = (order ^ (order >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     order = (order ^ (order >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     kept = np.sort(np.argsort(order ^ (order >> np.uint64(31)), kind="stable")[:limit])
-    return SparsePoints(points.xyz[kept], points.pixels[kept], points.ids[kept])
+    return SparsePoints(points.xyz[kept], points.pixels[kept], ids[kept])

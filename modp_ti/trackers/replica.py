@@ -21,9 +21,7 @@ from modp_ti.trackers.trajectory import inverse_poses
 __all__ = ["open_replica"]
 
 
-def open_replica(
-    source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None
-) -> ReplayedTracker:
+def open_replica(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> ReplayedTracker:
     """The images with a line in traj.txt, which holds 4x4 matrices, camera to world, row by row.
 
     Image `frame000123` has the line 123, counted from 0. Raises InputError, with the line, for a file that is missing
@@ -48,7 +46,9 @@ def _by_number(
     for name in names:
         number = re.search(r"([0-9]+)$", PurePosixPath(name).stem)
         if number is None:
-            raise InputError(f"{images.path / name}: the name ends in no number, which would say its line of {rows.path}")
+            raise InputError(
+                f"{images.path / name}: the name ends in no number, which would say its line of {rows.path}"
+            )
         if int(number[1]) < len(poses):
             found[name] = poses[int(number[1])]
     if not found:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -126,7 +127,7 @@ def _read(path: Path, file: BinaryIO) -> StellaMap:
             raise _DamagedError(f"keyframe {keyframe.number} observes landmark {lost}, which the map lacks")
         if keyframe.camera not in cameras:
             raise _DamagedError(f"keyframe {keyframe.number} is of camera {keyframe.camera!r}, which the map lacks")
-    for one, other in zip(keyframes, keyframes[1:], strict=False):
+    for one, other in pairwise(keyframes):
         if one.time == other.time:
             raise _DamagedError(f"keyframes {one.number} and {other.number} are of one time ({one.time:.6f} s)")
     return StellaMap(path, cameras, keyframes, landmarks)

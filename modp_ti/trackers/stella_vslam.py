@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from modp_ti.trackers.given_poses import checked_reader, found_file, missing_fra
 from modp_ti.trackers.point_cloud import visible_points
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, points_inside
 from modp_ti.trackers.stella_map import StellaKeyframe, StellaMap, read_stella_map
-from modp_ti.trackers.trajectory import Trajectory, poses_at_frames, read_trajectory_file
+from modp_ti.trackers.trajectory import Trajectory, read_trajectory_file, rows_at_frames
 
 __all__ = ["open_stella_vslam"]
 
@@ -42,39 +41,38 @@ def open_stella_vslam(source: SourceSettings, tracker: TrackerSettings) -> Repla
     world = read_stella_map(file)
     beside = file.with_name(TRAJECTORY)
     trajectory = read_trajectory_file(beside) if beside.is_file() else None
+    keyframes_alone = trajectory is None
     images = open_source(source)
     selected = selected_frames(images, source)
-    keyframe_poses = Trajectory(
-        file,
-        np.array([keyframe.time for keyframe in world.keyframes]),
-        np.stack([keyframe.T_camera_world for keyframe in world.keyframes]),
-    )
-    poses = poses_at_frames(images, selected, keyframe_poses if trajectory is None else trajectory, tracker)
+    keyframe_times = np.array([keyframe.time for keyframe in world.keyframes])
+    if trajectory is None:
+        trajectory = Trajectory(file, keyframe_times, np.stack([each.T_camera_world for each in world.keyframes]))
+    rows = rows_at_frames(images, selected, trajectory, tracker)
 
     intrinsics, said_by = _intrinsics(images, world, source)
     undistorter = intrinsics.undistorter(source.scale)
-    names = sorted(poses, key=images.position)
+    names = sorted(rows, key=images.position)
     reader = checked_reader(images, source, names, undistorter, said_by)
 
-    keyframe_of = _keyframes_of(images, names, world, tracker)
-    times = keyframe_poses.times + tracker.time_offset
-    frames = []
+    frames, between = [], 0
     for name in names:
-        keyframe = keyframe_of.get(name)
-        if keyframe is not None:
+        time = trajectory.times[rows[name]]
+        nearest = int(np.abs(keyframe_times - time).argmin())
+        if abs(keyframe_times[nearest] - time) <= SAME_TIME:
+            keyframe = world.keyframes[nearest]
             # The map's own pose: of the same optimisation as its landmarks.
             T = keyframe.T_camera_world
-            frames.append(PosedImage(name, undistorter, T, _observed(keyframe, world, undistorter)))
-            continue
-        after = int(np.searchsorted(times, images.timestamp(name)))
-        around = world.keyframes[max(0, after - NEIGHBOURS) : after + NEIGHBOURS]
-        points = _projected(around, world, undistorter, poses[name])
-        frames.append(PosedImage(name, undistorter, poses[name], points))
+            points = _observed(keyframe, world, undistorter)
+        else:
+            T = trajectory.T_camera_world[rows[name]]
+            after = int(np.searchsorted(keyframe_times, time))
+            points = _projected(world.keyframes[max(0, after - NEIGHBOURS) : after + NEIGHBOURS], world, undistorter, T)
+            between += 1
+        frames.append(PosedImage(name, undistorter, T, points))
 
-    notes = [*images.notes, *missing_frames_note(selected, poses, file if trajectory is None else beside)]
-    if trajectory is None:
+    notes = [*images.notes, *missing_frames_note(selected, rows, trajectory.path)]
+    if keyframes_alone:
         notes.append(f"{beside} is missing: it would have brought the poses of the frames between the keyframes")
-    between = len(frames) - len(keyframe_of)
     if between:
         notes.append(
             f"{between} frames between keyframes: the landmarks of the {NEIGHBOURS} keyframes on either side, at the "
@@ -85,26 +83,12 @@ def open_stella_vslam(source: SourceSettings, tracker: TrackerSettings) -> Repla
 
 def _intrinsics(images: ImageSource, world: StellaMap, source: SourceSettings) -> tuple[Intrinsics, str]:
     """The camera, and who says so: the user before the map before the source."""
-    if source.intrinsics is not None and images.intrinsics is not None:
+    if source.intrinsics.given and images.intrinsics is not None:
         return images.intrinsics, "source.intrinsics"
     cameras = {keyframe.camera for keyframe in world.keyframes}
     if len(cameras) > 1:
         raise InputError(f"{world.path}: keyframes of {len(cameras)} cameras; one is supported")
     return world.cameras[cameras.pop()], str(world.path)
-
-
-def _keyframes_of(
-    images: ImageSource, names: Sequence[str], world: StellaMap, tracker: TrackerSettings
-) -> dict[str, StellaKeyframe]:
-    """Which of the images are keyframes."""
-    times = np.array([keyframe.time for keyframe in world.keyframes]) + tracker.time_offset
-    found = {}
-    for name in names:
-        time = images.timestamp(name)
-        nearest = int(np.abs(times - time).argmin())
-        if abs(times[nearest] - time) <= min(SAME_TIME, tracker.max_difference):
-            found[name] = world.keyframes[nearest]
-    return found
 
 
 def _observed(keyframe: StellaKeyframe, world: StellaMap, undistorter: Undistorter) -> SparsePoints:

@@ -18,10 +18,10 @@ from modp_ti.trackers.number_rows import read_number_rows
 __all__ = [
     "Trajectory",
     "inverse_poses",
-    "poses_at_frames",
     "poses_of_quaternions",
     "read_trajectory_file",
     "require_rising",
+    "rows_at_frames",
 ]
 
 TUM_COLUMNS = "time tx ty tz qx qy qz qw"
@@ -101,10 +101,10 @@ def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> N
         )
 
 
-def poses_at_frames(
+def rows_at_frames(
     images: ImageSource, names: Sequence[str], trajectory: Trajectory, tracker: TrackerSettings
-) -> dict[str, NDArray[np.float64]]:
-    """`T_camera_world` of each image that has a pose within `tracker.max_difference` of its time.
+) -> dict[str, int]:
+    """The row of the trajectory for each image that has a pose within `tracker.max_difference` of its time.
 
     An image and a pose are used once, the nearest pairs first. Raises InputError where no image has one.
     """
@@ -114,7 +114,7 @@ def poses_at_frames(
     if len(pairs) == 0:
         raise InputError(
             f"{trajectory.path}: no pose lies within {tracker.max_difference:g} s of a frame: its times run from "
-            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the frames from {times.min():.6f} to {times.max():.6f}; "
+            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, the frames' from {times.min():.6f} to {times.max():.6f} s; "
             "check source.fps, tracker.time_offset and tracker.max_difference"
         )
-    return {names[frame]: trajectory.T_camera_world[pose] for frame, pose in sorted(map(tuple, pairs))}
+    return {names[frame]: pose for frame, pose in pairs.tolist()}

@@ -9,16 +9,14 @@ from modp_ti.sources import open_source
 from modp_ti.trackers.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import ReplayedTracker
-from modp_ti.trackers.trajectory import poses_at_frames, read_trajectory_file
+from modp_ti.trackers.trajectory import read_trajectory_file, rows_at_frames
 
 __all__ = ["open_tum", "replay_trajectory"]
 
 NAMES = ("groundtruth.txt", "trajectory.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt")
 
 
-def open_tum(
-    source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None
-) -> ReplayedTracker:
+def open_tum(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> ReplayedTracker:
     """The images that have a pose within `tracker.max_difference` of their time, in the source's order.
 
     Raises InputError for a trajectory that is missing or malformed or of other times than the images, and as
@@ -39,6 +37,7 @@ def replay_trajectory(
     trajectory = read_trajectory_file(file)  # before the images are listed: a wrong file is named at once
     images = open_source(source)
     selected = selected_frames(images, source)
-    poses = poses_at_frames(images, selected, trajectory, tracker)
+    rows = rows_at_frames(images, selected, trajectory, tracker)
+    poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
     notes = missing_frames_note(selected, poses, file)
     return replay_poses(images, source, tracker, poses, notes, progress)
