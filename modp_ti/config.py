@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 
-# Kinds of trackers that bring cameras, those whose files hold poses alone, and others that read what was tracked before.
+# Trackers that bring cameras, those whose files hold poses alone, and all that read what was tracked before.
 WITH_CAMERAS = ("colmap", "transforms", "synthetic")
 WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
 AFTERWARDS = (*WITH_CAMERAS, *WITHOUT_POINTS, "stella_vslam", "aria", "modp")

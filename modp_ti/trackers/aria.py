@@ -23,7 +23,7 @@ from modp_ti.trackers.aria_mps import (
 from modp_ti.trackers.given_poses import checked_reader, missing_frames_note, selected_frames, spread_points
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, is_held_out
-from modp_ti.trackers.trajectory import Trajectory, inverse_poses, rows_at_frames
+from modp_ti.trackers.trajectory import inverse_poses, rows_at_frames
 from modp_ti.trackers.triangulation import triangulated_frames
 
 __all__ = ["open_aria"]
@@ -60,7 +60,7 @@ def open_aria(source: SourceSettings, tracker: TrackerSettings, progress: Progre
 
     images = open_source(source)
     selected = selected_frames(images, source)
-    rows = rows_at_frames(images, selected, Trajectory(file, device.times, device.T_world_device), tracker)
+    rows = rows_at_frames(images, selected, file, device.times, tracker)
     names = sorted(rows, key=images.position)
     T_world_camera = np.stack(
         [device.T_world_device[rows[name]] @ mounts.at(device.times[rows[name]]) for name in names]
@@ -103,8 +103,8 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
             if (folder / name).is_file():
                 return folder, folder / name
     raise InputError(
-        f"{roots[0]}: holds neither {CLOSED_LOOP} nor {OPEN_LOOP}, which would have brought the poses: set tracker.path "
-        "to MPS's folder"
+        f"{roots[0]}: holds neither {CLOSED_LOOP} nor {OPEN_LOOP}, which would have brought the poses: set "
+        "tracker.path to MPS's folder"
     )
 
 

@@ -47,7 +47,7 @@ def open_stella_vslam(source: SourceSettings, tracker: TrackerSettings) -> Repla
     keyframe_times = np.array([keyframe.time for keyframe in world.keyframes])
     if trajectory is None:
         trajectory = Trajectory(file, keyframe_times, np.stack([each.T_camera_world for each in world.keyframes]))
-    rows = rows_at_frames(images, selected, trajectory, tracker)
+    rows = rows_at_frames(images, selected, trajectory.path, trajectory.times, tracker)
 
     intrinsics, said_by = _intrinsics(images, world, source)
     undistorter = intrinsics.undistorter(source.scale)

@@ -102,19 +102,20 @@ def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> N
 
 
 def rows_at_frames(
-    images: ImageSource, names: Sequence[str], trajectory: Trajectory, tracker: TrackerSettings
+    images: ImageSource, names: Sequence[str], path: Path, times: NDArray[np.float64], tracker: TrackerSettings
 ) -> dict[str, int]:
-    """The row of the trajectory for each image that has a pose within `tracker.max_difference` of its time.
+    """The pose of each image that has one within `tracker.max_difference` of its time, as its row.
 
+    times: (N,) [seconds] of the poses, before `tracker.time_offset`; path: where they come from, for messages.
     An image and a pose are used once, the nearest pairs first. Raises InputError where no image has one.
     """
-    times = np.array([images.timestamp(name) for name in names])
-    shifted = trajectory.times + tracker.time_offset
-    pairs = associate(times, shifted, tracker.max_difference)
+    of_frames = np.array([images.timestamp(name) for name in names])
+    shifted = times + tracker.time_offset
+    pairs = associate(of_frames, shifted, tracker.max_difference)
     if len(pairs) == 0:
         raise InputError(
-            f"{trajectory.path}: no pose lies within {tracker.max_difference:g} s of a frame: its times run from "
-            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, the frames' from {times.min():.6f} to {times.max():.6f} s; "
-            "check source.fps, tracker.time_offset and tracker.max_difference"
+            f"{path}: no pose lies within {tracker.max_difference:g} s of a frame: its times run from "
+            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the "
+            f"frames from {of_frames.min():.6f} to {of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
         )
     return {names[frame]: pose for frame, pose in pairs.tolist()}

@@ -37,7 +37,7 @@ def replay_trajectory(
     trajectory = read_trajectory_file(file)  # before the images are listed: a wrong file is named at once
     images = open_source(source)
     selected = selected_frames(images, source)
-    rows = rows_at_frames(images, selected, trajectory, tracker)
+    rows = rows_at_frames(images, selected, file, trajectory.times, tracker)
     poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
     notes = missing_frames_note(selected, poses, file)
     return replay_poses(images, source, tracker, poses, notes, progress)
