@@ -8,6 +8,7 @@ import resource
 import shutil
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -30,7 +31,7 @@ from modp_ti.exports.trajectory import write_trajectory
 from modp_ti.lpips import open_lpips
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
-from modp_ti.trackers import frame_count, may_read_ahead, open_tracker
+from modp_ti.trackers import close, frame_count, may_read_ahead, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
@@ -63,8 +64,13 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     Nothing is written before the map is finished; the files then appear together. Raises InputError for input that
     cannot be used.
     """
+    with ExitStack() as held:
+        return _run(config, console or Console(quiet=True), held)
+
+
+def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
+    """`run_scene`; held: takes what is to be closed at its end, however it ends."""
     started = time.perf_counter()
-    console = console or Console(quiet=True)
     line = ProgressLine(console)
     try:
         backend = initialise(config.device, config.threads, config.seed)
@@ -73,6 +79,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     console.print(f"device: {describe(backend)}", highlight=False, soft_wrap=True)
     tick = time.perf_counter()
     tracker = open_tracker(config, line.prepare)
+    held.callback(close, tracker)
     ahead = config.source.prefetch if may_read_ahead(tracker) else 0
     with FramesAhead(tracker, ahead) as frames:
         first = next(frames, None)
@@ -80,8 +87,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             raise InputError("the tracker delivered no frame: nothing to map")
         prepared = time.perf_counter() - tick
         lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
-        for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
-            console.print(f"note: {note}", highlight=False, soft_wrap=True)
+        notes = [*tracker.notes, *([no_lpips] if no_lpips else [])]
+        _say(notes, console)
 
         mapper = build_mapper(config, first.camera)
         watch = mapper.stopwatch
@@ -92,6 +99,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
         poses = _map(mapper, chain([first], _timed(frames, watch)), line)
         mapping_seconds = time.perf_counter() - tick
+    _say([note for note in tracker.notes if note not in notes], console)
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -150,6 +158,11 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         shutil.rmtree(staging, ignore_errors=True)
     line.summary(metrics)
     return config.output
+
+
+def _say(notes: Iterable[str], console: Console) -> None:
+    for note in notes:
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:

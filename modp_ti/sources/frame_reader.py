@@ -36,6 +36,7 @@ class Picture:
 class FrameReader:
     """Reads frames of a source with what `source.masks`, `mask_colour` and `vignette` add to them.
 
+    A vignette that the source itself has comes first: it is made of `source.vignette` where that is given.
     Raises InputError for a folder of masks or a vignette that cannot be used.
     """
 
@@ -43,7 +44,9 @@ class FrameReader:
         self.images = images
         self._source = source
         self._masks = None if source.masks is None else MaskFolder(source.masks)
-        self._vignette = None if source.vignette is None else read_vignette(source.vignette)
+        self._vignette: NDArray[np.float32] | None = getattr(images, "vignette", None)
+        if self._vignette is None and source.vignette is not None:
+            self._vignette = read_vignette(source.vignette)
         self._of_camera: dict[Undistorter, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
 
     def require_fitting(self, frames: Sequence[tuple[str, Undistorter]]) -> None:
@@ -58,8 +61,9 @@ class FrameReader:
             if self._vignette is not None:
                 height, width = self._vignette.shape[:2]
                 if abs(width * raw.height / (height * raw.width) - 1.0) > ASPECT_TOLERANCE:
+                    what = self._source.vignette or f"the vignette of {self.images.path}"
                     raise InputError(
-                        f"{self._source.vignette} is {width}x{height}, the images are {raw.width}x{raw.height}: "
+                        f"{what} is {width}x{height}, the images are {raw.width}x{raw.height}: "
                         "the vignette must show the whole image (source.vignette)"
                     )
 

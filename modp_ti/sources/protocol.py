@@ -18,7 +18,9 @@ class ImageSource(Protocol):
     """Images by name, in the order in which they were taken, each decoded when it is asked for.
 
     path: where they are, for messages. names: all of them; those of a live source grow while it runs. intrinsics: what
-    the source itself says of its camera, None where it says nothing. notes: one-line remarks for the user.
+    the user or else the source itself says of its camera, None where nobody says anything. notes: one-line remarks for
+    the user; a live source has more of them at its end. A source that knows its lens's vignette has it as `vignette`
+    (H, W, 3) float32, at most 1, of the stored image's field of view; None where it does not.
     """
 
     path: Path

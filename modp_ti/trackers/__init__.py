@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from modp_ti.trackers.protocol import Progress, Tracker, events, frame_count, may_read_ahead
+from modp_ti.trackers.protocol import Progress, Tracker, close, events, frame_count, may_read_ahead
 
 if TYPE_CHECKING:
     from modp_ti.config import SceneConfig
 
-__all__ = ["Progress", "Tracker", "events", "frame_count", "may_read_ahead", "open_tracker"]
+__all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ahead", "open_tracker"]
 
 
 def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:

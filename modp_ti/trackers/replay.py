@@ -45,12 +45,16 @@ class ReplayedTracker:
         notes: Iterable[str] = (),
     ) -> None:
         self.frames = tuple(frames)
-        self.notes = list(notes)
+        self.notes = [*notes, *reader.images.notes]
         self._reader = reader
         self._source = source
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def close(self) -> None:
+        """Let go of what the source of the images has open."""
+        self._reader.images.close()
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         for index, frame in enumerate(self.frames):

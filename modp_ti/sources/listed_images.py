@@ -1,0 +1,162 @@
+"""Image files that lie in a folder, known by name and in their order, decoded one at a time."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Container, Iterable, Iterator, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.errors import InputError
+from modp_ti.sources.image_header import read_image_header
+from modp_ti.sources.intrinsics import Intrinsics
+from modp_ti.sources.protocol import ImageSource
+
+__all__ = ["IMAGE_SUFFIXES", "ListedImages", "decoded", "find_frame", "selected_names"]
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+
+
+class ListedImages:
+    """An `ImageSource` of files under one folder.
+
+    names: relative to the folder, with forward slashes, each once. times [s]: of each. intrinsics: what the data set
+    says of its camera, where it does. vignette (H, W, 3) of maximum 1: the light that reaches each part of the stored
+    image, where the data set brings it. notes: remarks for the user.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        names: Sequence[str],
+        times: Sequence[float],
+        intrinsics: Intrinsics | None = None,
+        notes: Iterable[str] = (),
+        vignette: NDArray[np.float32] | None = None,
+    ) -> None:
+        self.path = path
+        self.names: tuple[str, ...] = tuple(names)
+        self.intrinsics = intrinsics
+        self.notes = list(notes)
+        self.vignette = vignette
+        self._times = times
+        self._position = {name: i for i, name in enumerate(self.names)}
+        self._by_stem: dict[str, str] = {}
+        for name in self.names:
+            self._by_stem.setdefault(str(PurePosixPath(name).with_suffix("")), name)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def position(self, name: str) -> int:
+        """Place of an image in the order, from 0."""
+        return self._position[name]
+
+    def timestamp(self, name: str) -> float:
+        """When the image was taken [s]."""
+        return float(self._times[self._position[name]])
+
+    def find(self, name: str) -> str | None:
+        """The image that a tracker's file name means, or None.
+
+        The name may be a path from elsewhere (`./train/0001.png` is `0001.png` here, where the folder is
+        `train`) and may lack its suffix.
+        """
+        parts = PurePosixPath(name.replace("\\", "/")).parts
+        for first in range(len(parts)):
+            tail = "/".join(parts[first:])
+            if tail in self._position:
+                return tail
+            # Only a name without an image suffix may take another's: `a.png` is not `a.jpg`.
+            if not tail.lower().endswith(IMAGE_SUFFIXES) and tail in self._by_stem:
+                return self._by_stem[tail]
+        return None
+
+    def with_stem(self, stem: str) -> str | None:
+        """The image with this path without its suffix, or None."""
+        return self._by_stem.get(stem)
+
+    def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
+        """Names at positions start, start + step, ... before stop; raises InputError where that is none."""
+        return selected_names(self, start, stop, step)
+
+    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
+        """The same names, one by one."""
+        return iter(self.selected(start, stop, step))
+
+    def size(self, name: str) -> tuple[int, int]:
+        """(width, height) as stored. Raises InputError for an image that is unreadable or cut off."""
+        try:
+            with (self.path / name).open("rb") as file:
+                header = read_image_header(file)
+        except OSError as error:
+            raise self._unreadable(name, error.strerror or "it cannot be opened") from None
+        if header is None:
+            height, width = self.read(name).shape[:2]
+            return width, height
+        if not header.complete:
+            raise self._unreadable(name, "the file is cut off")
+        return header.width, header.height
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Decoded image (H, W, 3) uint8 RGB, without EXIF rotation: intrinsics belong to the stored pixels.
+
+        Raises InputError for an image that is unreadable or cut off.
+        """
+        try:
+            data = (self.path / name).read_bytes()
+        except OSError as error:
+            raise self._unreadable(name, error.strerror or "it cannot be opened") from None
+        header = read_image_header(io.BytesIO(data))
+        if not data:
+            raise self._unreadable(name, "the file is empty")
+        if header is not None and not header.complete:
+            raise self._unreadable(name, "the file is cut off")
+        image = decoded(data)
+        if image is None:
+            raise self._unreadable(name, "it is damaged or no image")
+        return image
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+    def _unreadable(self, name: str, reason: str) -> InputError:
+        return InputError(f"{self.path / name}: unreadable image: {reason}; replace it or take it out of the folder")
+
+
+def decoded(data: bytes) -> NDArray[np.uint8] | None:
+    """The image (H, W, 3) uint8 RGB in an encoded file, as stored; None where it is none."""
+    import cv2
+
+    log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:  # silent: the one line that the user gets is ours
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    finally:
+        cv2.utils.logging.setLogLevel(log_level)
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def selected_names(images: ImageSource, start: int, stop: int | None, step: int) -> Sequence[str]:
+    """Names at positions start, start + step, ... before stop; raises InputError where that is none."""
+    names = images.names[start:stop:step]
+    if not names:
+        raise InputError(
+            f"{images.path}: source.start={start} leaves no frame of the {len(images.names)} "
+            f"in the {'folder' if images.path.is_dir() else 'file'}"
+        )
+    return names
+
+
+def find_frame(name: str, frames: Container[str]) -> str | None:
+    """The frame of that name, whatever folders before it and image suffix behind it; None for any other name.
+
+    For sources that name their frames themselves. A number alone finds nothing: programs that extract frames count
+    from 0 or from 1.
+    """
+    path = PurePosixPath(name.replace("\\", "/"))
+    tail = path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
+    return tail if tail in frames else None
