@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import open_source
+from modp_ti.sources import ImageSource, open_source
 from modp_ti.sources.intrinsics import require_intrinsics
 from modp_ti.trackers.aria_mps import (
     CameraMounts,
@@ -51,14 +51,11 @@ def open_aria(source: SourceSettings, tracker: TrackerSettings, progress: Progre
     folder, file = _trajectory_file(tracker.path, source.path)
     device = read_open_loop(file) if file.name == OPEN_LOOP else read_closed_loop(file)
     calibration = folder / CALIBRATION
-    if not calibration.is_file():
-        raise InputError(
-            f"{calibration} is missing: it would have brought where the camera {tracker.camera} sits on the device "
-            "(T_device_camera), without which device poses are no camera poses"
-        )
-    mounts = read_calibration(calibration, tracker.camera)
-
+    mounts = read_calibration(calibration, tracker.camera) if calibration.is_file() else None
     images = open_source(source)
+    missing = []
+    if mounts is None:
+        mounts, missing = _recorded_mount(images, calibration, tracker.camera)
     selected = selected_frames(images, source)
     rows = rows_at_frames(images, selected, file, device.times, tracker)
     names = sorted(rows, key=images.position)
@@ -68,8 +65,7 @@ def open_aria(source: SourceSettings, tracker: TrackerSettings, progress: Progre
     undistorter = require_intrinsics(images).undistorter(source.scale)
     reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
     frames = [PosedImage(name, undistorter, T) for name, T in zip(names, inverse_poses(T_world_camera), strict=True)]
-    notes = [*images.notes, *missing_frames_note(selected, rows, file)]
-    notes += _notes(device, mounts, file)
+    notes = [*missing_frames_note(selected, rows, file), *_notes(device, mounts, file), *missing]
 
     cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     if file.name == OPEN_LOOP or cloud is None:
@@ -108,6 +104,15 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
     )
 
 
+def _recorded_mount(images: ImageSource, file: Path, label: str) -> tuple[CameraMounts, list[str]]:
+    """Where a VRS recording says that its camera sits, in place of the calibration over time, and a remark on that."""
+    mount = getattr(images, "T_device_camera", None)
+    lost = f"{file} is missing: it would have brought where the camera {label} sits on the device (T_device_camera)"
+    if mount is None:
+        raise InputError(f"{lost}, without which device poses are no camera poses")
+    return CameraMounts(images.path, np.zeros(1), mount[None]), [f"{lost} over time; the recording's own is taken"]
+
+
 def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[str]:
     notes = []
     if file.name == OPEN_LOOP:
@@ -118,7 +123,7 @@ def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[s
     if device.left_out:
         notes.append(f"{device.left_out} poses of {file.name} are of another world than most (its graph): left out")
     gap = max(device.times[0] - mounts.times[-1], mounts.times[0] - device.times[-1])
-    if gap > 0:
+    if mounts.path.name == CALIBRATION and gap > 0:
         notes.append(
             f"{mounts.path.name} is of another time than {file.name} ({gap:.1f} s apart): is it of one recording?"
         )

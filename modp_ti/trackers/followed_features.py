@@ -16,12 +16,12 @@ from modp_ti.trackers.replay import PosedImage
 __all__ = ["FollowedFeatures", "follow_features", "looks_like_video"]
 
 MAX_SIDE = 640  # longer side of the images that corners are followed in
-CORNERS = 600  # followed at a time
+CORNERS = 800  # followed at a time
 REFILL_BELOW = 0.8  # share of them below which new ones are looked for
-MIN_DISTANCE = 1 / 64  # between new corners, as a share of the longer side
-QUALITY = 0.002  # of the weakest corner, as a share of the strongest
-WINDOW, LEVELS = 15, 3  # of the optical flow
-THERE_AND_BACK = 0.7  # [px] that a corner may be away from its start when it is followed back
+MIN_DISTANCE = 1 / 80  # between new corners, as a share of the longer side
+QUALITY = 0.01  # of the weakest corner, as a share of the strongest
+WINDOW, LEVELS = 21, 3  # of the optical flow
+THERE_AND_BACK = 1.0  # [px] that a corner may be away from its start when it is followed back
 EPIPOLAR_BAND = 3.0  # [px] that a corner may leave the line where the poses allow it
 
 # Frames that are looked at to tell whether a sequence is a video, and the share of corners that must survive a step.

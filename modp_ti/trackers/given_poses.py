@@ -109,7 +109,7 @@ def replay_poses(
     else:
         solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
         frames = triangulated_frames(images, frames, solves, progress)
-    return ReplayedTracker(reader, frames, source, [*images.notes, *notes])
+    return ReplayedTracker(reader, frames, source, notes)
 
 
 def spread_points(xyz: NDArray[np.float64], numbers: NDArray[np.int64], frame: PosedImage, limit: int) -> SparsePoints:

@@ -78,7 +78,7 @@ def open_modp(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTrack
         frames.append(PosedImage(name, undistorter, T, _projected(cloud[mine[1]], mine[0], undistorter, T)))
         first += len(cloud)
 
-    notes = [*images.notes]
+    notes = []
     if absent:
         notes.append(f"{len(absent)} cameras of {file.name} have no image in {images.path}: skipped")
     notes += missing_frames_note(selected, entries, file)

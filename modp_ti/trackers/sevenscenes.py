@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import open_source
+from modp_ti.sources import ImageSource, open_source
 from modp_ti.trackers.given_poses import missing_frames_note, replay_poses, selected_frames
 from modp_ti.trackers.number_rows import read_number_rows
 from modp_ti.trackers.protocol import Progress
@@ -32,14 +33,9 @@ def open_sevenscenes(
     assert source.path is not None, "the configuration asks for it"
     images = open_source(source)
     selected = selected_frames(images, source)
-    folder = _pose_folder(tracker.path, source.path)
+    folder = _pose_folder(tracker.path, source.path, images, selected)
     files = {name: _pose_file(folder, name) for name in selected}
     found = {name: file for name, file in files.items() if file.is_file()}
-    if not found:
-        raise InputError(
-            f"{folder}: holds no pose of any of the {len(selected)} frames: {selected[0]} should have "
-            f"{files[selected[0]].name} (tracker.path)"
-        )
     matrices = []
     for file in found.values():
         rows = read_number_rows(file, 4, "a row of a 4x4 matrix, camera to world")
@@ -55,14 +51,18 @@ def open_sevenscenes(
     return replay_poses(images, source, tracker, poses, notes, progress)
 
 
-def _pose_folder(given: Path | None, images: Path) -> Path:
-    candidates = [given] if given is not None else [images, images.parent / "poses", images.parent]
-    for folder in candidates:
-        if folder.is_dir() and next(folder.glob(f"**/*{SUFFIX}"), None) is not None:
-            return folder
+def _pose_folder(given: Path | None, source: Path, images: ImageSource, names: Sequence[str]) -> Path:
+    """The folder in which one of the images at least has its pose."""
     if given is not None and not given.is_dir():
         raise InputError(f"{given}: no such folder (tracker.path); it should hold *{SUFFIX}")
-    raise InputError(f"no *{SUFFIX} in {' or '.join(map(str, candidates))}: set tracker.path to their folder")
+    candidates = [images.path, source, source / "poses", source.parent / "poses"] if given is None else [given]
+    for folder in candidates:
+        if any(_pose_file(folder, name).is_file() for name in names):
+            return folder
+    raise InputError(
+        f"{' and '.join(map(str, dict.fromkeys(candidates)))}: holds no pose of any of the {len(names)} frames: "
+        f"{names[0]} should have {_pose_file(candidates[0], names[0]).name} (tracker.path)"
+    )
 
 
 def _pose_file(folder: Path, image: str) -> Path:

@@ -70,7 +70,7 @@ def open_stella_vslam(source: SourceSettings, tracker: TrackerSettings) -> Repla
             between += 1
         frames.append(PosedImage(name, undistorter, T, points))
 
-    notes = [*images.notes, *missing_frames_note(selected, rows, trajectory.path)]
+    notes = [*missing_frames_note(selected, rows, trajectory.path)]
     if keyframes_alone:
         notes.append(f"{beside} is missing: it would have brought the poses of the frames between the keyframes")
     if between:

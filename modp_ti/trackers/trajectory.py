@@ -115,7 +115,7 @@ def rows_at_frames(
     if len(pairs) == 0:
         raise InputError(
             f"{path}: no pose lies within {tracker.max_difference:g} s of a frame: its times run from "
-            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the "
-            f"frames from {of_frames.min():.6f} to {of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
+            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the frames from {of_frames.min():.6f} to "
+            f"{of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
         )
     return {names[frame]: pose for frame, pose in pairs.tolist()}
