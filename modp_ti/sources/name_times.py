@@ -22,7 +22,7 @@ def times_of_names(names: Sequence[str]) -> NDArray[np.float64] | None:
     stems = [PurePosixPath(name).stem for name in names]
     if all(SECONDS.fullmatch(stem) for stem in stems):
         times = np.array([float(stem) for stem in stems])
-    elif all(stem.isascii() and stem.isdigit() and len(stem) in UNITS for stem in stems):
+    elif all(re.fullmatch("[1-9][0-9]+", stem) and len(stem) in UNITS for stem in stems):
         if len({len(stem) for stem in stems}) > 1:
             return None
         times = np.array([int(stem) for stem in stems]) * UNITS[len(stems[0])]

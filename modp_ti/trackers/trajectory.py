@@ -96,7 +96,7 @@ def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> N
     if len(back):
         row = int(back[0]) + 1
         raise InputError(
-            f"{where(row)}: time {times[row]:.15g} does not lie after {times[row - 1]:.15g} of the line before: "
+            f"{where(row)}: time {times[row]:.6f} does not lie after {times[row - 1]:.6f} of the line before: "
             "sort the file by time and take doubles out"
         )
 
