@@ -52,18 +52,23 @@ class AriaRecording:
         self._lock = Lock()
         if not path.is_file():
             raise InputError(f"{path}: no such VRS file (source.path)")
-        with _quiet():
-            provider = data_provider.create_vrs_data_provider(str(path))
+        try:
+            with _quiet():
+                provider = data_provider.create_vrs_data_provider(str(path))
+        except RuntimeError:  # as for a file that ends before its configuration
+            provider = None
         if provider is None:
-            raise InputError(f"{path}: not a VRS recording, or it is cut off before its first record; copy it again")
+            raise InputError(f"{path}: not a VRS recording, or it is cut off before its first image; copy it again")
         self._provider: Any = provider
         labels = [provider.get_label_from_stream_id(stream) for stream in provider.get_all_streams()]
         self._stream = provider.get_stream_id_from_label(RGB) if RGB in labels else None
-        if self._stream is None or provider.get_num_data(self._stream) == 0:
+        if self._stream is None:
             raise InputError(
-                f"{path}: holds no images of {RGB}, which the map is made of; it holds "
-                f"{', '.join(labels) or 'no stream'}: record with a profile that has RGB"
+                f"{path}: holds no stream {RGB}, which the map is made of; it holds {', '.join(labels) or 'none'}: "
+                "record with a profile that has RGB"
             )
+        if provider.get_num_data(self._stream) == 0:
+            raise InputError(f"{path}: holds no image of {RGB}, which the map is made of; is the file cut off?")
         device = provider.get_device_calibration()
         fisheye = None if device is None else device.get_camera_calib(RGB)
         if fisheye is None:
@@ -83,8 +88,8 @@ class AriaRecording:
             )
         camera = calibration.get_linear_camera_calibration(pinhole.width, pinhole.height, pinhole.focal)
         self._rectification = _Rectification(calibration.distort_by_calibration, camera, fisheye)
-        fx, fy = camera.get_focal_lengths()
-        cx, cy = camera.get_principal_point()  # of pixel centres at whole numbers
+        fx, fy = (float(value) for value in camera.get_focal_lengths())
+        cx, cy = (float(value) for value in camera.get_principal_point())  # of pixel centres at whole numbers
         self.intrinsics: Intrinsics | None = Intrinsics(
             PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, pinhole.width, pinhole.height)
         )

@@ -36,12 +36,14 @@ class LiveSource:
     seconds of the Unix clock.
 
     It ends when the stream does, when `arriving` comes to its `stop`, with `finish`, and with the first Ctrl-C (where
-    it was opened in the main thread): the frames until then are all there are. A second Ctrl-C interrupts as usual.
+    it was opened in the main thread): the frames until then are all there are. After the end Ctrl-C interrupts.
 
     frame_size: (width, height). Raises InputError where the stream cannot be opened or sends no frame.
     """
 
     def __init__(self, stream: int | str) -> None:
+        if isinstance(stream, str) and stream.isdigit():
+            stream = int(stream)
         self.path = Path(_shown(stream))
         self.intrinsics: Intrinsics | None = None
         self.dropped = 0
@@ -145,7 +147,8 @@ class LiveSource:
     def close(self) -> None:
         """End the thread, let the camera go and remove the frames that were kept."""
         self.finish()
-        self._thread.join(2 * PATIENCE)
+        # A thread that waits for a stream which has stalled ends when it is tired of that; nothing depends on it.
+        self._thread.join(1.0)
         self._give_back_interrupt()
         self._kept.cleanup()
 
@@ -211,6 +214,8 @@ class LiveSource:
 
     def _interrupted(self, *_: object) -> None:
         self._give_back_interrupt()
+        if self._ended:
+            raise KeyboardInterrupt
         # In a thread of its own: the interrupted one may hold the lock.
         threading.Thread(target=self.finish, daemon=True).start()
 
@@ -231,20 +236,16 @@ def _open(stream: int | str):
     """The capture. Raises InputError where there is none."""
     import cv2
 
-    if isinstance(stream, str) and stream.isdigit():
-        stream = int(stream)
     if isinstance(stream, str) and Path(stream).is_file():
         raise InputError(f"{stream}: is a file (source.stream): give it as source.path")
     with quiet_decoder():
         try:
-            if isinstance(stream, int):
+            if isinstance(stream, int) or "://" not in stream:  # a camera, by its number or its path
                 capture = cv2.VideoCapture(stream)
             else:
                 patience = int(1000 * PATIENCE)
                 limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience, cv2.CAP_PROP_READ_TIMEOUT_MSEC, patience]
                 capture = cv2.VideoCapture(stream, cv2.CAP_FFMPEG, limits)
-                if not capture.isOpened():  # a device by its path, or another kind of stream
-                    capture = cv2.VideoCapture(stream)
         except cv2.error:
             capture = None
     if capture is None or not capture.isOpened():

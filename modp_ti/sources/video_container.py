@@ -54,19 +54,20 @@ def _end_of_boxes(stream: BinaryIO, size: int) -> int:
 
 def _end_of_riff(stream: BinaryIO, size: int) -> int:
     """Where the last RIFF chunk ends (files of more than a gigabyte have several): 4 letters, 4 bytes of length."""
-    here = 0
+    here = end = 0
     while here < size:
         stream.seek(here)
         head = stream.read(8)
         if here and head[:4] != b"RIFF":
-            return here  # something was appended
+            return end  # something was appended
         length = int.from_bytes(head[4:], "little")
         if len(head) < 8:
             return here + 8
         if length == 0:
             return size  # its writer did not come to state it
-        here += 8 + length + length % 2
-    return here if here != size + 1 else size  # the last one may lack its padding
+        end = here + 8 + length
+        here = end + length % 2  # padding, which the last one may lack
+    return end
 
 
 def _end_of_matroska(stream: BinaryIO, size: int) -> int | None:

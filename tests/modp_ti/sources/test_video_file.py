@@ -1,0 +1,253 @@
+"""A video's frames are those of the file in any order, with the container's times; bad files get one line.
+
+Oracles: what was written (a lossless codec), OpenCV's own reading from the first frame to the last, and MP4 files whose
+bytes are changed by hand.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from threading import Thread
+
+import cv2
+import numpy as np
+import pytest
+
+from modp_ti.errors import InputError
+from modp_ti.sources import VideoFile
+
+FRAMES, FPS = 40, 12.5
+RNG = np.random.default_rng(5)
+IMAGES = [cv2.GaussianBlur(RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8), (0, 0), 2) for _ in range(FRAMES)]
+# Inter-coded with a keyframe every twelve frames, each frame on its own, and lossless.
+CODECS = {"room.mp4": "mp4v", "room.avi": "MJPG", "room.mkv": "FFV1"}
+
+
+def write(file: Path, codec: str, images=IMAGES) -> Path:
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*codec), FPS, (64, 48))
+    assert writer.isOpened()
+    for image in images:
+        writer.write(image[..., ::-1])
+    writer.release()
+    return file
+
+
+@pytest.fixture(params=CODECS)
+def video(tmp_path, request) -> Path:
+    return write(tmp_path / request.param, CODECS[request.param])
+
+
+@pytest.fixture
+def mp4(tmp_path) -> Path:
+    return write(tmp_path / "room.mp4", "mp4v")
+
+
+def by_opencv(file: Path) -> list[np.ndarray]:
+    capture, images = cv2.VideoCapture(str(file)), []
+    while True:
+        more, image = capture.read()
+        if not more:
+            return images
+        images.append(image[..., ::-1])
+
+
+def test_frames_are_named_counted_and_timed_by_the_container(video):
+    made = VideoFile(video, fps=99.0)
+    assert made.names[:2] == ("room_000000", "room_000001")
+    assert len(made) == FRAMES
+    assert made.position("room_000012") == 12
+    assert made.size("room_000003") == (64, 48)
+    np.testing.assert_allclose([made.timestamp(n) for n in made.names], np.arange(FRAMES) / FPS, atol=1e-3)
+    assert made.notes == [] and made.intrinsics is None
+
+
+def test_every_order_of_reading_gives_the_frames_of_the_file(video):
+    expected = by_opencv(video)
+    backwards, shuffled = range(FRAMES - 1, -1, -1), RNG.permutation(FRAMES)
+    for orders in ([range(FRAMES)] * 2, [range(0, FRAMES, 7), backwards], [shuffled, shuffled[::-1]]):
+        made = VideoFile(video)
+        for order in orders:
+            for i in order:
+                assert np.array_equal(made.read(made.names[i]), expected[i]), (list(order), i)
+
+
+def test_lossless_video_gives_the_very_pixels_that_were_written(tmp_path):
+    made = VideoFile(write(tmp_path / "a.mkv", "FFV1"))
+    difference = [np.abs(made.read(n).astype(int) - image).max() for n, image in zip(made.names, IMAGES, strict=True)]
+    assert max(difference) == 0
+
+
+def test_frames_behind_a_place_that_seeking_gets_wrong_are_right_all_the_same(mp4, monkeypatch):
+    """A container whose search lands elsewhere than it says is found out, and read from its beginning."""
+    from modp_ti.sources import video_file
+
+    made, expected = VideoFile(mp4), by_opencv(mp4)
+    for name in made.names:
+        made.read(name)
+    lands_at = video_file._Decoder.seek
+
+    def two_frames_late(decoder, milliseconds):
+        shown = lands_at(decoder, milliseconds)
+        decoder.advance(), decoder.advance()
+        return shown
+
+    monkeypatch.setattr(video_file._Decoder, "seek", two_frames_late)
+    for i in (30, 5, 17, 2):
+        assert np.array_equal(made.read(made.names[i]), expected[i])
+
+
+def test_two_threads_may_read(mp4):
+    made, expected, wrong = VideoFile(mp4), by_opencv(mp4), []
+
+    def read(order):
+        wrong.extend(i for i in order if not np.array_equal(made.read(made.names[i]), expected[i]))
+
+    threads = [Thread(target=read, args=(order,)) for order in (range(FRAMES), range(FRAMES - 1, -1, -1))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def test_stop_ends_the_reading_there(mp4):
+    made = VideoFile(mp4, stop=7)
+    assert len(made) == 7
+    assert made.selected(1, 7, 3) == ("room_000001", "room_000004")
+    with pytest.raises(InputError, match=r"source\.start=7 leaves no frame of the 7 in the file"):
+        made.selected(7, None, 1)
+
+
+def patch(file: Path, change) -> Path:
+    data = bytearray(file.read_bytes())
+    change(data)
+    file.write_bytes(data)
+    return file
+
+
+def test_frame_times_are_those_of_the_time_table(mp4):
+    def faster(data: bytearray) -> None:
+        # stts: length, kind, version and flags, one entry: number of frames and the time of each
+        place = data.index(b"stts") + 16
+        data[place : place + 4] = (int.from_bytes(data[place : place + 4], "big") // 4).to_bytes(4, "big")
+
+    made = VideoFile(patch(mp4, faster))
+    np.testing.assert_allclose([made.timestamp(n) for n in made.names], np.arange(FRAMES) / FPS / 4, atol=1e-3)
+
+
+def test_portrait_that_was_recorded_lying_is_turned_and_said(mp4):
+    upright = by_opencv(mp4)
+
+    def lie_down(data: bytearray) -> None:
+        # tkhd ends in a 3x3 matrix (16.16 fixed point, its last column 2.30), width and height: a turn by 90 degrees
+        place = data.index(b"tkhd") + 4 + 40
+        matrix = [0, 1 << 16, 0, -(1 << 16), 0, 0, 48 << 16, 0, 1 << 30]
+        data[place : place + 36] = b"".join(value.to_bytes(4, "big", signed=True) for value in matrix)
+
+    made = VideoFile(patch(mp4, lie_down))
+    assert made.size("room_000000") == (48, 64)
+    assert np.array_equal(made.read("room_000009"), np.rot90(upright[9], -1))
+    assert made.notes == [
+        f"{mp4} asks to be turned clockwise by 90 degrees, and is: its frames are 48x64, and intrinsics are for that"
+    ]
+
+
+def test_stream_without_times_is_timed_by_the_setting(tmp_path, monkeypatch):
+    from modp_ti.sources import video_file
+
+    file = write(tmp_path / "room.avi", "MJPG")
+    # What OpenCV says of raw H.264, which none of its encoders writes.
+    monkeypatch.setattr(video_file._Decoder, "shown", 0.0)
+    made = VideoFile(file, fps=20.0)
+    assert made.timestamp("room_000010") == 0.5
+    assert "holds no frame times: frame n is taken to be of second n / 20" in made.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ("room_000003", "room_000003"),
+        ("frames/room_000003.png", "room_000003"),
+        ("frames\\room_000003.JPG", "room_000003"),
+        ("room_000040", None),
+        ("000003.png", None),
+        ("room.mp4", None),
+        ("", None),
+    ],
+)
+def test_a_frame_is_found_by_its_whole_name_alone(mp4, asked, found):
+    assert VideoFile(mp4).find(asked) == found
+
+
+@pytest.mark.parametrize("part", [0.5, 0.9])
+@pytest.mark.parametrize("codec", [c for c in CODECS if c != "room.mp4"])
+def test_cut_off_video_is_named_with_its_mend(tmp_path, codec, part):
+    file = write(tmp_path / codec, CODECS[codec])
+    whole = by_opencv(file)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(part * len(data))])
+    with pytest.raises(InputError, match=r"cut off, \d+ bytes are missing: copy it again, or set") as caught:
+        VideoFile(file)
+    readable = int(str(caught.value).partition("source.stop: ")[2].split()[0])
+    assert 0 < readable < FRAMES
+    rest = VideoFile(file, stop=readable)  # the mend
+    assert len(rest) == readable
+    assert np.array_equal(rest.read(rest.names[1]), whole[1])
+
+
+def test_mp4_without_its_table_is_named(mp4):
+    mp4.write_bytes(mp4.read_bytes()[:3000])  # the table comes last
+    with pytest.raises(InputError, match=r"room\.mp4: the video is cut off, \d+ bytes are missing: copy it again$"):
+        VideoFile(mp4)
+
+
+def test_files_that_are_no_videos_are_named(tmp_path):
+    file = tmp_path / "a.mp4"
+    for content, message in ((b"", "the video file is empty"), (b"no video", "no video that OpenCV can read")):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=rf"a\.mp4: {message}"):
+            VideoFile(file)
+    with pytest.raises(InputError, match=r"gone\.mp4: no such video file"):
+        VideoFile(tmp_path / "gone.mp4")
+    with pytest.raises(InputError, match="must be a file, this is a folder"):
+        VideoFile(tmp_path)
+
+
+def test_video_without_a_frame_is_named(mp4):
+    def no_frames(data: bytearray) -> None:
+        for table, entry in ((b"stts", 4), (b"stsz", 8), (b"stsc", 4), (b"stco", 4)):  # the number of entries
+            place = data.index(table) + 4 + entry
+            data[place : place + 4] = bytes(4)
+
+    with pytest.raises(InputError, match="no video that OpenCV can read, or without a frame"):
+        VideoFile(patch(mp4, no_frames))
+
+
+def test_closed_video_says_that_it_cannot_be_read(mp4):
+    made = VideoFile(mp4)
+    made.close()
+    with pytest.raises(InputError, match="frame 3 cannot be decoded"):
+        made.read("room_000003")
+
+
+def test_decoder_keeps_its_own_complaints_to_itself(tmp_path):
+    """In a process of its own: the decoder is told when it is first used."""
+    cut = write(tmp_path / "cut.mkv", "FFV1")
+    cut.write_bytes(cut.read_bytes()[:30_000])
+    (tmp_path / "none.mp4").write_bytes(b"no video")
+    code = """
+import sys
+from modp_ti.errors import InputError
+from modp_ti.sources import VideoFile
+for file in sys.argv[1:]:
+    try:
+        VideoFile(file)
+    except InputError as error:
+        print(error)
+"""
+    command = [sys.executable, "-c", code, str(cut), str(tmp_path / "none.mp4")]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stderr == ""
+    assert len(result.stdout.splitlines()) == 2
