@@ -33,6 +33,12 @@ __all__ = [
 ]
 
 
+# Trackers that bring cameras, those whose files hold poses alone, and all that read what was tracked before.
+WITH_CAMERAS = ("colmap", "transforms", "synthetic")
+WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
+AFTERWARDS = (*WITH_CAMERAS, *WITHOUT_POINTS, "stella_vslam", "aria", "modp")
+
+
 class IntrinsicsSettings(StrictModel):
     """The camera's calibration, for the stored size of the images."""
 
@@ -165,12 +171,46 @@ class SourceSettings(StrictModel):
 class TrackerSettings(StrictModel):
     """Where the camera poses and the sparse points come from."""
 
-    kind: Literal["colmap", "transforms", "synthetic"] = Field(
-        description="`colmap` (a model), `transforms` (transforms.json) or `synthetic` (the embedded demo)"
+    kind: Literal[
+        "colmap",
+        "transforms",
+        "tum",
+        "orbslam3",
+        "stella_vslam",
+        "aria",
+        "modp",
+        "replica",
+        "sevenscenes",
+        "synthetic",
+    ] = Field(
+        description="`colmap` (a model), `transforms` (transforms.json), `tum` (any trajectory in TUM's format), "
+        "`orbslam3`, `stella_vslam` (its map.msg), `aria` (what MPS writes), `modp` (the paper's release), `replica`, "
+        "`sevenscenes` or `synthetic` (the embedded demo)"
     )
     path: Path | None = Field(
         None,
-        description="model folder or file; empty: `sparse/0`, `sparse` or `transforms.json` near the images",
+        description="model folder or file; empty: the file of the kind's usual name near the images",
+    )
+    points: Path | None = Field(
+        None,
+        description="world points for `tum`, `orbslam3`, `replica` and `sevenscenes`: PLY, or text with `x y z` a "
+        "line; empty to have features tracked and triangulated with the poses",
+    )
+    max_points: int = Field(
+        2000, ge=10, description="points of a point file, or of MPS, that one frame is shown at most"
+    )
+    max_difference: float = Field(
+        0.02, gt=0, description="seconds by which a pose's time may differ from its image's time"
+    )
+    time_offset: float = Field(
+        0.0, description="seconds added to the times of the poses, where their clock is not that of the images"
+    )
+    camera: str = Field("camera-rgb", description="`aria` only: label of the camera in online_calibration.jsonl")
+    max_inv_dist_std: float = Field(
+        0.005, gt=0, description="`aria` only: points whose inverse distance is less certain [1/m] are left out"
+    )
+    max_dist_std: float = Field(
+        0.05, gt=0, description="`aria` only: points whose distance is less certain [m] are left out"
     )
     exposure_change: float = Field(
         0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
@@ -209,10 +249,12 @@ class SceneConfig(StrictModel):
     def _images_are_named(self) -> SceneConfig:
         if self.source.path is None and self.source.stream is None and self.tracker.kind != "synthetic":
             raise ValueError("source.path is missing: give the folder that holds the images")
-        if self.source.intrinsics.given and self.tracker.kind in ("colmap", "transforms", "synthetic"):
+        if self.source.intrinsics.given and self.tracker.kind in WITH_CAMERAS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
-        if self.source.stream is not None and self.tracker.kind in ("colmap", "transforms", "synthetic"):
+        if self.source.stream is not None and self.tracker.kind in AFTERWARDS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
+        if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
+            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")
         if self.tracker.exposure_change and self.tracker.kind != "synthetic":
             raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
         return self

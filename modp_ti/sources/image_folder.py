@@ -10,6 +10,7 @@ import numpy as np
 
 from modp_ti.errors import InputError
 from modp_ti.sources.listed_images import IMAGE_SUFFIXES, ListedImages
+from modp_ti.sources.name_times import times_of_names
 
 __all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key"]
 
@@ -24,7 +25,8 @@ class ImageFolder(ListedImages):
     """The images under one folder, subfolders included, hidden files left out.
 
     Names are relative to the folder, with forward slashes. Raises InputError where there is no such folder or
-    no image. fps: images a second, where their place is all that is known of their time. setting: the key that named
+    no image. fps: images a second, where their place is all that is known of their time: names that are time stamps, as
+    in EuRoC's and TUM's folders, tell it themselves. setting: the key that named
     the folder, for messages.
     """
 
@@ -45,4 +47,7 @@ class ImageFolder(ListedImages):
             ]
         if not found:
             raise InputError(f"{path}: holds no image ({', '.join(IMAGE_SUFFIXES)})")
-        super().__init__(path, sorted(found, key=natural_key), np.arange(len(found)) / fps)
+        names = sorted(found, key=natural_key)
+        times = times_of_names(names)
+        notes = [] if times is None else [f"{path}: the images' names are taken as their times"]
+        super().__init__(path, names, np.arange(len(names)) / fps if times is None else times, notes=notes)

@@ -15,7 +15,7 @@ __all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ah
 def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:
     """The tracker that the configuration asks for, its input checked as far as possible without decoding.
 
-    progress: called while a tracker prepares (the triangulation of `transforms`). Raises InputError for bad
+    progress: called while a tracker prepares (triangulates). Raises InputError for bad
     input.
     """
     if config.tracker.kind == "colmap":
@@ -26,6 +26,34 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         from modp_ti.trackers.transforms import open_transforms
 
         return open_transforms(config.source, config.tracker, progress)
+    if config.tracker.kind == "tum":
+        from modp_ti.trackers.tum import open_tum
+
+        return open_tum(config.source, config.tracker, progress)
+    if config.tracker.kind == "orbslam3":
+        from modp_ti.trackers.orbslam3 import open_orbslam3
+
+        return open_orbslam3(config.source, config.tracker, progress)
+    if config.tracker.kind == "stella_vslam":
+        from modp_ti.trackers.stella_vslam import open_stella_vslam
+
+        return open_stella_vslam(config.source, config.tracker)
+    if config.tracker.kind == "aria":
+        from modp_ti.trackers.aria import open_aria
+
+        return open_aria(config.source, config.tracker, progress)
+    if config.tracker.kind == "modp":
+        from modp_ti.trackers.modp import open_modp
+
+        return open_modp(config.source, config.tracker)
+    if config.tracker.kind == "replica":
+        from modp_ti.trackers.replica import open_replica
+
+        return open_replica(config.source, config.tracker, progress)
+    if config.tracker.kind == "sevenscenes":
+        from modp_ti.trackers.sevenscenes import open_sevenscenes
+
+        return open_sevenscenes(config.source, config.tracker, progress)
     from modp_ti.synthetic import open_synthetic
 
     return open_synthetic(config.source, config.tracker)

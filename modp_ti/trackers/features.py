@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Features", "Matches", "detect_features", "essential_matrix", "match_features"]
+__all__ = ["MAX_FEATURES", "Features", "Matches", "detect_features", "essential_matrix", "match_features"]
 
 MAX_SIDE = 1000
 MAX_FEATURES = 2000
@@ -47,8 +47,8 @@ class Matches:
         return len(self.pairs)
 
 
-def detect_features(image: NDArray[np.uint8]) -> Features:
-    """SIFT features of an image (H, W, 3) uint8 RGB, found at a longer side of at most 1000 pixels."""
+def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES) -> Features:
+    """The `most` clearest SIFT features of an image (H, W, 3) uint8 RGB, at a longer side of at most 1000 pixels."""
     import cv2
 
     height, width = image.shape[:2]
@@ -58,7 +58,7 @@ def detect_features(image: NDArray[np.uint8]) -> Features:
     if small != (width, height):
         gray = cv2.resize(gray, small, interpolation=cv2.INTER_AREA)
     # Without the precise upscale every place is a quarter of a pixel too far to the right and below.
-    sift = cv2.SIFT_create(nfeatures=MAX_FEATURES, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     keypoints, raw = sift.detectAndCompute(gray, None)
     if raw is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), pixel)

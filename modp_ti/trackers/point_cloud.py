@@ -52,10 +52,11 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
         raise InputError(f"{path}: the vertices have no x, y and z")
     try:
         if form == "ascii":
-            rows = np.loadtxt(body.decode("ascii").splitlines(), max_rows=count, ndmin=2)
-            if len(rows) != count or (count and rows.shape[1] < len(names)):
+            lines = body.decode("ascii").splitlines()
+            rows = np.loadtxt(lines, max_rows=count, ndmin=2) if count and lines else np.zeros((0, len(names)))
+            if len(rows) != count or rows.shape[1] < len(names):
                 raise ValueError
-            xyz = rows[:, [names.index(axis) for axis in "xyz"]] if count else np.zeros((0, 3))
+            xyz = rows[:, [names.index(axis) for axis in "xyz"]]
         else:
             order = {"binary_little_endian": "<", "binary_big_endian": ">"}[form]
             record = np.dtype([(name, order + PLY_TYPES[kind]) for name, kind in properties])

@@ -1,0 +1,70 @@
+"""Tables of numbers as text: one row a line, `#` comments, columns parted by blanks or commas."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.errors import InputError
+
+__all__ = ["NumberRows", "read_number_rows", "read_text"]
+
+
+@dataclass(frozen=True)
+class NumberRows:
+    """values: (N, columns). lines: (N,) line of the file that each row stands in, from 1."""
+
+    path: Path
+    values: NDArray[np.float64]
+    lines: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def where(self, row: int) -> str:
+        """File and line of a row, for messages."""
+        return f"{self.path}:{self.lines[row]}"
+
+
+def read_text(path: Path, setting: str) -> str:
+    """Content of a text file. setting: the key that named it, for the message of the InputError where it cannot be."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file ({setting})") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+        raise InputError(f"{path}: cannot be read as text: {reason} ({setting})") from None
+
+
+def read_number_rows(
+    path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False
+) -> NumberRows:
+    """The rows of a file whose lines hold `columns` finite numbers each; with `more`, what follows them is ignored.
+
+    meaning: the columns in words, for messages. Raises InputError with file and line for anything else, and for a file
+    without a row.
+    """
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for number, line in enumerate(read_text(path, setting).splitlines(), start=1):
+        words = line.split("#", 1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        if len(words) < columns or (len(words) > columns and not more):
+            raise InputError(f"{path}:{number}: holds {len(words)} columns instead of {columns}: {meaning}")
+        try:
+            row = [float(word) for word in words[:columns]]
+        except ValueError:
+            raise InputError(f"{path}:{number}: not a row of numbers: {meaning}") from None
+        if not all(map(math.isfinite, row)):
+            raise InputError(f"{path}:{number}: holds NaN or infinite numbers; take the line out")
+        rows.append(row)
+        lines.append(number)
+    if not rows:
+        raise InputError(f"{path}: holds no row of {meaning} ({setting})")
+    return NumberRows(path, np.array(rows, dtype=np.float64), np.array(lines, dtype=np.int64))

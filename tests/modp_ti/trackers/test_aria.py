@@ -1,0 +1,221 @@
+"""Tracker `aria`: MPS's files give camera poses and the points seen; what is missing is named with what it would bring."""
+
+from __future__ import annotations
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+WORLD = "ea7288b8-b6a0-012d-8156-257aba6bd796"
+START = 149_202_610  # [us]
+MOUNT = np.eye(4)
+MOUNT[:3, :3] = Rotation.from_euler("xyz", [38, 3, 5], degrees=True).as_matrix()
+MOUNT[:3, 3] = [-0.004, -0.012, -0.0044]
+
+COLUMNS = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"
+
+
+def trajectory_rows(recording, world: str = WORLD) -> list[str]:
+    """Device poses each millisecond around each frame: T_world_device = T_world_camera T_camera_device."""
+    rows = []
+    for i, T_world_camera in enumerate(recording.T_world_camera):
+        T = T_world_camera @ np.linalg.inv(MOUNT)
+        pose = ",".join(f"{x:.9f}" for x in [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()])
+        for shift in (-1000, 0, 1000):
+            at = pose if shift == 0 else "9,9,9,0,0,0,1"  # neighbours are elsewhere: only the nearest will do
+            rows.append(f"{world},{START + round(i * 1e6 / 30) + shift},1686767222002923694,{at},0,0,0,0.5")
+    return rows
+
+
+def write_trajectory(recording, rows: list[str], name: str = "closed_loop_trajectory.csv", frame="world_device"):
+    axes = ",".join(f"{axis}_{frame}" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    header = f"graph_uid,tracking_timestamp_us,utc_timestamp_ns,{axes},gravity_x,gravity_y,gravity_z,quality_score"
+    recording.write(f"slam/{name}", [header, *rows])
+
+
+def calibration_line(time: int, mount: np.ndarray) -> str:
+    x, y, z, w = Rotation.from_matrix(mount[:3, :3]).as_quat().tolist()
+    camera = {"Label": "camera-rgb", "T_Device_Camera": {"Translation": mount[:3, 3].tolist()}}
+    camera["T_Device_Camera"]["UnitQuaternion"] = [w, [x, y, z]]
+    left = {
+        "Label": "camera-slam-left",
+        "T_Device_Camera": {"Translation": [0, 0, 0], "UnitQuaternion": [1, [0, 0, 0]]},
+    }
+    return json.dumps({"tracking_timestamp_us": time, "CameraCalibrations": [left, camera]})
+
+
+def write_gz(recording, name: str, lines: list[str]) -> None:
+    with gzip.open(recording.root / "slam" / name, "wt") as file:
+        file.write("".join(line + "\n" for line in lines))
+
+
+def point_rows(recording) -> list[str]:
+    """Certain points 500, 501, ...; then one of another world and two that are not certain."""
+    rows = [f"{500 + i},{WORLD},{x!r},{y!r},{z!r},0.002,0.01" for i, (x, y, z) in enumerate(recording.xyz.tolist())]
+    return [
+        *rows,
+        "900,another-world,0,0,0,0.002,0.01",
+        f"901,{WORLD},0,0,0,0.006,0.01",
+        f"902,{WORLD},0,0,0,0.002,0.06",
+    ]
+
+
+@pytest.fixture
+def recorded(recording):
+    """MPS's folder `slam` beside the images, with all but the observations."""
+    write_trajectory(recording, trajectory_rows(recording))
+    wrong = MOUNT.copy()
+    wrong[:3, 3] += 1.0
+    lines = [calibration_line(START + round(i * 1e6 / 30) + 100, MOUNT) for i in range(7)]
+    recording.write("slam/online_calibration.jsonl", [calibration_line(START - 700_000, wrong), *lines])
+    write_gz(recording, "semidense_points.csv.gz", [COLUMNS, *point_rows(recording)])
+    return recording
+
+
+CLOCK = {"time_offset": -START * 1e-6}  # the folder's images have no times of their own
+
+
+def test_camera_poses_are_device_poses_times_the_mount_nearest_in_time(recorded):
+    tracker = recorded.open("aria", **CLOCK)
+    recorded.assert_frames(tracker, range(7))
+    for frame in tracker.frames:
+        assert np.array_equal(frame.points.xyz, recorded.xyz[frame.points.ids - 500]), "900 to 902 are left out"
+    assert "60 of 63 points of semidense_points.csv.gz are certain enough" in tracker.notes
+    assert any("semidense_observations.csv.gz is missing: it would have said" in note for note in tracker.notes)
+    looser = recorded.open("aria", max_inv_dist_std=0.01, max_dist_std=0.1, **CLOCK)
+    assert "62 of 63 points of semidense_points.csv.gz are certain enough" in looser.notes
+
+
+def test_with_observations_a_frame_sees_what_was_seen_around_its_time(recorded):
+    """Points 500 to 529 are seen at the first frame's time, 530 to 559 half a second later."""
+    later = START + 500_000
+    rows = [f"{500 + i},{START if i < 30 else later},serial,10.5,20.5" for i in range(60)]
+    write_gz(recorded, "semidense_observations.csv.gz", ["uid,frame_tracking_timestamp_us,camera_serial,u,v", *rows])
+    tracker = recorded.open("aria", **CLOCK)
+    recorded.assert_frames(tracker, range(7), least_points=0)
+    # Within 0.11 s of the first frame lie frames 0 to 3.
+    for i, frame in enumerate(tracker.frames):
+        assert (len(frame.points) > 5) == (i <= 3)
+        assert set(frame.points.ids.tolist()) <= set(range(500, 530))
+    rows = [f"777,{START},serial,1,1"]
+    write_gz(recorded, "semidense_observations.csv.gz", ["uid,frame_tracking_timestamp_us,camera_serial,u,v", *rows])
+    assert "none of its observations is of a point that is used" in recorded.failure("aria", **CLOCK)
+
+
+def test_older_names_and_another_world_s_poses(recorded):
+    (recorded.root / "slam" / "semidense_points.csv.gz").rename(recorded.root / "slam" / "global_points.csv.gz")
+    rows = trajectory_rows(recorded)
+    extra = [row.replace(WORLD, "a-second-world") for row in rows[-3:]]
+    write_trajectory(recorded, rows[:-3] + extra)
+    tracker = recorded.open("aria", path=recorded.root / "slam", **CLOCK)
+    recorded.assert_frames(tracker, range(6))
+    assert "3 poses of closed_loop_trajectory.csv are of another world than most (its graph): left out" in tracker.notes
+
+
+def test_open_loop_is_read_and_said_to_drift(recorded):
+    (recorded.root / "slam" / "closed_loop_trajectory.csv").unlink()
+    rows = trajectory_rows(recorded)
+    write_trajectory(recorded, rows, "open_loop_trajectory.csv", "odometry_device")
+    file = recorded.root / "slam" / "open_loop_trajectory.csv"
+    file.write_text(file.read_text().replace("graph_uid", "session_uid", 1))
+    tracker = recorded.open("aria", {"stop": 3}, **CLOCK)
+    np.testing.assert_allclose(
+        [frame.T_camera_world for frame in tracker.frames], recorded.T_camera_world[:3], atol=1e-6
+    )
+    assert any("odometry, which drifts" in note for note in tracker.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("closed_loop_trajectory.csv", ["open_loop_trajectory.csv", "would have brought the poses"]),
+        ("online_calibration.jsonl", ["is missing", "where the camera camera-rgb sits on the device"]),
+    ],
+)
+def test_missing_file_is_named_with_what_it_would_have_brought(recorded, name, parts):
+    (recorded.root / "slam" / name).unlink()
+    message = recorded.failure("aria", **CLOCK)
+    for part in (name, *parts):
+        assert part in message
+
+
+def test_missing_points_are_triangulated_with_a_word(recorded):
+    (recorded.root / "slam" / "semidense_points.csv.gz").unlink()
+    tracker = recorded.open("aria", {"stop": 2}, **CLOCK)
+    assert any("semidense_points.csv.gz is missing: it would have brought the points" in n for n in tracker.notes)
+
+
+ROW = 4  # file line 6
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (lambda row: row.rsplit(",", 1)[0], ["closed_loop_trajectory.csv:6", "13 columns, the header 14"]),
+        (lambda row: row.replace(row.split(",")[3], "nan"), ["csv:6", "tx_world_device is NaN"]),
+        (lambda row: row.replace(row.split(",")[3], "x1"), ["csv:6", "tx_world_device is 'x1', not a number"]),
+        (lambda row: row.replace(row.split(",")[1], "soon"), ["csv:6", "tracking_timestamp_us is 'soon'"]),
+        (lambda row: row.replace(row.split(",")[1], str(START)), ["csv:6", "does not lie after"]),
+        (lambda row: row.replace(row.split(",")[9], "3.0"), ["csv:6", "qx qy qz qw has length"]),
+    ],
+)
+def test_wrong_row_of_the_trajectory_is_named(recorded, change, parts):
+    rows = trajectory_rows(recorded)
+    rows[ROW] = change(rows[ROW])
+    write_trajectory(recorded, rows)
+    message = recorded.failure("aria", **CLOCK)
+    for part in parts:
+        assert part in message
+
+
+def test_wrong_headers_and_empty_files_are_named(recorded):
+    write_trajectory(recorded, [])
+    assert "closed_loop_trajectory.csv: holds no pose" in recorded.failure("aria", **CLOCK)
+    write_trajectory(recorded, trajectory_rows(recorded), frame="odometry_device")
+    assert "closed_loop_trajectory.csv:1: the header has no column tx_world_device" in recorded.failure("aria", **CLOCK)
+
+
+@pytest.mark.parametrize(
+    ("line", "parts"),
+    [
+        ('{"tracking_timestamp_us": 3, "Came', ["jsonl:2", "not valid JSON", "cut off"]),
+        ("{}", ["jsonl:2", "holds no `CameraCalibrations`"]),
+        (calibration_line(START, MOUNT).replace("camera-rgb", "camera-et"), ["jsonl:2", "no camera camera-rgb", "et"]),
+        (calibration_line(START, MOUNT).replace("UnitQuaternion", "Quaternion"), ["jsonl:2", "T_Device_Camera"]),
+        (calibration_line(START, np.diag([1, 1, 1, 1])).replace("[1.0, [", "[2.0, ["), ["jsonl:2", "length 2"]),
+        (calibration_line(START - 800_000, MOUNT), ["jsonl:2", "does not lie after"]),
+    ],
+)
+def test_wrong_line_of_the_calibration_is_named(recorded, line, parts):
+    file = recorded.root / "slam" / "online_calibration.jsonl"
+    first = file.read_text().splitlines()[0]
+    file.write_text(f"{first}\n{line}\n")
+    message = recorded.failure("aria", **CLOCK)
+    for part in parts:
+        assert part in message
+
+
+def test_points_that_are_cut_off_damaged_or_uncertain_are_named(recorded):
+    file = recorded.root / "slam" / "semidense_points.csv.gz"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    assert "semidense_points.csv.gz: the gzip file is cut off" in recorded.failure("aria", **CLOCK)
+    file.write_bytes(b"uid,graph_uid\n")
+    assert "semidense_points.csv.gz: the gzip file is cut off or damaged" in recorded.failure("aria", **CLOCK)
+    file.write_bytes(whole)
+    message = recorded.failure("aria", max_dist_std=0.001, **CLOCK)
+    assert "none of its 63 points" in message and "tracker.max_dist_std" in message
+    write_gz(recorded, "semidense_points.csv.gz", [COLUMNS, f"1,{WORLD},0,0,0,0.001"])
+    assert "semidense_points.csv.gz:2: holds 6 columns, the header 7" in recorded.failure("aria", **CLOCK)
+
+
+def test_images_of_another_time_are_an_error(recorded):
+    message = recorded.failure("aria")
+    assert "closed_loop_trajectory.csv: no pose lies within 0.02 s of a frame" in message
+    assert "149.2" in message and "tracker.time_offset" in message
+    assert "no such folder (tracker.path)" in recorded.failure("aria", path=recorded.root / "gone", **CLOCK)
+    other = recorded.write("slam/other.csv", ["x"])
+    assert "tracker.path must be MPS's folder" in recorded.failure("aria", path=other, **CLOCK)
