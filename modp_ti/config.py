@@ -35,7 +35,7 @@ class SourceSettings(StrictModel):
     """Where the frames are."""
 
     path: Path | None = Field(
-        None, description="folder of the images; subfolders are searched too (not used by `synthetic`)"
+        None, description="folder of the images; subfolders are searched too (not used by `synthetic` and `socket`)"
     )
     scale: float = Field(1.0, gt=0, le=1, description="factor on width and height of every frame")
     holdout: int | None = Field(
@@ -82,12 +82,21 @@ class SourceSettings(StrictModel):
 class TrackerSettings(StrictModel):
     """Where the camera poses and the sparse points come from."""
 
-    kind: Literal["colmap", "transforms", "synthetic"] = Field(
-        description="`colmap` (a model), `transforms` (transforms.json) or `synthetic` (the embedded demo)"
+    kind: Literal["colmap", "transforms", "socket", "synthetic"] = Field(
+        description="`colmap` (a model), `transforms` (transforms.json), `socket` (another program sends frames and "
+        "poses: docs/door.md) or `synthetic` (the embedded demo)"
     )
     path: Path | None = Field(
         None,
-        description="model folder or file; empty: `sparse/0`, `sparse` or `transforms.json` near the images",
+        description="model folder or file; empty: `sparse/0`, `sparse` or `transforms.json` near the images. "
+        "`socket`: a Unix socket to be made there, instead of tracker.address",
+    )
+    address: str | None = Field(
+        None,
+        description="`socket` only: host:port to listen at; empty: 127.0.0.1:7007, which only this machine reaches",
+    )
+    patience: float = Field(
+        120.0, gt=0, description="`socket` only: seconds without a whole message after which the stream counts as ended"
     )
     exposure_change: float = Field(
         0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
@@ -124,8 +133,12 @@ class SceneConfig(StrictModel):
 
     @model_validator(mode="after")
     def _images_are_named(self) -> SceneConfig:
-        if self.source.path is None and self.tracker.kind != "synthetic":
+        if self.source.path is None and self.tracker.kind not in ("synthetic", "socket"):
             raise ValueError("source.path is missing: give the folder that holds the images")
+        if self.tracker.address is not None and self.tracker.kind != "socket":
+            raise ValueError("tracker.address is for tracker.kind: socket alone; take it out")
+        if self.tracker.address is not None and self.tracker.path is not None:
+            raise ValueError("tracker.address and tracker.path both say where to listen: take one out")
         if self.tracker.exposure_change and self.tracker.kind != "synthetic":
             raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
         return self

@@ -30,7 +30,7 @@ from modp_ti.exports.trajectory import write_trajectory
 from modp_ti.lpips import open_lpips
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
-from modp_ti.trackers import frame_count, may_read_ahead, open_tracker
+from modp_ti.trackers import Tracker, close, frame_count, may_read_ahead, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
@@ -73,6 +73,22 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     console.print(f"device: {describe(backend)}", highlight=False, soft_wrap=True)
     tick = time.perf_counter()
     tracker = open_tracker(config, line.prepare)
+    try:
+        return _run(config, console, line, backend, tracker, started, tick)
+    finally:
+        close(tracker)
+
+
+def _run(
+    config: SceneConfig,
+    console: Console,
+    line: ProgressLine,
+    backend: str,
+    tracker: Tracker,
+    started: float,
+    tick: float,
+) -> Path:
+    """The run on an opened tracker. started, tick: when the run and the opening of the tracker began."""
     ahead = config.source.prefetch if may_read_ahead(tracker) else 0
     with FramesAhead(tracker, ahead) as frames:
         first = next(frames, None)
@@ -80,8 +96,8 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
             raise InputError("the tracker delivered no frame: nothing to map")
         prepared = time.perf_counter() - tick
         lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
-        for note in [*tracker.notes, *([no_lpips] if no_lpips else [])]:
-            console.print(f"note: {note}", highlight=False, soft_wrap=True)
+        said = len(tracker.notes)
+        _say(console, [*tracker.notes[:said], *([no_lpips] if no_lpips else [])])
 
         mapper = build_mapper(config, first.camera)
         watch = mapper.stopwatch
@@ -92,6 +108,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
         poses = _map(mapper, chain([first], _timed(frames, watch)), line)
         mapping_seconds = time.perf_counter() - tick
+    _say(console, tracker.notes[said:])  # how a live tracker's frames ended
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -150,6 +167,11 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
         shutil.rmtree(staging, ignore_errors=True)
     line.summary(metrics)
     return config.output
+
+
+def _say(console: Console, notes: list[str]) -> None:
+    for note in notes:
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:

@@ -19,6 +19,7 @@ class ImageSource(Protocol):
 
     path: where they are, for messages. names: all of them; those of a live source grow while it runs. intrinsics: what
     the source itself says of its camera, None where it says nothing. notes: one-line remarks for the user.
+    A source whose images say themselves which pixels count has `valid(name)`, (H, W) bool or None where all do.
     """
 
     path: Path

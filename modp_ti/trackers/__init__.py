@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from modp_ti.trackers.protocol import Progress, Tracker, events, frame_count, may_read_ahead
+from modp_ti.trackers.protocol import Progress, Tracker, close, events, frame_count, may_read_ahead
 
 if TYPE_CHECKING:
     from modp_ti.config import SceneConfig
 
-__all__ = ["Progress", "Tracker", "events", "frame_count", "may_read_ahead", "open_tracker"]
+__all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ahead", "open_tracker"]
 
 
 def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:
@@ -26,6 +26,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         from modp_ti.trackers.transforms import open_transforms
 
         return open_transforms(config.source, config.tracker, progress)
+    if config.tracker.kind == "socket":
+        from modp_ti.trackers.door import open_door
+
+        return open_door(config.source, config.tracker, progress)
     from modp_ti.synthetic import open_synthetic
 
     return open_synthetic(config.source, config.tracker)

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 
-__all__ = ["Progress", "Tracker", "events", "frame_count", "may_read_ahead"]
+__all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ahead"]
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(what, done, total) while a tracker prepares."""
@@ -46,3 +46,9 @@ def frame_count(tracker: Tracker) -> int | None:
 def may_read_ahead(tracker: Tracker) -> bool:
     """Whether a thread may iterate over the tracker while the mapper works; not unless it says so."""
     return getattr(tracker, "reads_ahead", False)
+
+
+def close(tracker: Tracker) -> None:
+    """Let go of what the tracker holds open, where it holds anything."""
+    if hasattr(tracker, "close"):
+        tracker.close()
