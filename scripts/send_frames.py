@@ -167,8 +167,8 @@ def play(
 ) -> int:
     """Send the scene's frames as its tracker delivers them; how many the door took.
 
-    address, wait: see `Sender`. late: frames after which a frame's pose and points follow it; 0 sends them with it. rate:
-    frames a second at most.
+    address, wait: see `Sender`. late: frames after which a frame's pose and points follow it; 0 sends them with it.
+    rate: frames a second at most.
     """
     from fields.backend import initialise
     from fields.pose_correction import PoseCorrection

@@ -33,6 +33,7 @@ class Connection:
         self._socket = sock
         self._patience = patience
         self._closed = closed
+        self._reset = False
 
     def receive(self, hello: Hello | None) -> tuple[Header, bytes]:
         """The next message, whose header is judged before its payload is read.
@@ -58,6 +59,12 @@ class Connection:
                     continue
                 where = "in mid-message" if begun or data else "without a message"
                 raise SenderGoneError(f"was silent for {patience:g} s {where}") from None
+            except ConnectionResetError:
+                # Said once, by a sender that died with our WELCOME unread; what it had sent may still be there.
+                if self._reset:
+                    raise SenderGoneError("is gone: the connection was reset") from None
+                self._reset = True
+                continue
             except OSError as error:
                 raise SenderGoneError(f"is gone: {error.strerror or error}") from None
             if not part:
