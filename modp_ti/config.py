@@ -23,6 +23,7 @@ from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings,
 
 __all__ = [
     "EvaluationSettings",
+    "ExportSettings",
     "SceneConfig",
     "SourceSettings",
     "TrackerSettings",
@@ -113,6 +114,16 @@ class EvaluationSettings(StrictModel):
     )
 
 
+class ExportSettings(StrictModel):
+    """What a run writes beside its map."""
+
+    images: bool = Field(
+        False,
+        description="write the undistorted images, as mapped, into `colmap/images`: to go on with elsewhere, since the "
+        "cameras of `colmap/` are theirs",
+    )
+
+
 class SceneConfig(StrictModel):
     """Everything that a run depends on."""
 
@@ -130,6 +141,7 @@ class SceneConfig(StrictModel):
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
+    export: ExportSettings = ExportSettings()
 
     @model_validator(mode="after")
     def _images_are_named(self) -> SceneConfig:
