@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from modp_ti.check import check
 from modp_ti.run import run
 from modp_ti.warmup import warmup
 
@@ -17,6 +18,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("run")(run)
+app.command("check")(check)
 app.command("warmup")(warmup)
 
 

@@ -23,6 +23,7 @@ from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings,
 
 __all__ = [
     "EvaluationSettings",
+    "ExportSettings",
     "IntrinsicsSettings",
     "SceneConfig",
     "SourceSettings",
@@ -34,7 +35,8 @@ __all__ = [
 
 
 # Trackers that bring cameras, those whose files hold poses alone, and all that read what was tracked before.
-WITH_CAMERAS = ("colmap", "transforms", "synthetic")
+WITHOUT_SOURCE = ("synthetic", "socket")
+WITH_CAMERAS = ("colmap", "transforms", *WITHOUT_SOURCE)
 WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
 AFTERWARDS = (*WITH_CAMERAS, *WITHOUT_POINTS, "stella_vslam", "aria", "modp")
 
@@ -103,7 +105,7 @@ class SourceSettings(StrictModel):
     path: Path | None = Field(
         None,
         description="folder of the images (subfolders are searched too), data set, video file or recording "
-        "(not used by `synthetic`)",
+        "(not used by `synthetic` and `socket`)",
     )
     stream: int | str | None = Field(
         None, description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live"
@@ -181,15 +183,18 @@ class TrackerSettings(StrictModel):
         "modp",
         "replica",
         "sevenscenes",
+        "socket",
         "synthetic",
     ] = Field(
         description="`colmap` (a model), `transforms` (transforms.json), `tum` (any trajectory in TUM's format), "
         "`orbslam3`, `stella_vslam` (its map.msg), `aria` (what MPS writes), `modp` (the paper's release), `replica`, "
-        "`sevenscenes` or `synthetic` (the embedded demo)"
+        "`sevenscenes`, `socket` (another program sends frames and poses: docs/door.md) or `synthetic` (the embedded "
+        "demo)"
     )
     path: Path | None = Field(
         None,
-        description="model folder or file; empty: the file of the kind's usual name near the images",
+        description="model folder or file; empty: the file of the kind's usual name near the images. `socket`: a Unix "
+        "socket to be made there, instead of tracker.address",
     )
     points: Path | None = Field(
         None,
@@ -212,6 +217,13 @@ class TrackerSettings(StrictModel):
     max_dist_std: float = Field(
         0.05, gt=0, description="`aria` only: points whose distance is less certain [m] are left out"
     )
+    address: str | None = Field(
+        None,
+        description="`socket` only: host:port to listen at; empty: 127.0.0.1:7007, which only this machine reaches",
+    )
+    patience: float = Field(
+        120.0, gt=0, description="`socket` only: seconds without a whole message after which the stream counts as ended"
+    )
     exposure_change: float = Field(
         0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
     )
@@ -224,6 +236,16 @@ class EvaluationSettings(StrictModel):
         None,
         description="folder with `alexnet-owt-7be5be79.pth` (torchvision) and `alex.pth` (the `lpips` package, v0.1); "
         "empty: torch's cache and the installed package; LPIPS is null where they are not",
+    )
+
+
+class ExportSettings(StrictModel):
+    """What a run writes beside its map."""
+
+    images: bool = Field(
+        False,
+        description="write the undistorted images, as mapped, into `colmap/images`: to go on with elsewhere, since the "
+        "cameras of `colmap/` are theirs",
     )
 
 
@@ -244,10 +266,11 @@ class SceneConfig(StrictModel):
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
+    export: ExportSettings = ExportSettings()
 
     @model_validator(mode="after")
     def _images_are_named(self) -> SceneConfig:
-        if self.source.path is None and self.source.stream is None and self.tracker.kind != "synthetic":
+        if self.source.path is None and self.source.stream is None and self.tracker.kind not in WITHOUT_SOURCE:
             raise ValueError("source.path is missing: give the folder that holds the images")
         if self.source.intrinsics.given and self.tracker.kind in WITH_CAMERAS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
@@ -255,6 +278,10 @@ class SceneConfig(StrictModel):
             raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
         if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")
+        if self.tracker.address is not None and self.tracker.kind != "socket":
+            raise ValueError("tracker.address is for tracker.kind: socket alone; take it out")
+        if self.tracker.address is not None and self.tracker.path is not None:
+            raise ValueError("tracker.address and tracker.path both say where to listen: take one out")
         if self.tracker.exposure_change and self.tracker.kind != "synthetic":
             raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
         return self

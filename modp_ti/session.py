@@ -24,6 +24,7 @@ from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
 from modp_ti.errors import InputError
 from modp_ti.evaluation import FrameScore, MapVersion, evaluate, summary, trajectory_errors
+from modp_ti.exports.colmap_model import image_names, write_colmap, write_image
 from modp_ti.exports.exposure import write_exposures
 from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats, write_splats
@@ -31,6 +32,7 @@ from modp_ti.exports.trajectory import write_trajectory
 from modp_ti.lpips import open_lpips
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
+from modp_ti.tracked_points import TrackedPoints
 from modp_ti.trackers import close, frame_count, may_read_ahead, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
@@ -46,13 +48,19 @@ MAPS = ("online", "refined", "offline")
 
 @dataclass
 class Poses:
-    """What is kept of every frame: its time and poses."""
+    """What is kept of every frame: its name, time, camera and pose, and the points that it saw."""
 
+    name: list[str] = field(default_factory=list)
+    camera: list[PinholeCamera] = field(default_factory=list)
+    points: TrackedPoints = field(default_factory=TrackedPoints)
     index: list[int] = field(default_factory=list)
     timestamp: list[float] = field(default_factory=list)
     tracked: list[NDArray[np.float64]] = field(default_factory=list)
 
     def add(self, frame: TrackedFrame) -> None:
+        self.name.append(frame.name)
+        self.camera.append(frame.camera)
+        self.points.add(frame)
         self.index.append(frame.index)
         self.timestamp.append(frame.timestamp)
         self.tracked.append(frame.T_camera_world)
@@ -87,8 +95,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
             raise InputError("the tracker delivered no frame: nothing to map")
         prepared = time.perf_counter() - tick
         lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
-        notes = [*tracker.notes, *([no_lpips] if no_lpips else [])]
-        _say(notes, console)
+        said = len(tracker.notes)
+        _say([*tracker.notes[:said], *([no_lpips] if no_lpips else [])], console)
 
         mapper = build_mapper(config, first.camera)
         watch = mapper.stopwatch
@@ -99,7 +107,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
         poses = _map(mapper, chain([first], _timed(frames, watch)), line)
         mapping_seconds = time.perf_counter() - tick
-    _say([note for note in tracker.notes if note not in notes], console)
+    _say(tracker.notes[said:], console)  # how a live tracker's frames ended
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -121,6 +129,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         (staging / "renders").mkdir(parents=True)
         write_splats(staging / "splats.ply", final.gaussians)
         write_trajectory(staging / "trajectory.txt", poses.timestamp, final.trajectory)
+        names = image_names(poses.name, config.export.images)
+        write_colmap(staging / "colmap", names, poses.camera, final.trajectory, poses.points)
         if mapper.keyframes[0].exposure is not None:
             keyframes = {k.index for k in mapper.keyframes}
             write_exposures(staging / "exposure.json", poses.index, poses.timestamp, final.exposures, keyframes)
@@ -128,6 +138,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         versions[last] = replace(final, gaussians=read_splats(staging / "splats.ply"))
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+            if stage == last and config.export.images:
+                write_image(staging / "colmap", names[frame.index], frame)
             if stage == last and frame.held_out:
                 _write_pair(staging / "renders" / f"{frame.index:06d}.png", frame.image, render)
 
@@ -148,6 +160,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
             "seconds": _seconds(watch.seconds, time.perf_counter() - started),
             "breakdown_percent": breakdown,
             **trajectory_errors(poses.tracked, final.trajectory, getattr(tracker, "ground_truth", list)()),
+            "reprojection_error": _rounded(poses.points.reprojection_error(poses.camera, final.trajectory)),
+            "reprojection_error_tracked": _rounded(poses.points.reprojection_error(poses.camera, poses.tracked)),
         }
         (staging / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         dump_scene(config, staging / "config.yaml")
@@ -252,9 +266,14 @@ def _seconds(stages: dict[str, float], total: float) -> dict[str, float]:
     return seconds
 
 
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
+
+
 def _publish(staging: Path, output: Path) -> None:
     """Move the finished files into the output folder, over those of an earlier run."""
     output.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(output / "renders", ignore_errors=True)
+    for folder in ("renders", "colmap"):
+        shutil.rmtree(output / folder, ignore_errors=True)
     for item in staging.iterdir():
         os.replace(item, output / item.name)

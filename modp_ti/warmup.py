@@ -82,6 +82,8 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
+    if size is None and config.tracker.kind == "socket":
+        raise InputError("no frame is there before a tracker sends one: give the size, --size 640x480")
     if size is None:
         first = next(iter(open_tracker(config)), None)
         if first is None:

@@ -79,6 +79,8 @@ class FrameReader:
     def _valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         """Which pixels of the stored image count; None where all do."""
         valid = None if self._masks is None else self._masks.read(name)
+        if hasattr(self.images, "valid"):
+            valid = _both(valid, self.images.valid(name))
         if self._source.mask_colour is not None:
             valid = _both(valid, differs_from_colour(raw, self._source.mask_colour, self._source.mask_tolerance))
         return None if valid is None or valid.all() else valid

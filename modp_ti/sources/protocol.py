@@ -20,7 +20,8 @@ class ImageSource(Protocol):
     path: where they are, for messages. names: all of them; those of a live source grow while it runs. intrinsics: what
     the user or else the source itself says of its camera, None where nobody says anything. notes: one-line remarks for
     the user; a live source has more of them at its end. A source that knows its lens's vignette has it as `vignette`
-    (H, W, 3) float32, at most 1, of the stored image's field of view; None where it does not.
+    (H, W, 3) float32, at most 1, of the stored image's field of view; None where it does not. One whose images say
+    themselves which pixels count has `valid(name)`, (H, W) bool or None where all do.
     """
 
     path: Path

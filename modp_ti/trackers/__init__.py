@@ -54,6 +54,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         from modp_ti.trackers.sevenscenes import open_sevenscenes
 
         return open_sevenscenes(config.source, config.tracker, progress)
+    if config.tracker.kind == "socket":
+        from modp_ti.trackers.door import open_door
+
+        return open_door(config.source, config.tracker, progress)
     from modp_ti.synthetic import open_synthetic
 
     return open_synthetic(config.source, config.tracker)

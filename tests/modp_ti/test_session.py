@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from modp_ti.config import load_scene
@@ -105,6 +106,23 @@ def test_every_frame_has_its_pose(folder: Path) -> None:
     np.testing.assert_allclose(times, np.arange(9) / 10)
     rotations = poses[:, :3, :3]
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (9, 1, 1)), atol=1e-9)
+
+
+def test_the_colmap_model_has_every_frame_at_its_refined_pose(folder: Path) -> None:
+    model = pycolmap.Reconstruction(str(folder / "colmap"))
+    tracked = list(open_tracker(load_scene(folder / "config.yaml")))
+    refined = read_trajectory(folder / "trajectory.txt")[1]
+    assert [model.images[i + 1].name for i in range(9)] == [frame.name for frame in tracked]
+    for i, (frame, T) in enumerate(zip(tracked, refined, strict=True)):
+        np.testing.assert_allclose(model.images[i + 1].cam_from_world().matrix(), T[:3], atol=1e-12)
+        pixels = [p.xy for p in model.images[i + 1].get_observation_points2D()]
+        np.testing.assert_array_equal(pixels, frame.points.pixels.astype(np.float32))
+    assert len(model.points3D) == len({i for frame in tracked for i in frame.points.ids.tolist()})
+    metrics = json.loads((folder / "metrics.json").read_text())
+    # The demo's pixels are off by 0.3 of a pixel, its points by 1 % of their depth.
+    assert 0.2 < metrics["reprojection_error_tracked"] < 2.0
+    assert 0.2 < metrics["reprojection_error"] < 2.0
+    assert metrics["reprojection_error"] != metrics["reprojection_error_tracked"]
 
 
 def test_the_trajectory_errors_are_those_of_the_written_and_of_the_tracked_poses(folder: Path) -> None:

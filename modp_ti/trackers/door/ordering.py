@@ -1,0 +1,119 @@
+"""Frames in their order, each once its pose is known, with the corrections between them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+
+from modp_ti.trackers.door.messages import Correction, Frame, ProtocolError, State
+
+__all__ = ["Ordering"]
+
+# What may wait behind a frame without a pose; images wait on disk.
+MAX_WAITING = 2_000  # frames and corrections
+MAX_WAITING_BYTES = 256 << 20  # of points and poses
+
+
+class Ordering:
+    """Takes messages as they arrive, gives frames with poses and corrections in the order in which they began.
+
+    A frame whose pose comes later holds up all after it; one that is lost is left out.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._waiting: deque[Frame | Correction] = deque()
+        self._late: dict[int, Frame] = {}  # poses of frames that came without, to be delivered
+        self._undecided: set[int] = set()
+        self._posed: set[int] = set()
+        self._bytes = 0
+        self._last: Frame | None = None
+
+    @property
+    def undecided(self) -> int:
+        """Frames that still wait for their pose."""
+        return len(self._undecided)
+
+    def require_next(self, frame: Frame) -> None:
+        """Raises ProtocolError where the frame does not come after those before it."""
+        if self._last is None:
+            return
+        if frame.number <= self._last.number:
+            raise ProtocolError(f"FRAME {frame.number} after FRAME {self._last.number}: numbers must grow")
+        if frame.timestamp <= self._last.timestamp:
+            raise ProtocolError(
+                f"FRAME {frame.number}: its time {frame.timestamp!r} is not after {self._last.timestamp!r}, that of "
+                f"FRAME {self._last.number}"
+            )
+
+    def add_frame(self, frame: Frame) -> None:
+        """Take a frame in; its image is of no interest here. Raises ProtocolError as `require_next` does."""
+        self.require_next(frame)
+        self._last = frame = replace(frame, image=b"")
+        if frame.state is State.LATER:
+            self._undecided.add(frame.number)
+        elif frame.state is State.KNOWN:
+            self._posed.add(frame.number)
+        self._wait(frame)
+
+    def add_pose(self, pose: Frame) -> None:
+        """What became of a frame's pose. Raises ProtocolError where that is not open."""
+        if pose.number not in self._undecided:
+            raise ProtocolError(
+                f"POSE {pose.number}: no frame of this number waits for its pose; CORRECTION revises one that has it"
+            )
+        self._undecided.discard(pose.number)
+        if pose.state is State.KNOWN:
+            self._posed.add(pose.number)
+        self._late[pose.number] = pose
+        self._hold(_size(pose))
+
+    def add_correction(self, correction: Correction) -> None:
+        """Raises ProtocolError where it names a frame that has no pose."""
+        for number in correction.numbers.tolist():
+            if number not in self._posed:
+                raise ProtocolError(f"CORRECTION of frame {number}, which has no pose so far")
+        self._wait(correction)
+
+    def ready(self) -> Iterator[Frame | Correction]:
+        """What can be delivered by now: frames with their poses, and corrections of frames before them."""
+        while self._waiting:
+            item = self._waiting[0]
+            if isinstance(item, Frame) and item.state is State.LATER:
+                if item.number not in self._late:
+                    return
+                late = self._late.pop(item.number)
+                self._bytes -= _size(late)
+                item = replace(late, timestamp=item.timestamp)
+            else:
+                self._bytes -= _size(item)
+            self._waiting.popleft()
+            if isinstance(item, Frame) and item.state is State.LOST:
+                self.lost += 1
+            else:
+                yield item
+
+    def close(self) -> None:
+        """No pose will come any more: frames without count as lost."""
+        for item in self._waiting:
+            if isinstance(item, Frame) and item.number in self._undecided:
+                self._late[item.number] = replace(item, state=State.LOST)
+        self._undecided.clear()
+
+    def _wait(self, item: Frame | Correction) -> None:
+        self._waiting.append(item)
+        self._hold(_size(item))
+
+    def _hold(self, size: int) -> None:
+        self._bytes += size
+        if len(self._waiting) > MAX_WAITING or self._bytes > MAX_WAITING_BYTES:
+            raise ProtocolError(
+                f"{len(self._waiting)} frames and corrections ({self._bytes >> 20} MiB) wait for the pose of FRAME "
+                f"{min(self._undecided, default=0)}: send its POSE, state 2 where it has none"
+            )
+
+
+def _size(item: Frame | Correction) -> int:
+    """Bytes that it holds in memory, about."""
+    return 48 * len(item.points) if isinstance(item, Frame) else 136 * len(item.numbers) + 32 * len(item.ids)

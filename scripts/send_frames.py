@@ -1,0 +1,245 @@
+"""Plays the frames of any scene into a run of `tracker: {kind: socket}`, as a tracker in another program would.
+
+The messages are written here after docs/door.md, with the standard library and NumPy: an example to start from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import socket
+import struct
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+HELLO, FRAME, POSE, CORRECTION, END = 1, 2, 3, 4, 5
+WELCOME, DONE, ERROR = 64, 65, 66
+JPEG, PNG, GREY8, RGB8, RGBA8 = 1, 2, 3, 4, 5
+LATER, KNOWN, LOST = 0, 1, 2
+
+NOWHERE = np.zeros((4, 4))
+NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+
+
+class DoorError(Exception):
+    """The door has told us why it goes no further, or is not there."""
+
+
+class Sender:
+    """The other side of `tracker: {kind: socket}`.
+
+    address: "host:port", or the path of a Unix socket. wait: seconds in which the run may still start to listen.
+    """
+
+    def __init__(self, address: str, wait: float = 60.0) -> None:
+        self.socket = _connected(address, time.monotonic() + wait)
+
+    def hello(
+        self,
+        width: int,
+        height: int,
+        intrinsics: Sequence[float],
+        encoding: int,
+        lens: int = 0,
+        coefficients: Sequence[float] = (),
+        name: str = "",
+    ) -> None:
+        """The camera. intrinsics: fx, fy, cx, cy in pixels, pixel centres at +0.5. Waits for the answer."""
+        k = [*coefficients, *[0.0] * (8 - len(coefficients))]
+        self.send(HELLO, struct.pack("<IIII4d8d", width, height, encoding, lens, *intrinsics, *k) + name.encode())
+        self.expect(WELCOME)
+
+    def frame(
+        self,
+        number: int,
+        timestamp: float,
+        image: bytes,
+        T_camera_world: NDArray[np.float64] | None = None,
+        points: tuple[NDArray, NDArray, NDArray] = NO_POINTS,
+        state: int | None = None,
+    ) -> None:
+        """A frame. points: (N, 3) in the world, (N, 2) pixels and (N,) ids. state: where the pose is not known yet."""
+        state = state if state is not None else LATER if T_camera_world is None else KNOWN
+        self.send(FRAME, _frame(number, state, timestamp, T_camera_world, points, image))
+
+    def pose(
+        self,
+        number: int,
+        T_camera_world: NDArray[np.float64] | None,
+        points: tuple[NDArray, NDArray, NDArray] = NO_POINTS,
+    ) -> None:
+        """The pose of a frame that was sent without; None where there will be none."""
+        self.send(POSE, _frame(number, LOST if T_camera_world is None else KNOWN, 0.0, T_camera_world, points, b""))
+
+    def correction(
+        self,
+        numbers: NDArray[np.integer],
+        T_camera_world: NDArray[np.float64],
+        ids: NDArray[np.integer] | None = None,
+        xyz: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Revised poses (N, 4, 4) of frames, by their numbers in growing order, and places (M, 3) of points."""
+        ids, xyz = (np.zeros(0), np.zeros((0, 3))) if ids is None or xyz is None else (ids, xyz)
+        payload = struct.pack("<II", len(numbers), len(ids))
+        for number, T in zip(numbers, T_camera_world, strict=True):
+            payload += struct.pack("<II", number, 0) + np.ascontiguousarray(T, dtype="<f8").tobytes()
+        for i, place in zip(ids, xyz, strict=True):
+            payload += struct.pack("<q3d", i, *place)
+        self.send(CORRECTION, payload)
+
+    def end(self) -> int:
+        """No more will come. Returns how many frames went to the mapper, once the last of them has."""
+        self.send(END, b"")
+        return struct.unpack("<I", self.expect(DONE))[0]
+
+    def send(self, kind: int, payload: bytes) -> None:
+        """Any message. Waits while the run has enough frames to work on."""
+        try:
+            self.socket.sendall(struct.pack("<4sHHII", b"MODP", 1, kind, len(payload), 0) + payload)
+        except OSError as error:
+            raise DoorError(self._last_words() or f"the connection is gone: {error}") from None
+
+    def expect(self, kind: int) -> bytes:
+        """The payload of the door's next message. Raises DoorError where that is an error."""
+        _, _, answer, length, _ = struct.unpack("<4sHHII", self._read(16))
+        payload = self._read(length)
+        if answer != kind:
+            raise DoorError(payload.decode() if answer == ERROR else f"unexpected answer {answer}")
+        return payload
+
+    def _read(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            part = self.socket.recv(size - len(data))
+            if not part:
+                raise DoorError("the door has closed the connection")
+            data += part
+        return data
+
+    def _last_words(self) -> str | None:
+        try:
+            return self.expect(ERROR).decode()
+        except (DoorError, OSError):
+            return None
+
+
+def _frame(
+    number: int,
+    state: int,
+    timestamp: float,
+    T_camera_world: NDArray[np.float64] | None,
+    points: tuple[NDArray, NDArray, NDArray],
+    image: bytes,
+) -> bytes:
+    xyz, pixels, ids = points
+    table = np.zeros(len(ids), dtype=[("id", "<i8"), ("xyz", "<f8", 3), ("pixel", "<f8", 2)])
+    table["id"], table["xyz"], table["pixel"] = ids, xyz, pixels
+    T = NOWHERE if T_camera_world is None else T_camera_world
+    head = struct.pack(
+        "<IId16dII", number, state, timestamp, *np.asarray(T, dtype=np.float64).ravel(), len(ids), len(image)
+    )
+    return head + table.tobytes() + image
+
+
+def _connected(address: str, deadline: float) -> socket.socket:
+    while True:
+        try:
+            if "/" in address or os.path.exists(address):
+                connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+                connection.connect(address)
+                return connection
+            host, _, port = address.rpartition(":")
+            return socket.create_connection((host.strip("[]"), int(port)))
+        except OSError as error:
+            if time.monotonic() > deadline:
+                raise DoorError(f"{address}: nobody listens there: {error}") from None
+            time.sleep(0.2)
+
+
+def play(
+    scene: Path, overrides: Sequence[str], address: str, wait: float, late: int = 0, rate: float | None = None
+) -> int:
+    """Send the scene's frames as its tracker delivers them; how many the door took.
+
+    address, wait: see `Sender`. late: frames after which a frame's pose and points follow it; 0 sends them with it.
+    rate: frames a second at most.
+    """
+    from fields.backend import initialise
+    from fields.pose_correction import PoseCorrection
+    from modp_ti.config import load_scene
+    from modp_ti.trackers import close, events, open_tracker
+
+    config = load_scene(scene, overrides)
+    initialise("cpu", config.threads, config.seed)  # the demo's frames are rendered
+    tracker = open_tracker(config)
+    waiting: deque = deque()
+    next_time = time.monotonic()
+    sender: Sender | None = None
+    try:
+        for event in events(tracker):
+            if isinstance(event, PoseCorrection):
+                assert sender is not None, "frames come before their corrections"
+                for each in waiting:  # the frames that it revises need poses first
+                    _send_pose(sender, each)
+                waiting.clear()
+                sender.correction(event.index, event.T_camera_world, event.ids, event.xyz)
+                continue
+            if sender is None:  # not before there is something to say: who connects and is silent is let go
+                camera = c = event.camera
+                sender = Sender(address, wait)
+                sender.hello(c.width, c.height, (c.fx, c.fy, c.cx, c.cy), RGBA8, name="send_frames")
+            if event.camera != camera:
+                raise DoorError(f"{event.name} has another camera than the first frame: the door takes one")
+            if rate is not None:
+                time.sleep(max(next_time - time.monotonic(), 0.0))
+                next_time = max(next_time + 1.0 / rate, time.monotonic())
+            image = event.rgba.tobytes()
+            if late:
+                sender.frame(event.index, event.timestamp, image)
+                waiting.append(event)
+                if len(waiting) > late:
+                    _send_pose(sender, waiting.popleft())
+            else:
+                sender.frame(event.index, event.timestamp, image, event.T_camera_world, _points(event))
+        for each in waiting:
+            _send_pose(sender, each)
+        return 0 if sender is None else sender.end()
+    finally:
+        close(tracker)
+
+
+def _send_pose(sender: Sender, frame) -> None:
+    sender.pose(frame.index, frame.T_camera_world, _points(frame))
+
+
+def _points(frame) -> tuple[NDArray, NDArray, NDArray]:
+    return frame.points.xyz, frame.points.pixels, frame.points.ids
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, help="scene file whose frames are sent, whatever its tracker")
+    parser.add_argument("--to", default="127.0.0.1:7007", metavar="ADDRESS", help="host:port, or a Unix socket's path")
+    parser.add_argument("--late", type=int, default=0, metavar="N", help="send each pose and its points N frames late")
+    parser.add_argument("--rate", type=float, metavar="FPS", help="frames a second at most")
+    parser.add_argument("--wait", type=float, default=60.0, help="seconds in which the run may still start to listen")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override of the scene file")
+    arguments = parser.parse_args()
+    from modp_ti.errors import InputError
+
+    try:
+        taken = play(arguments.scene, arguments.set, arguments.to, arguments.wait, arguments.late, arguments.rate)
+    except (DoorError, InputError) as error:
+        sys.exit(f"error: {error}")
+    print(f"{taken} frames taken")
+
+
+if __name__ == "__main__":
+    main()
