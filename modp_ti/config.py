@@ -92,6 +92,16 @@ class TrackerSettings(StrictModel):
     exposure_change: float = Field(
         0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
     )
+    drift: float = Field(
+        0.0,
+        ge=0,
+        le=0.5,
+        description="`synthetic` only: the camera walks in a loop, at whose end the world is off by this: shift in "
+        "scene depths, turn in radians, scale by its exponential",
+    )
+    correction: bool = Field(
+        False, description="`synthetic` only: where the loop closes, the tracker corrects all that has drifted"
+    )
 
 
 class EvaluationSettings(StrictModel):
@@ -126,8 +136,9 @@ class SceneConfig(StrictModel):
     def _images_are_named(self) -> SceneConfig:
         if self.source.path is None and self.tracker.kind != "synthetic":
             raise ValueError("source.path is missing: give the folder that holds the images")
-        if self.tracker.exposure_change and self.tracker.kind != "synthetic":
-            raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
+        for key in ("exposure_change", "drift", "correction"):
+            if getattr(self.tracker, key) and self.tracker.kind != "synthetic":
+                raise ValueError(f"tracker.{key} is for tracker.kind: synthetic alone; take it out")
         return self
 
 
