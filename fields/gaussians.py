@@ -6,11 +6,12 @@ from numpy.typing import NDArray
 
 from fields.backend import growing, refuse_too_many_fields
 
-__all__ = ["SH_C0", "GaussianField"]
+__all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
 
 # The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[0].
 SH_C0 = 0.28209479177387814
 BLOCK = 1024
+NO_ANCHOR = -1
 
 
 @ti.data_oriented
@@ -23,7 +24,8 @@ class GaussianField:
 
     position (3), log_scale (3), quaternion (4; w, x, y, z, any length but zero), opacity_logit (1),
     sh (K, 3) with K = (sh_degree + 1)^2 coefficients: the layout of 3DGS files. `steps` counts the updates that
-    a Gaussian has had. 232 bytes per Gaussian at degree 0 in float32.
+    a Gaussian has had; `anchor` is the number of the view that placed it, NO_ANCHOR where nobody has said.
+    236 bytes per Gaussian at degree 0 in float32.
     """
 
     def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:
@@ -44,6 +46,7 @@ class GaussianField:
         self.opacity_logit_m, self.opacity_logit_v = ti.field(real), ti.field(real)
         self.sh, self.sh_m, self.sh_v = vector(3, True), vector(3), vector(3)
         self.steps = ti.field(ti.i32)
+        self.anchor = ti.field(ti.i32)
         self.touched = ti.field(ti.i32)
 
         builder = ti.FieldsBuilder()
@@ -59,7 +62,7 @@ class GaussianField:
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh)
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
-        blocks.dense(ti.i, BLOCK).place(self.steps, self.touched)
+        blocks.dense(ti.i, BLOCK).place(self.steps, self.anchor, self.touched)
         builder.finalize()
         refuse_too_many_fields(self.touched)
 
@@ -75,10 +78,11 @@ class GaussianField:
         quaternion: NDArray,
         opacity_logit: NDArray,
         sh: NDArray,
+        anchor: int = NO_ANCHOR,
     ) -> None:
         """Add N Gaussians: position (N, 3), log_scale (N, 3), quaternion (N, 4), opacity_logit (N,), sh (N, K, 3).
 
-        Gradients, moments and step counts of the new ones are zero.
+        Gradients, moments and step counts of the new ones are zero. anchor: of all of them.
         Raises ValueError naming the first Gaussian that holds NaN, infinity or a zero quaternion, or where the
         shapes disagree or the pool is full.
         """
@@ -99,7 +103,7 @@ class GaussianField:
         if self.count + n > self.capacity:
             raise ValueError(f"{self.count + n} Gaussians exceed the pool of {self.capacity}; raise max_gaussians")
         if n:
-            self._write(self.count, *arrays)
+            self._write(self.count, anchor, *arrays)
             self.count += n
 
     def remove(self, keep: NDArray[np.bool_]) -> int:
@@ -125,6 +129,13 @@ class GaussianField:
         """Values of all Gaussians by name: position (N, 3), log_scale, quaternion, opacity_logit (N,), sh (N, K, 3)."""
         return self._to_numpy([getattr(self, name) for name in _NAMES])
 
+    def anchors(self) -> NDArray[np.int32]:
+        """The anchor of every Gaussian (N,)."""
+        out = np.zeros(self.count, dtype=np.int32)
+        if self.count:
+            self._read_anchors(out)
+        return out
+
     def gradients_to_numpy(self) -> dict[str, NDArray]:
         """Gradients of all Gaussians, by the names and shapes of `to_numpy`."""
         return self._to_numpy([getattr(self, name).grad for name in _NAMES])
@@ -137,7 +148,7 @@ class GaussianField:
         return dict(zip(_NAMES, arrays, strict=True))
 
     def load(self, state: dict[str, NDArray]) -> None:
-        """Replace the content by the values of `state`, as `to_numpy` gives them.
+        """Replace the content by the values of `state`, as `to_numpy` gives them; they have no anchors.
 
         Raises as `append` does, the content then being what it was.
         """
@@ -195,6 +206,7 @@ class GaussianField:
     def _write(
         self,
         first: ti.i32,
+        anchor: ti.i32,
         position: ti.types.ndarray(),
         log_scale: ti.types.ndarray(),
         quaternion: ti.types.ndarray(),
@@ -213,6 +225,12 @@ class GaussianField:
                 for c in ti.static(range(3)):
                     self.sh[i, k][c] = sh[j, k, c]
             self._forget(i)
+            self.anchor[i] = anchor
+
+    @ti.kernel
+    def _read_anchors(self, out: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+        for i in range(out.shape[0]):
+            out[i] = self.anchor[i]
 
     @ti.kernel
     def _read(
@@ -262,6 +280,7 @@ class GaussianField:
                 self.sh_m[t, k] = self.sh_m[s, k]
                 self.sh_v[t, k] = self.sh_v[s, k]
             self.steps[t] = self.steps[s]
+            self.anchor[t] = self.anchor[s]
 
 
 _NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")

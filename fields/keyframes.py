@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from fields.pyramid import ImageLevel
 from fields.running_median import RunningMedian
-from fields.se3 import interpolate_se3, inverse_se3
+from fields.se3 import interpolate_se3, inverse_se3, orthonormalised
+from fields.similarity import moved_points, scale_of
 from fields.tracked_frame import SparsePoints, TrackedFrame
 
 __all__ = ["Keyframe", "KeyframeStore"]
@@ -27,7 +28,8 @@ class Keyframe:
     median_depth: of its tracked points [scene units]; view_scale:
     median_depth / focal, the width of a pixel out there (Section 3.2.1). error: mean absolute error when the frame was
     optimised last (err(j) of Eq. 2). vignette: as in `TrackedFrame`, at full size. exposure: (3, 4) affine colour
-    transform (A, b), image = (A colour + b) vignette; None for an identity that is not estimated.
+    transform (A, b), image = (A colour + b) vignette; None for an identity that is not estimated. lag: the motion
+    (4, 4) of the world around it, by corrections of the tracker, that its Gaussians have not followed yet.
     """
 
     index: int
@@ -47,6 +49,7 @@ class Keyframe:
     exposure_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 4)))
     exposure_v: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 4)))
     exposure_steps: int = 0
+    lag: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
     @property
     def view_scale(self) -> float:
@@ -67,6 +70,35 @@ class Keyframe:
     def correction(self) -> NDArray[np.float64]:
         """The motion (4, 4) that refinement has put on the left of the tracked pose."""
         return self.T_camera_world @ inverse_se3(self.T_tracked)
+
+    def revise(self, T_tracked: NDArray[np.float64], S: NDArray[np.float64]) -> None:
+        """Take over the tracker's revised pose (4, 4), S_after_before (4, 4) being how the world around it moves.
+
+        What refinement has put on the tracked pose stays on it, at the scale of S, and so do Adam's moments, which are
+        in pixels of this camera. The tracked points and their depths move with the world.
+        """
+        if np.array_equal(S, np.eye(4)) and np.array_equal(T_tracked, self.T_tracked):
+            return
+        correction = self.correction
+        correction[:3, 3] *= scale_of(S)
+        unrefined = np.array_equal(self.T_camera_world, self.T_tracked)
+        self.T_tracked = T_tracked.copy()
+        self.T_camera_world = T_tracked.copy() if unrefined else orthonormalised(correction @ T_tracked)
+        self.points = replace(self.points, xyz=moved_points(S, self.points.xyz))
+        self.median_depth *= float(scale_of(S))
+        self.lag = S @ self.lag
+
+    def revise_points(self, points: SparsePoints) -> None:
+        """Take over the tracker's revised points."""
+        self.points = points
+        self.median_depth = _median_depth(points, self.T_tracked, self.median_depth)
+
+
+def _median_depth(points: SparsePoints, T_camera_world: NDArray[np.float64], otherwise: float) -> float:
+    """Median depth of the points before the camera; `otherwise` where there are none."""
+    depth = points.depths(T_camera_world)
+    depth = depth[depth > 0]
+    return float(np.median(depth)) if len(depth) else otherwise
 
 
 class KeyframeStore:
@@ -111,10 +143,14 @@ class KeyframeStore:
         self._depths.add(keyframe.median_depth)
         return keyframe
 
+    def take_in_depths(self) -> None:
+        """Bring the scene's depth up to date with keyframes whose median depths have changed."""
+        self._depths = RunningMedian()
+        for keyframe in self._keyframes:
+            self._depths.add(keyframe.median_depth)
+
     def view(self, frame: TrackedFrame, levels: int = 1) -> Keyframe:
         """`frame` as a keyframe would be, with the pose and exposure that those around it imply, but not kept."""
-        depth = frame.points.depths(frame.T_camera_world)
-        depth = depth[depth > 0]
         return Keyframe(
             index=frame.index,
             rgba=frame.rgba,
@@ -122,7 +158,7 @@ class KeyframeStore:
             T_tracked=frame.T_camera_world.copy(),
             T_camera_world=self.corrected(frame.index, frame.T_camera_world),
             points=frame.points,
-            median_depth=float(np.median(depth)) if len(depth) else self.scene_depth,
+            median_depth=_median_depth(frame.points, frame.T_camera_world, self.scene_depth),
             error=float(self.errors().mean()) if self._keyframes else 1.0,
             vignette=frame.vignette,
             exposure=self.exposure_at(frame.index),

@@ -80,6 +80,10 @@ class OccupancyVoxels:
         self.coarsest = float(coarsest)
         self.origin = np.array(origin, dtype=np.float64)
 
+    def clear(self) -> None:
+        """Forget all marks. The memory of the places stays, for those around them."""
+        self._clear()
+
     def level_of(self, size: ArrayLike) -> NDArray[np.int32]:
         """The finest level whose cells are at least `size` wide; 0, the coarsest, for sizes beyond all of them."""
         size = np.maximum(np.asarray(size, dtype=np.float64), 1e-300)
@@ -155,6 +159,11 @@ class OccupancyVoxels:
         np.fmin(np.fmax(cells, -FARTHEST, out=cells), FARTHEST, out=cells)
         level = np.broadcast_to(self.level_of(size), len(cells))
         return cells.astype(np.int32), np.ascontiguousarray(level)
+
+    @ti.kernel
+    def _clear(self):
+        for place in ti.grouped(self.words):
+            self.words[place] = ti.u64(0)
 
     @ti.kernel
     def _query(self, cells: CELLS, level: LEVELS, out: FLAGS):

@@ -227,6 +227,16 @@ class TrackerSettings(StrictModel):
     exposure_change: float = Field(
         0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
     )
+    drift: float = Field(
+        0.0,
+        ge=0,
+        le=0.5,
+        description="`synthetic` only: the camera walks in a loop, at whose end the world is off by this: shift in "
+        "scene depths, turn in radians, scale by its exponential",
+    )
+    correction: bool = Field(
+        False, description="`synthetic` only: where the loop closes, the tracker corrects all that has drifted"
+    )
 
 
 class EvaluationSettings(StrictModel):
@@ -282,8 +292,9 @@ class SceneConfig(StrictModel):
             raise ValueError("tracker.address is for tracker.kind: socket alone; take it out")
         if self.tracker.address is not None and self.tracker.path is not None:
             raise ValueError("tracker.address and tracker.path both say where to listen: take one out")
-        if self.tracker.exposure_change and self.tracker.kind != "synthetic":
-            raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
+        for key in ("exposure_change", "drift", "correction"):
+            if getattr(self.tracker, key) and self.tracker.kind != "synthetic":
+                raise ValueError(f"tracker.{key} is for tracker.kind: synthetic alone; take it out")
         return self
 
 

@@ -6,13 +6,16 @@ from collections.abc import Iterable, Iterator
 from queue import SimpleQueue
 from threading import Semaphore, Thread
 
+from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 
 __all__ = ["FramesAhead"]
 
 
-class FramesAhead(Iterator[TrackedFrame]):
+class FramesAhead(Iterator[TrackedFrame | PoseCorrection]):
     """The frames of `frames` in their order, up to `ahead` of them read and their pyramids built before they are due.
+
+    Corrections of poses come in their places between them; one counts as a frame.
 
     One thread reads. Taichi's kernels hold Python's lock while they run; OpenCV and NumPy, which do nearly all of
     decoding, undistorting and resizing, give it up and so work beside them. An error of `frames` is raised at the frame
@@ -21,9 +24,9 @@ class FramesAhead(Iterator[TrackedFrame]):
     A context manager: leaving it ends the thread, once the frame that it is at is read.
     """
 
-    def __init__(self, frames: Iterable[TrackedFrame], ahead: int) -> None:
+    def __init__(self, frames: Iterable[TrackedFrame | PoseCorrection], ahead: int) -> None:
         self._frames = iter(frames)
-        self._ready: SimpleQueue[TrackedFrame | BaseException] = SimpleQueue()
+        self._ready: SimpleQueue[TrackedFrame | PoseCorrection | BaseException] = SimpleQueue()
         self._free = Semaphore(ahead)  # frames that may still be read ahead
         self._end: BaseException | None = None
         self._closed = False
@@ -32,7 +35,7 @@ class FramesAhead(Iterator[TrackedFrame]):
         if self._thread is not None:
             self._thread.start()
 
-    def __next__(self) -> TrackedFrame:
+    def __next__(self) -> TrackedFrame | PoseCorrection:
         if self._thread is None:
             return next(self._frames)
         if self._end is not None:
@@ -59,9 +62,10 @@ class FramesAhead(Iterator[TrackedFrame]):
             if self._closed:
                 return
             try:
-                frame = next(self._frames)
-                _ = frame.pyramid  # kept by the frame, for the mapper
+                item = next(self._frames)
+                if isinstance(item, TrackedFrame):
+                    _ = item.pyramid  # kept by the frame, for the mapper
             except BaseException as error:  # StopIteration too: whatever ends the frames comes after the last of them
                 self._ready.put(error)
                 return
-            self._ready.put(frame)
+            self._ready.put(item)

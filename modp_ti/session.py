@@ -20,6 +20,7 @@ from rich.console import Console
 
 from fields.backend import describe, initialise
 from fields.camera import PinholeCamera
+from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import SceneConfig, dump_scene
 from modp_ti.errors import InputError
@@ -33,11 +34,12 @@ from modp_ti.lpips import open_lpips
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
 from modp_ti.tracked_points import TrackedPoints
-from modp_ti.trackers import close, frame_count, may_read_ahead, open_tracker
+from modp_ti.trackers import close, events, frame_count, may_read_ahead, open_tracker
+from pipelines.corrections import WorldMotion
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
-from pipelines.stopwatch import breakdown_percent
+from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
 
@@ -48,7 +50,10 @@ MAPS = ("online", "refined", "offline")
 
 @dataclass
 class Poses:
-    """What is kept of every frame: its name, time, camera and pose, and the points that it saw."""
+    """What is kept of every frame: its name, time, camera and pose, and the points that it saw.
+
+    corrections: how many came, and how many of them moved the map.
+    """
 
     name: list[str] = field(default_factory=list)
     camera: list[PinholeCamera] = field(default_factory=list)
@@ -56,6 +61,7 @@ class Poses:
     index: list[int] = field(default_factory=list)
     timestamp: list[float] = field(default_factory=list)
     tracked: list[NDArray[np.float64]] = field(default_factory=list)
+    corrections: dict[str, int] = field(default_factory=lambda: {"received": 0, "moved": 0})
 
     def add(self, frame: TrackedFrame) -> None:
         self.name.append(frame.name)
@@ -64,6 +70,12 @@ class Poses:
         self.index.append(frame.index)
         self.timestamp.append(frame.timestamp)
         self.tracked.append(frame.T_camera_world)
+
+    def correct(self, correction: PoseCorrection, motion: WorldMotion) -> None:
+        """Take over the poses that the tracker names; the other frames go with the world around them."""
+        named = {int(i): T for i, T in zip(correction.index, correction.T_camera_world, strict=True)}
+        for n, index in enumerate(self.index):
+            self.tracked[n] = named[index] if index in named else motion.of(index, self.tracked[n])[0]
 
 
 def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
@@ -89,10 +101,12 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     tracker = open_tracker(config, line.prepare)
     held.callback(close, tracker)
     ahead = config.source.prefetch if may_read_ahead(tracker) else 0
-    with FramesAhead(tracker, ahead) as frames:
+    with FramesAhead(events(tracker), ahead) as frames:
         first = next(frames, None)
         if first is None:
             raise InputError("the tracker delivered no frame: nothing to map")
+        if isinstance(first, PoseCorrection):
+            raise InputError("the tracker corrects poses before its first frame")
         prepared = time.perf_counter() - tick
         lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
         said = len(tracker.notes)
@@ -150,6 +164,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         metrics = {
             "frames": len(poses.index),
             "keyframes": len(mapper.keyframes),
+            "corrections": poses.corrections,
             "gaussians": len(mapper.gaussians),
             "backend": backend,
             "seed": config.seed,
@@ -189,11 +204,16 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | O
         raise InputError(str(error)) from None
 
 
-def _map(mapper: OnlineMapper | OfflineMapper, frames: Iterable[TrackedFrame], line: ProgressLine) -> Poses:
-    """Take all frames in, and finish the map; their poses."""
+def _map(
+    mapper: OnlineMapper | OfflineMapper, frames: Iterable[TrackedFrame | PoseCorrection], line: ProgressLine
+) -> Poses:
+    """Take all frames and corrections in, in their order, and finish the map; the frames' poses."""
     poses, size = Poses(), None
     try:
         for frame in frames:
+            if isinstance(frame, PoseCorrection):
+                _correct(mapper, frame, poses)
+                continue
             size = size or (frame.camera.width, frame.camera.height)
             if (frame.camera.width, frame.camera.height) != size:
                 raise InputError(
@@ -209,6 +229,18 @@ def _map(mapper: OnlineMapper | OfflineMapper, frames: Iterable[TrackedFrame], l
     finally:
         line.stop()
     return poses
+
+
+def _correct(mapper: OnlineMapper | OfflineMapper, correction: PoseCorrection, poses: Poses) -> None:
+    """Revise poses and map."""
+    if correction.index[-1] > poses.index[-1]:
+        raise InputError(
+            f"the tracker corrects frame {correction.index[-1]} after frame {poses.index[-1]}, before it has come"
+        )
+    report = mapper.correct(correction)
+    poses.correct(correction, report.motion)
+    poses.corrections["received"] += 1
+    poses.corrections["moved"] += report.moved
 
 
 def _version(mapper: OnlineMapper | OfflineMapper, poses: Poses) -> MapVersion:
@@ -231,8 +263,10 @@ def _optimise_offline(mapper: OfflineMapper, line: ProgressLine) -> None:
     mapper.optimise(line.optimised)
 
 
-def _timed(frames: Iterator[TrackedFrame], watch) -> Iterator[TrackedFrame]:
-    """The frames, the time that the mapper waits for each counted as reading."""
+def _timed(
+    frames: Iterator[TrackedFrame | PoseCorrection], watch: Stopwatch
+) -> Iterator[TrackedFrame | PoseCorrection]:
+    """The frames and corrections, the time that the mapper waits for each counted as reading."""
     while True:
         with watch.measure("read"):
             frame = next(frames, None)

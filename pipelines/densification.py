@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.gaussians import SH_C0, GaussianField
+from fields.gaussians import NO_ANCHOR, SH_C0, GaussianField
 from fields.keyframes import Keyframe
 from fields.occupancy import OccupancyVoxels
 from fields.se3 import inverse_se3
@@ -112,8 +112,12 @@ def grow(
     voxels: OccupancyVoxels | None,
     target: float,
     settings: DensifySettings,
+    anchor: int = NO_ANCHOR,
 ) -> int:
-    """Add isotropic Gaussians at the seeds that the voxels admit at spacing `target` [scene units]; return how many."""
+    """Add isotropic Gaussians at the seeds that the voxels admit at spacing `target` [scene units]; return how many.
+
+    anchor: of the new ones, see `GaussianField`.
+    """
     if voxels is not None:
         seeds = seeds[voxels.admit(seeds.xyz, target)]
     seeds = seeds[np.arange(len(seeds)) < gaussians.capacity - gaussians.count]
@@ -127,5 +131,6 @@ def grow(
         quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
         opacity_logit=np.full(n, np.log(settings.initial_opacity / (1.0 - settings.initial_opacity))),
         sh=sh,
+        anchor=anchor,
     )
     return n

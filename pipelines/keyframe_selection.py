@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from fields.camera import PinholeCamera
 from fields.keyframes import Keyframe
 from fields.se3 import inverse_se3
 from fields.tracked_frame import TrackedFrame
+from pipelines.corrections import WorldMotion
 from pipelines.settings import KeyframeSettings
 from pipelines.sharpness import sharpness
 
@@ -80,6 +81,12 @@ class KeyframeSelector:
         if moved > self.settings.baseline * last.median_depth:
             return True
         return covisibility(SeenPoints.of(frame), SeenPoints.of(last)) < self.settings.covisibility
+
+    def correct(self, motion: WorldMotion) -> None:
+        """The tracker has revised its poses: that of the latest frame as well."""
+        if self._previous is not None:
+            T, _ = motion.of(self._previous.index, self._previous.T_camera_world)
+            self._previous = replace(self._previous, T_camera_world=T)
 
     def _is_blurred(self, frame: TrackedFrame, last: Keyframe) -> bool:
         return sharpness(frame.rgba) < self.settings.min_sharpness * sharpness(last.rgba)

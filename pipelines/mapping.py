@@ -5,22 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
+from fields.gaussian_motion import GaussianMotion
 from fields.gaussians import GaussianField
 from fields.keyframes import Keyframe, KeyframeStore
 from fields.occupancy import OccupancyVoxels
+from fields.pose_correction import PoseCorrection
 from fields.se3 import inverse_se3
+from fields.similarity import moved_points, scale_of
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from pipelines.contribution import Contribution
+from pipelines.corrections import CorrectionReport, lag_in_pixels, revise
 from pipelines.densification import dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.depth import DepthEstimator, build_depth
 from pipelines.keyframe_selection import KeyframeSelector
 from pipelines.optimisation import MapOptimiser
 from pipelines.rendering import Renderer
 from pipelines.settings import MappingSettings
+from pipelines.spherical_harmonics import sh_rotation
 from pipelines.stopwatch import Stopwatch
-from pipelines.view_selection import LocalGlobalViews, ViewSelection
+from pipelines.view_selection import LocalGlobalViews, ViewSelection, global_probabilities
 
 __all__ = ["FrameReport", "OnlineMapper"]
 
@@ -39,11 +45,22 @@ class FrameReport:
     psnr: float | None
 
 
+@dataclass
+class Anchor:
+    """A view that placed Gaussians: the keyframe that they move with, and the spacing asked for [scene units]."""
+
+    keyframe: Keyframe
+    spacing: float
+
+
 class OnlineMapper:
     """Turns a stream of `TrackedFrame`s into a Gaussian map while they arrive.
 
     Images may have any size up to `max_width` x `max_height`. Depth estimation and view selection can be replaced by
     any object of their Protocols.
+
+    Gaussians know the view that placed them (`GaussianField.anchor`, a place in `anchors`), and follow when the tracker
+    corrects its pose.
     """
 
     def __init__(
@@ -69,6 +86,9 @@ class OnlineMapper:
         self.selector = KeyframeSelector(settings.keyframes)
         self.depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
+        self.motion = GaussianMotion(self.gaussians)
+        self.anchors: list[Anchor] = []
+        self._tracked: dict[int, NDArray[np.float64]] = {}  # the tracker's pose of every frame so far
         self._frames = 0
 
     @property
@@ -83,6 +103,7 @@ class OnlineMapper:
         if frame.held_out:
             raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
         self._frames += 1
+        self._tracked[frame.index] = frame.T_camera_world
         if self._frames % self.settings.densify.prune_every == 0:
             self.prune()
         with self.stopwatch.measure("select"):
@@ -101,6 +122,66 @@ class OnlineMapper:
             # Other frames only bring their points, at the pose that the keyframes around them imply.
             self._add(self.keyframes.view(frame), compensate=False)
         return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr)
+
+    def correct(self, correction: PoseCorrection) -> CorrectionReport:
+        """Take over poses and points that the tracker has revised; Gaussians follow the views that placed them.
+
+        They do once a keyframe's picture would be off by more than `min_pixels` otherwise. The voxels are then marked
+        anew, and some steps on the keyframes that have moved mend the seams.
+        """
+        settings = self.settings.corrections
+        with self.stopwatch.measure("correct"):
+            self.optimiser.settle()
+            motion = revise(self.keyframes, self._tracked, correction)
+            self._tracked = {index: motion.of(index, T)[0] for index, T in self._tracked.items()}
+            self.selector.correct(motion)
+            lags = np.array([lag_in_pixels(view) for view in self.keyframes])
+            if not (settings.enabled and (lags > settings.min_pixels).any()):
+                return CorrectionReport(motion, moved=False)
+            self._follow()
+        with self.stopwatch.measure("optimise"):
+            self._mend(np.flatnonzero(lags > 0))
+        return CorrectionReport(motion, moved=True)
+
+    def _follow(self) -> None:
+        """Move Gaussians and voxels as the keyframes that anchor them have moved."""
+        first = self.keyframes[0].lag
+        turns = {
+            view.index: sh_rotation(self.gaussians.sh_degree, view.lag[:3, :3] / scale_of(view.lag))
+            for view in self.keyframes
+        }
+        if self.anchors:
+            S = np.stack([anchor.keyframe.lag for anchor in self.anchors])
+            self.motion.move(S, np.stack([turns[anchor.keyframe.index] for anchor in self.anchors]))
+        for anchor in self.anchors:
+            anchor.spacing *= float(scale_of(anchor.keyframe.lag))
+        if self.voxels is not None:
+            origin = moved_points(first, self.voxels.origin[None])[0]
+            self.voxels.clear()
+            self.voxels.settle(self.voxels.coarsest * float(scale_of(first)), origin)
+            self._mark()
+        for view in self.keyframes:
+            view.lag = np.eye(4)
+
+    def _mark(self) -> None:
+        """Mark the voxels of all Gaussians, each to the level that its view had asked for."""
+        anchor = self.gaussians.anchors()
+        spacing = np.array([a.spacing for a in self.anchors] + [self.voxels.coarsest])[anchor]  # -1: the coarsest
+        position = self.gaussians.to_numpy()["position"]
+        order = np.argsort(spacing, kind="stable")  # a GPU takes the places of one level together
+        self.voxels.update(position[order], spacing[order])
+
+    def _mend(self, moved: NDArray[np.int64]) -> None:
+        """Optimise the map for the keyframes that have moved."""
+        settings, views = self.settings.corrections, self.settings.views
+        if len(self.gaussians) == 0:
+            return
+        for _ in range(settings.steps):
+            p = global_probabilities(self.keyframes, views.error_weight, 0.0)[moved]
+            batch = [int(j) for j in self.rng.choice(moved, settings.views, p=p / p.sum())]
+            rates = self.optimiser.rates(self.keyframes.scene_depth)
+            self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
+        self.optimiser.settle()
 
     def finish(self) -> float | None:
         """After the last frame: more steps on the last keyframe, and a last removal of transparent Gaussians."""
@@ -145,6 +226,7 @@ class OnlineMapper:
 
     def _add(self, view: Keyframe, compensate: bool) -> None:
         """Densify from one view: tracked points, then pixels of high error, each filtered by the voxels."""
+        self.anchors.append(Anchor(self.keyframes[-1], self.settings.voxels.target * view.view_scale))
         self._grow(tracked_seeds(view), view)
         if not compensate:
             return
@@ -169,7 +251,8 @@ class OnlineMapper:
             if self.voxels is not None and len(self.gaussians) == 0:
                 centre = inverse_se3(view.T_camera_world)[:3, 3]
                 self.voxels.settle(v.coarsest * view.view_scale, centre)
-            grow(self.gaussians, seeds, self.voxels, v.target * view.view_scale, self.settings.densify)
+            spacing = self.anchors[-1].spacing
+            grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, len(self.anchors) - 1)
 
     # ---- compiling -------------------------------------------------------------------------------------------
 
@@ -197,5 +280,10 @@ class OnlineMapper:
             self.renderer.images.clip_colour()
             self.renderer.images.colour_to_numpy()
             self.gaussians.to_numpy()
+            self.gaussians.anchors()
+            if self.settings.corrections.enabled:
+                self.motion.move(np.eye(4)[None], np.eye(self.gaussians.sh_count)[None])
+                if self.voxels is not None:
+                    self.voxels.clear()
             self.renderer.view_renders = 0
             self.gaussians.remove(np.zeros(len(self.gaussians), dtype=bool))

@@ -10,10 +10,12 @@ import numpy as np
 from fields.camera import PinholeCamera
 from fields.gaussians import GaussianField
 from fields.keyframes import Keyframe, KeyframeStore
+from fields.pose_correction import PoseCorrection
 from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from pipelines.adam import Adam, LearningRates
 from pipelines.adaptive_density import AdaptiveDensity
+from pipelines.corrections import CorrectionReport, revise
 from pipelines.gpu.losses import photometric_loss
 from pipelines.losses import LossValues
 from pipelines.mapping import FrameReport
@@ -125,6 +127,11 @@ class OfflineMapper:
             raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
         self.keyframes.append(frame)
         return FrameReport(frame.index, True, len(self.keyframes), 0, None)
+
+    def correct(self, correction: PoseCorrection) -> CorrectionReport:
+        """Take over revised poses and points; the map, which is made afterwards, has them from the start."""
+        motion = revise(self.keyframes, {view.index: view.T_tracked for view in self.keyframes}, correction)
+        return CorrectionReport(motion, moved=False)
 
     def initialise(self) -> None:
         """Begin the map with the tracked points of the frames so far. Raises ValueError where they are too few."""

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from fields.pyramid import MAX_LEVELS
 
 __all__ = [
+    "CorrectionSettings",
     "DensifySettings",
     "DepthSettings",
     "EpipolarSettings",
@@ -160,6 +161,21 @@ class PoseSettings(StrictModel):
     align: bool = Field(True, description="first move a new keyframe to where its tracked points project rightly")
 
 
+class CorrectionSettings(StrictModel):
+    """What a tracker's corrections of former poses (bundle adjustment, closed loops) do to the map."""
+
+    enabled: bool = Field(
+        True, description="Gaussians follow the frames that placed them; without, corrections change poses alone"
+    )
+    min_pixels: float = Field(
+        0.5,
+        ge=0,
+        description="displacement of a keyframe's picture beyond which they do [px]; smaller ones add up until then",
+    )
+    steps: int = Field(10, ge=0, description="optimisation steps on keyframes that have moved, after Gaussians have")
+    views: int = Field(4, ge=1, description="such keyframes per step, drawn as the global views are")
+
+
 class LevelSettings(StrictModel):
     """Image pyramid: the level that a new keyframe is optimised and densified on."""
 
@@ -230,6 +246,7 @@ class MappingSettings(StrictModel):
     levels: LevelSettings = LevelSettings()
     views: ViewSettings = ViewSettings()
     poses: PoseSettings = PoseSettings()
+    corrections: CorrectionSettings = CorrectionSettings()
     exposure: ExposureSettings = ExposureSettings()
     optimise: OptimiseSettings = OptimiseSettings()
 

@@ -7,19 +7,21 @@ from typing import TYPE_CHECKING
 
 from modp_ti.errors import InputError
 from modp_ti.synthetic.light import LightChange
-from modp_ti.synthetic.simulated_tracker import FRAMES, SMALLEST, SyntheticTracker, TrackerNoise
+from modp_ti.synthetic.loop import Loop
+from modp_ti.synthetic.simulated_tracker import FRAMES, LOOP_FRAMES, SMALLEST, SyntheticTracker, TrackerNoise
 
 if TYPE_CHECKING:
     from modp_ti.config import SourceSettings, TrackerSettings
 
-__all__ = ["LightChange", "SyntheticTracker", "TrackerNoise", "open_synthetic"]
+__all__ = ["LightChange", "Loop", "SyntheticTracker", "TrackerNoise", "open_synthetic"]
 
 WIDTH, HEIGHT = 320, 240  # [px] at scale 1
 
 
 def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> SyntheticTracker:
-    """The demo sequence. Of `source`, scale, start, stop, step, holdout and fps count; of `tracker` exposure_change.
+    """The demo sequence; with drift or correction the camera walks in a loop.
 
+    Of `source`, scale, start, stop, step, holdout and fps count; of `tracker` exposure_change, drift and correction.
     Raises InputError where the scale leaves no picture or the range no frames, and for masks or a vignette.
     """
     if source.masks is not None or source.mask_colour is not None or source.vignette is not None:
@@ -31,13 +33,17 @@ def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> Syntheti
             f"source.scale {source.scale:g} leaves {width}x{height} pixels of the demo: use {least} or more"
         )
     select = slice(source.start, source.stop, source.step)
-    if not range(FRAMES)[select]:
-        raise InputError(f"source.start {source.start} lies behind the {FRAMES} frames of the demo room")
+    loop = Loop(tracker.drift, tracker.correction) if tracker.drift or tracker.correction else None
+    frames = FRAMES if loop is None else LOOP_FRAMES
+    if not range(frames)[select]:
+        raise InputError(f"source.start {source.start} lies behind the {frames} frames of the demo room")
     return SyntheticTracker(
         width=width,
         height=height,
+        frames=frames,
         select=select,
         holdout=source.holdout or 0,
         fps=source.fps,
         light=LightChange().scaled(tracker.exposure_change),
+        loop=loop,
     )

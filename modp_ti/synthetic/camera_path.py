@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["camera_path", "look_at"]
+__all__ = ["LOOP_CLOSES", "camera_path", "look_at"]
 
 # Eye and target at equal steps of time [m]. The eye always moves sideways while it turns: rotation alone
 # gives no parallax.
@@ -20,6 +20,11 @@ STATIONS = np.array(
         [[-1.00, -0.70, 1.48], [2.00, 0.70, 1.00]],
     ]
 )
+
+# A way there, back a little lower and nearer to the furniture, and on along its beginning.
+BACK = np.array([[0.0, 0.18, -0.14], [0.0, 0.0, 0.0]])
+LOOP = np.concatenate([STATIONS[:5], STATIONS[3:0:-1] + BACK, STATIONS[:2]])
+LOOP_CLOSES = 8 / 9  # where it is at its first station again
 
 # Hand tremor: amplitude, cycles over the whole path and phase of each coordinate, for eye and target.
 TREMOR = 0.012  # [m]
@@ -39,16 +44,20 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
     return transform
 
 
-def camera_path(frames: int) -> list[NDArray[np.float64]]:
-    """T_camera_world (4, 4) in metres of `frames` views at equal steps of time."""
-    return [look_at(*_eye_and_target(t)) for t in np.linspace(0.0, 1.0, frames)]
+def camera_path(frames: int, loop: bool = False) -> list[NDArray[np.float64]]:
+    """T_camera_world (4, 4) in metres of `frames` views at equal steps of time.
+
+    loop: along a way that comes back to its beginning, at the share LOOP_CLOSES of the time.
+    """
+    stations = LOOP if loop else STATIONS
+    return [look_at(*_eye_and_target(stations, t)) for t in np.linspace(0.0, 1.0, frames)]
 
 
-def _eye_and_target(t: float) -> NDArray[np.float64]:
+def _eye_and_target(stations: NDArray[np.float64], t: float) -> NDArray[np.float64]:
     """(2, 3) at time t in [0, 1]: a Catmull-Rom spline through the stations, plus the tremor."""
-    padded = np.concatenate([2 * STATIONS[:1] - STATIONS[1:2], STATIONS, 2 * STATIONS[-1:] - STATIONS[-2:-1]])
-    position = t * (len(STATIONS) - 1)
-    k = min(int(position), len(STATIONS) - 2)
+    padded = np.concatenate([2 * stations[:1] - stations[1:2], stations, 2 * stations[-1:] - stations[-2:-1]])
+    position = t * (len(stations) - 1)
+    k = min(int(position), len(stations) - 2)
     s = position - k
     a, b, c, d = padded[k : k + 4]
     smooth = b + 0.5 * s * (c - a + s * (2 * a - 5 * b + 4 * c - d + s * (3 * (b - c) + d - a)))

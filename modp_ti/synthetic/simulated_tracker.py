@@ -10,15 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
+from fields.pose_correction import PoseCorrection
+from fields.similarity import moved_pose
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.synthetic.camera_path import camera_path
 from modp_ti.synthetic.light import LightChange
+from modp_ti.synthetic.loop import Loop
 from modp_ti.synthetic.renderer import RoomRenderer
 from modp_ti.synthetic.walks import smooth_walks
 
-__all__ = ["FRAMES", "SMALLEST", "SyntheticTracker", "TrackerNoise"]
+__all__ = ["FRAMES", "LOOP_FRAMES", "SMALLEST", "SyntheticTracker", "TrackerNoise"]
 
 FRAMES = 56
+LOOP_FRAMES = 84
 SMALLEST = 32  # [px] least width and height: patches and corners need some room
 
 SCENE_DEPTH = 2.5  # [m] typical distance of the furniture from the camera
@@ -61,7 +65,9 @@ class SyntheticTracker:
     delivered. holdout: frames whose index among the delivered ones is a multiple of it are held out, 0 for
     none. points: wanted number in view. light: what the camera makes of the colours, nothing by default; it
     does not disturb tracking, and frames carry the vignette as those of a calibrated camera do. room: one
-    that is built already; otherwise the first frame builds it.
+    that is built already; otherwise the first frame builds it. loop: the camera comes back to where it began, its
+    poses and points drifting as it says; each frame's points lie where the tracker believes them then. `events` brings
+    the correction as soon as the loop is closed, or after the last frame; iterating afterwards gives what it corrected.
     """
 
     def __init__(
@@ -79,6 +85,7 @@ class SyntheticTracker:
         seed: int = 0,
         light: LightChange | None = None,
         room: RoomRenderer | None = None,
+        loop: Loop | None = None,
     ) -> None:
         if min(width, height) < SMALLEST:
             raise ValueError(f"frames must be at least {SMALLEST} pixels wide and high, got {width}x{height}")
@@ -95,9 +102,11 @@ class SyntheticTracker:
         self._positions = range(frames)[select]
         if not self._positions:
             raise ValueError(f"{select} leaves none of the {frames} frames of the demo room")
-        path = camera_path(frames)
+        path = camera_path(frames, loop=loop is not None)
         self._truth = [path[k] for k in self._positions]
         self._tracked = self._noisy_poses()
+        self._loop = Loop() if loop is None else loop
+        self._shares = [k / max(frames - 1, 1) for k in self._positions]
         light = LightChange.none() if light is None else light
         self._exposures = light.exposures(len(self), np.random.default_rng([seed, 3]))
         self._vignette = light.corner_vignette(width, height)
@@ -129,6 +138,40 @@ class SyntheticTracker:
         return self._render(index)[1]
 
     def __iter__(self) -> Iterator[TrackedFrame]:
+        drifts = not self._loop.corrected
+        return (frame for frame, _ in self._frames([drifts] * len(self)))
+
+    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+        """The frames as they are tracked, with the correction where the loop is closed."""
+        if not self._loop.corrected:
+            yield from self
+            return
+        closed = [self._loop.closed_at(share) for share in self._shares]
+        known = _Landmarks.empty()
+        for index, (frame, landmarks) in enumerate(self._frames([not c for c in closed])):
+            if closed[index] and index > 0 and not closed[index - 1]:
+                yield self._correction(index, known)
+            yield frame
+            known = landmarks
+        if not closed[-1]:
+            yield self._correction(len(self), known)
+
+    def _correction(self, frames: int, known: _Landmarks) -> PoseCorrection:
+        """Poses without drift of the first `frames` frames, and the landmarks where those put them."""
+        return PoseCorrection(
+            index=np.arange(frames),
+            T_camera_world=np.stack([self._in_units(self._tracked[index]) for index in range(frames)]),
+            ids=np.arange(len(known.tracked)),
+            xyz=known.tracked / self.metres_per_unit,
+        )
+
+    def _in_units(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        pose = pose.copy()
+        pose[:3, 3] /= self.metres_per_unit
+        return pose
+
+    def _frames(self, drifts: list[bool]) -> Iterator[tuple[TrackedFrame, _Landmarks]]:
+        """The frames, each with all landmarks that are known by then. drifts: which of them show the drift."""
         known = _Landmarks.empty()
         for index in range(len(self)):
             image, depth = self._render(index)
@@ -143,22 +186,25 @@ class SyntheticTracker:
             rng = np.random.default_rng([self._seed, 2, index])
             observed = pixels + self.noise.pixel * rng.standard_normal(pixels.shape)
             inside = self.camera.contains(observed)
-            tracked = self._tracked[index].copy()
-            tracked[:3, 3] /= self.metres_per_unit
-            yield TrackedFrame(
-                index=index,
-                timestamp=self._positions[index] / self._fps,
-                name=f"room-{self._positions[index]:04d}",
-                image=self._developed(image, index),
-                camera=self.camera,
-                T_camera_world=tracked,
-                points=SparsePoints(
-                    xyz=known.tracked[seen[inside]] / self.metres_per_unit,
-                    pixels=observed[inside],
-                    ids=seen[inside].astype(np.int64),
+            tracked, places = self._tracked[index], known.tracked[seen[inside]]
+            if drifts[index] and self._loop.drift:
+                S = self._loop.drifted_world(self._shares[index], self._truth[0], SCENE_DEPTH)
+                tracked, places = moved_pose(S, tracked), _apply(S, places)
+            yield (
+                TrackedFrame(
+                    index=index,
+                    timestamp=self._positions[index] / self._fps,
+                    name=f"room-{self._positions[index]:04d}",
+                    image=self._developed(image, index),
+                    camera=self.camera,
+                    T_camera_world=self._in_units(tracked),
+                    points=SparsePoints(
+                        xyz=places / self.metres_per_unit, pixels=observed[inside], ids=seen[inside].astype(np.int64)
+                    ),
+                    vignette=self._vignette,
+                    held_out=self._holdout > 0 and index % self._holdout == 0,
                 ),
-                vignette=self._vignette,
-                held_out=self._holdout > 0 and index % self._holdout == 0,
+                known,
             )
 
     def _developed(self, image: NDArray[np.float32], index: int) -> NDArray[np.float32]:

@@ -1,0 +1,141 @@
+"""What a tracker's revised poses mean for the frames that it does not name, for keyframes, and for the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.keyframes import Keyframe, KeyframeStore
+from fields.pose_correction import PoseCorrection
+from fields.se3 import interpolate_se3, inverse_se3, orthonormalised
+from fields.similarity import motion_around, moved_points, moved_pose, scale_of
+from fields.tracked_frame import SparsePoints
+
+__all__ = ["CorrectionReport", "WorldMotion", "lag_in_pixels", "revise"]
+
+# Moved points that tell a keyframe's change of scale.
+MIN_POINTS = 10
+
+
+@dataclass(frozen=True)
+class WorldMotion:
+    """How a correction moves frames and the world around them.
+
+    index: (N,) of the named frames whose former pose is known, increasing. T_camera_world: (N, 4, 4), their tracked
+    poses from now on. S: S_after_before (N, 4, 4), how the world around them moves.
+    """
+
+    index: NDArray[np.int64]
+    T_camera_world: NDArray[np.float64]
+    S: NDArray[np.float64]
+
+    def of(self, index: int, T_tracked: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pose (4, 4) from now on, and motion S (4, 4), of frame `index`, which was at `T_tracked` (4, 4).
+
+        A frame between named ones takes its place between the poses that it would have as part of either's world, by
+        index; one outside goes with the nearest.
+        """
+        after = int(np.searchsorted(self.index, index))
+        if after < len(self.index) and self.index[after] == index:
+            return self.T_camera_world[after].copy(), self.S[after].copy()
+        if len(self.index) == 0:
+            return T_tracked.copy(), np.eye(4)
+        if after in (0, len(self.index)):
+            S = self.S[min(after, len(self.index) - 1)]
+            return moved_pose(S, T_tracked), S.copy()
+        a, b = self.S[after - 1], self.S[after]
+        if np.array_equal(a, b):
+            return moved_pose(a, T_tracked), a.copy()
+        t = (index - self.index[after - 1]) / (self.index[after] - self.index[after - 1])
+        T = orthonormalised(interpolate_se3(moved_pose(a, T_tracked), moved_pose(b, T_tracked), t))
+        return T, motion_around(T_tracked, T, float(scale_of(a) ** (1.0 - t) * scale_of(b) ** t))
+
+
+@dataclass(frozen=True)
+class CorrectionReport:
+    """What a correction did. motion: of frames and world. moved: whether Gaussians have moved."""
+
+    motion: WorldMotion
+    moved: bool
+
+
+def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], correction: PoseCorrection) -> WorldMotion:
+    """Bring the keyframes of `store` up to date: poses, points, depths; return how the world moves.
+
+    tracked: T_camera_world (4, 4) of the frames so far by index, as the tracker had them. Named frames that are not
+    among them tell nothing. The Gaussians stay where they are: each keyframe's `lag` says how they are to follow.
+    """
+    known = np.array([int(i) in tracked for i in correction.index])
+    index, T_after = correction.index[known], correction.T_camera_world[known]
+    order = np.argsort(correction.ids, kind="stable")
+    ids, xyz = correction.ids[order], correction.xyz[order]
+    scale = _scales(store, index, T_after, ids, xyz)
+    S = [motion_around(tracked[int(i)], T, s) for i, T, s in zip(index, T_after, scale, strict=True)]
+    motion = WorldMotion(index, T_after, np.array(S).reshape(-1, 4, 4))
+    for keyframe in store:
+        T, around = motion.of(keyframe.index, keyframe.T_tracked)
+        keyframe.revise(T, around)
+        mine, theirs = _matches(keyframe.points, ids)
+        if len(mine):
+            moved = keyframe.points.xyz.copy()
+            moved[mine] = xyz[theirs]
+            if not np.array_equal(moved, keyframe.points.xyz):
+                keyframe.revise_points(replace(keyframe.points, xyz=moved))
+    store.take_in_depths()
+    return motion
+
+
+def lag_in_pixels(view: Keyframe) -> float:
+    """By how much the picture of a keyframe would be off if Gaussians stayed behind [px].
+
+    The mean over a grid of pixels at its median depth; infinite where they would not be before the camera at all.
+    """
+    if np.array_equal(view.lag, np.eye(4)):
+        return 0.0
+    camera = view.camera
+    across, down = (np.arange(0.1, 1.0, 0.2) * side for side in (camera.width, camera.height))
+    grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    here = camera.unproject(grid, np.full(len(grid), view.median_depth))
+    there = moved_points(view.T_camera_world @ np.linalg.inv(view.lag) @ inverse_se3(view.T_camera_world), here)
+    if (there[:, 2] < 1e-3 * view.median_depth).any():
+        return float("inf")
+    return float(np.linalg.norm(camera.project(there) - grid, axis=1).mean())
+
+
+def _scales(
+    store: KeyframeStore,
+    index: NDArray[np.int64],
+    T_after: NDArray[np.float64],
+    ids: NDArray[np.int64],
+    xyz: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Change of scale (N,) at the named frames: that of the keyframes among them, by index between, 1 where none knows.
+
+    A keyframe's is the median over its moved points of their depth after by their depth before. ids (M,) are sorted.
+    """
+    place = {int(i): n for n, i in enumerate(index)}
+    at, logs = [], []
+    for keyframe in store:
+        if keyframe.index not in place:
+            continue
+        mine, theirs = _matches(keyframe.points, ids)
+        before = keyframe.points.depths(keyframe.T_tracked)[mine]
+        T = T_after[place[keyframe.index]]
+        after = xyz[theirs] @ T[2, :3] + T[2, 3]
+        valid = (before > 0) & (after > 0)
+        if np.count_nonzero(valid) >= MIN_POINTS:
+            at.append(keyframe.index)
+            logs.append(np.log(np.median(after[valid] / before[valid])))
+    return np.exp(np.interp(index, at, logs)) if at else np.ones(len(index))
+
+
+def _matches(points: SparsePoints, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of `points`, and of the sorted `ids`, that are the same point."""
+    if len(ids) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    place = np.minimum(np.searchsorted(ids, points.ids), len(ids) - 1)
+    mine = np.flatnonzero(ids[place] == points.ids)
+    return mine, place[mine]
