@@ -43,14 +43,12 @@ class SeenFrame:
 class Beginning:
     """Takes frames in until `add` returns a map. frames: those seen so far, the oldest forgotten after LONGEST.
 
-    lenses: cameras that may be the right one; the map has the one that explains the features best, refined where
-    `refines` is set.
+    lenses: cameras that may be the right one; the map has the one that explains the features best.
     """
 
-    def __init__(self, lenses: Sequence[Lens], seed: int, refines: bool = False) -> None:
+    def __init__(self, lenses: Sequence[Lens], seed: int) -> None:
         self.frames: list[SeenFrame] = []
         self._lenses = list(lenses)
-        self._refines = refines
         self._seed = seed
         self._count = 0
 
@@ -156,15 +154,13 @@ class Beginning:
             keyframe = Keyframe(seen.number, poses[i], seen.grey, seen.ids.copy(), pixels, lens.rays(pixels))
             landmarks.add_keyframe(keyframe)
         every = range(len(order))
-        # Two views alone tell nothing of a camera.
-        refines = self._refines and len(order) > 2
         for _ in range(2):
-            if not np.isfinite(adjust_bundle(landmarks, every, steps=30, intrinsics=refines)):
+            if not np.isfinite(adjust_bundle(landmarks, every, steps=30)):
                 return None, np.inf
             landmarks.discard_outliers(every)
             for k in every:
                 landmarks.triangulate(k)
-        cost = adjust_bundle(landmarks, every, steps=15, intrinsics=refines)
+        cost = adjust_bundle(landmarks, every, steps=15)
         landmarks.discard_outliers(every)
         if not self._holds(landmarks, len(share)):
             return None, np.inf

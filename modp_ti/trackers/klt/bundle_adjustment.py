@@ -19,12 +19,13 @@ def adjust_bundle(
     free: Sequence[int],
     held: Sequence[int] = (),
     steps: int = 10,
-    intrinsics: bool = False,
+    focal: bool = False,
+    distortion: bool = False,
 ) -> float:
     """Moves the keyframes `free` and the landmarks that they see, to the least robust reprojection error.
 
     held: keyframes that take part where they are; where there is none, the first two of `free` hold the world.
-    steps: Levenberg-Marquardt steps at most. intrinsics: whether the camera is refined too.
+    steps: Levenberg-Marquardt steps at most. focal, distortion: whether these of the camera are refined too.
     Returns the mean cost of an observation [px^2 / 2], infinite where there is nothing to adjust.
     """
     import pycolmap
@@ -62,12 +63,12 @@ def adjust_bundle(
         names[point] = model.add_point3D(landmarks.xyz[point], track)
     if not held:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    if not intrinsics:
+    if not (focal or distortion):
         config.set_constant_cam_intrinsics(1)
 
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = options.refine_extra_params = intrinsics
+    options.refine_focal_length, options.refine_extra_params = focal, distortion
     options.refine_principal_point = options.refine_sensor_from_rig = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_WIDTH
@@ -87,6 +88,6 @@ def adjust_bundle(
     xyz = np.array([model.point3D(name).xyz for name in names.values()])
     finite = np.isfinite(xyz).all(axis=1)
     landmarks.xyz[np.array(points)[finite]] = xyz[finite]
-    if intrinsics:
+    if focal or distortion:
         landmarks.use_lens(Lens(model.camera(1)))
     return float(summary.ceres_summary.final_cost / len(ids)) if hasattr(summary, "ceres_summary") else 0.0

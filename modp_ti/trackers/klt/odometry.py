@@ -34,6 +34,10 @@ WINDOW = 8  # keyframes that a bundle adjustment moves
 HELD = 12  # keyframes that it holds
 WIDE_EVERY = 12  # keyframes between bundle adjustments of WIDE_WINDOW of them
 WIDE_WINDOW = 30
+# Keyframes from which a camera that is unknown can be told: few of them fit any.
+FOCAL_FROM = 6
+DISTORTION_FROM = 12
+REFINE_EVERY = 6
 # Tries to find a lost camera: at every frame at first, then now and then.
 EAGER = 10
 LAZY = 5
@@ -85,7 +89,7 @@ class Odometry:
     def __init__(self, lenses: Sequence[Lens], seed: int = 0, refines: bool = False) -> None:
         self.map: LandmarkMap | None = None
         self.counts = Counts()
-        self._beginning: Beginning | None = Beginning(lenses, seed, refines)
+        self._beginning: Beginning | None = Beginning(lenses, seed)
         self._refines = refines
         self._seed = seed
         self._state: _State | None = None
@@ -284,7 +288,7 @@ class Odometry:
         if self.map.known[share].sum() < KEYFRAME_SHARE * self.map.known[last.ids].sum():
             return True
         shift = float(np.median(np.linalg.norm(last.pixels[a] - state.pixels[b], axis=1)))
-        return shift > KEYFRAME_SHIFT * max(state.grey.shape)
+        return shift > (0.6 if self._refines else 1.0) * KEYFRAME_SHIFT * max(state.grey.shape)
 
     def _make_keyframe(self) -> None:
         """The last frame becomes a keyframe: its landmarks placed exactly, more of them found, the map adjusted."""
@@ -341,16 +345,23 @@ class Odometry:
     def _adjust(self) -> None:
         landmarks = self.map
         count = len(landmarks.keyframes)
-        wide = count % WIDE_EVERY == 0
-        if self._refines:
-            free, held = list(range(count)), []
-        else:
-            free = list(range(max(0, count - (WIDE_WINDOW if wide else WINDOW)), count))
-            held = self._companions(free)
-            if not held:
-                held, free = free[:2], free[2:]
-        adjust_bundle(landmarks, free, held, steps=8, intrinsics=self._refines)
+        if self._refines and count >= FOCAL_FROM and count % REFINE_EVERY == 0:
+            self.refine_camera()
+            return
+        free = list(range(max(0, count - (WIDE_WINDOW if count % WIDE_EVERY == 0 else WINDOW)), count))
+        held = self._companions(free)
+        if not held:
+            held, free = free[:2], free[2:]
+        adjust_bundle(landmarks, free, held, steps=8)
         landmarks.discard_outliers(free)
+
+    def refine_camera(self) -> None:
+        """Bundle adjustment of the whole map and of the camera's focal length and distortion, as far as they show."""
+        count = len(self.map.keyframes)
+        every = range(count)
+        for _ in range(2):
+            adjust_bundle(self.map, every, steps=15, focal=True, distortion=count >= DISTORTION_FROM)
+            self.map.discard_outliers(every)
 
     def _companions(self, free: list[int]) -> list[int]:
         """Keyframes that see most of what `free` sees."""

@@ -77,7 +77,8 @@ def align_landmarks(
 
     offset = np.arange(TILE) - (TILE - 1) / 2
     grid = np.stack(np.meshgrid(offset, offset), axis=-1)  # (TILE, TILE, 2)
-    there = pixel[:, None, None] + np.einsum("nij,yxj->nyxi", np.linalg.inv(warp), grid)
+    unwarped = grid.reshape(-1, 2) @ np.linalg.inv(warp).transpose(0, 2, 1)  # (N, TILE * TILE, 2)
+    there = pixel[:, None, None] + unwarped.reshape(count, TILE, TILE, 2)
     here = guess[:, None, None] + grid
     reference = np.zeros((count, TILE, TILE), np.float32)
     for k in np.unique(keyframe[usable]):

@@ -58,7 +58,7 @@ def refine_pose(
         step = -np.linalg.solve(normal, weighted.T @ residual.reshape(-1))
         step[:3] *= scale
         T = exp_se3(step) @ T
-        if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-7 * scale:
+        if np.abs(step[3:]).max() < 1e-5 and np.abs(step[:3]).max() < 1e-5 * scale:
             break
     return orthonormalised(T)
 
