@@ -82,8 +82,9 @@ class SourceSettings(StrictModel):
 class TrackerSettings(StrictModel):
     """Where the camera poses and the sparse points come from."""
 
-    kind: Literal["colmap", "transforms", "synthetic"] = Field(
-        description="`colmap` (a model), `transforms` (transforms.json) or `synthetic` (the embedded demo)"
+    kind: Literal["colmap", "transforms", "klt", "synthetic"] = Field(
+        description="`colmap` (a model), `transforms` (transforms.json), `klt` (the images alone: our own tracker) or "
+        "`synthetic` (the embedded demo)"
     )
     path: Path | None = Field(
         None,

@@ -26,6 +26,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         from modp_ti.trackers.transforms import open_transforms
 
         return open_transforms(config.source, config.tracker, progress)
+    if config.tracker.kind == "klt":
+        from modp_ti.trackers.klt import open_klt
+
+        return open_klt(config.source, config.tracker, config.seed, progress)
     from modp_ti.synthetic import open_synthetic
 
     return open_synthetic(config.source, config.tracker)

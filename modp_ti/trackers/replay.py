@@ -13,7 +13,15 @@ from modp_ti.config import SourceSettings
 from modp_ti.errors import InputError
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
 
-__all__ = ["PosedImage", "ReplayedTracker", "checked_pose", "points_inside", "require_fitting_sizes"]
+__all__ = [
+    "PosedImage",
+    "ReplayedTracker",
+    "checked_pose",
+    "is_held_out",
+    "points_inside",
+    "require_fitting_sizes",
+    "unmasked",
+]
 
 # A rotation this far from orthonormal was not meant as one; below it lies the rounding of text files.
 MAX_ROTATION_DEFECT = 1e-2
@@ -62,14 +70,14 @@ class ReplayedTracker:
                 image=picture.image,
                 camera=frame.undistorter.camera,
                 T_camera_world=frame.T_camera_world,
-                points=_unmasked(frame.points, picture.mask),
+                points=unmasked(frame.points, picture.mask),
                 mask=picture.mask,
                 vignette=picture.vignette,
                 held_out=is_held_out(index, self._source),
             )
 
 
-def _unmasked(points: SparsePoints, mask: NDArray[np.bool_] | None) -> SparsePoints:
+def unmasked(points: SparsePoints, mask: NDArray[np.bool_] | None) -> SparsePoints:
     """The points, all of them inside the image, whose pixels are valid."""
     if mask is None:
         return points

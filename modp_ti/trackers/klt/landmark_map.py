@@ -113,9 +113,7 @@ class LandmarkMap:
         for keyframe in self.keyframes:
             keyframe.rays = lens.rays(keyframe.pixels)
 
-    def observations(
-        self, keyframes: Iterable[int]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def observations(self, keyframes: Iterable[int]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Keyframe, place within it and landmark, (M,) each, of what these keyframes see of landmarks with a place."""
         of, place, ids = [], [], []
         for k in keyframes:

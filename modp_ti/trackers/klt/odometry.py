@@ -37,7 +37,7 @@ WIDE_WINDOW = 30
 # Keyframes from which a camera that is unknown can be told: few of them fit any.
 FOCAL_FROM = 6
 DISTORTION_FROM = 12
-REFINE_EVERY = 6
+REFINED_AT = (6, 12, 24, 48)
 # Tries to find a lost camera: at every frame at first, then now and then.
 EAGER = 10
 LAZY = 5
@@ -163,7 +163,13 @@ class Odometry:
         self.counts.numbers_lost += [frames[i].number for i in range(len(frames)) if i not in views]
         last = landmarks.keyframes[-1]
         self._state = _State(
-            last.number, last.grey, frames[-1].valid, last.T_camera_world, last.ids, last.pixels, len(self._thumbnails) - 1
+            last.number,
+            last.grey,
+            frames[-1].valid,
+            last.T_camera_world,
+            last.ids,
+            last.pixels,
+            len(self._thumbnails) - 1,
         )
         self._replenish()
         before = views.get(len(frames) - 2)
@@ -174,7 +180,9 @@ class Odometry:
     def _backwards(self, frames: list[SeenFrame], first: int, views: dict[int, View]) -> None:
         """Poses for the frames before the map's first, followed from there against time."""
         keyframe = self.map.keyframes[0]
-        after = _State(keyframe.number, frames[first].grey, None, keyframe.T_camera_world, keyframe.ids, keyframe.pixels)
+        after = _State(
+            keyframe.number, frames[first].grey, None, keyframe.T_camera_world, keyframe.ids, keyframe.pixels
+        )
         for i in range(first - 1, -1, -1):
             frame = frames[i]
             pixels, found = flow(after.grey, frame.grey, after.pixels, after.pixels)
@@ -217,7 +225,7 @@ class Odometry:
         return self._view(number, T, ids[known], pixels[known])
 
     def _predicted(self, T: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the followed features will be seen from T; those without a place are as far as the others mostly are."""
+        """Where the followed features will be seen from T; those without a place are as far as most others."""
         state = self._state
         known = self.map.known[state.ids]
         world = self.map.xyz[state.ids].copy()
@@ -345,7 +353,7 @@ class Odometry:
     def _adjust(self) -> None:
         landmarks = self.map
         count = len(landmarks.keyframes)
-        if self._refines and count >= FOCAL_FROM and count % REFINE_EVERY == 0:
+        if self._refines and count in REFINED_AT:
             self.refine_camera()
             return
         free = list(range(max(0, count - (WIDE_WINDOW if count % WIDE_EVERY == 0 else WINDOW)), count))
@@ -377,9 +385,7 @@ class Odometry:
         known = self.map.known[keyframe.ids]
         return View(keyframe.number, k, np.eye(4), keyframe.ids[known], keyframe.pixels[known])
 
-    def _view(
-        self, number: int, T: NDArray[np.float64], ids: NDArray[np.int64], pixels: NDArray[np.float64]
-    ) -> View:
+    def _view(self, number: int, T: NDArray[np.float64], ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> View:
         """A view seen from its nearest keyframe in time, among those before it."""
         k = max(
             (k for k, keyframe in enumerate(self.map.keyframes) if keyframe.number <= number),
@@ -415,7 +421,10 @@ class Odometry:
         if len(features.pixels) < FEWEST:
             return None
         candidates = alike_keyframes(np.array(self._thumbnails), grey, 3)
-        candidates = [*candidates, *([len(self.map.keyframes) - 1] if len(self.map.keyframes) - 1 not in candidates else [])]
+        candidates = [
+            *candidates,
+            *([len(self.map.keyframes) - 1] if len(self.map.keyframes) - 1 not in candidates else []),
+        ]
         view = self._placed(number, grey, valid, features, candidates)
         if view is not None:
             self.counts.recovered += 1

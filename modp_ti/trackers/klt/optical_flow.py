@@ -65,7 +65,7 @@ def corners(
     wanted: int,
     valid: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
-    """New corners (N, 2) of an image (H, W) uint8, centres at +0.5, spread over a grid, apart from those `taken` (M, 2).
+    """New corners (N, 2) of an image (H, W) uint8, centres at +0.5, on a grid, apart from those `taken` (M, 2).
 
     wanted: how many there should be together with those taken. valid: (H, W), False where none may be.
     """
