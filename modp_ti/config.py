@@ -176,6 +176,7 @@ class TrackerSettings(StrictModel):
     kind: Literal[
         "colmap",
         "transforms",
+        "klt",
         "tum",
         "orbslam3",
         "stella_vslam",
@@ -186,10 +187,10 @@ class TrackerSettings(StrictModel):
         "socket",
         "synthetic",
     ] = Field(
-        description="`colmap` (a model), `transforms` (transforms.json), `tum` (any trajectory in TUM's format), "
-        "`orbslam3`, `stella_vslam` (its map.msg), `aria` (what MPS writes), `modp` (the paper's release), `replica`, "
-        "`sevenscenes`, `socket` (another program sends frames and poses: docs/door.md) or `synthetic` (the embedded "
-        "demo)"
+        description="`colmap` (a model), `transforms` (transforms.json), `klt` (the images alone: our own tracker), "
+        "`tum` (any trajectory in TUM's format), `orbslam3`, `stella_vslam` (its map.msg), `aria` (what MPS writes), "
+        "`modp` (the paper's release), `replica`, `sevenscenes`, `socket` (another program sends frames and poses: "
+        "docs/door.md) or `synthetic` (the embedded demo)"
     )
     path: Path | None = Field(
         None,

@@ -67,16 +67,19 @@ class FrameReader:
                         "the vignette must show the whole image (source.vignette)"
                     )
 
-    def read(self, name: str, undistorter: Undistorter) -> Picture:
-        """The frame as the mapper takes it. Raises InputError for an image or a mask that is unreadable."""
-        raw = self.images.read(name)
-        image, mask = undistorter.image(raw, self._valid(name, raw))
+    def read(self, name: str, undistorter: Undistorter, raw: NDArray[np.uint8] | None = None) -> Picture:
+        """The frame as the mapper takes it; raw: its stored image, where that is decoded already.
+
+        Raises InputError for an image or a mask that is unreadable.
+        """
+        raw = self.images.read(name) if raw is None else raw
+        image, mask = undistorter.image(raw, self.valid(name, raw))
         if self._vignette is None:
             return Picture(image, mask, None)
         vignette, lit = self._light(undistorter)
         return Picture(image, _both(mask, lit), vignette)
 
-    def _valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+    def valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         """Which pixels of the stored image count; None where all do."""
         valid = None if self._masks is None else self._masks.read(name)
         if hasattr(self.images, "valid"):

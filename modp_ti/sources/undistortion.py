@@ -64,6 +64,22 @@ class Undistorter:
         kept = share >= 0.5
         return image, kept if mask is None else kept & mask
 
+    def grey(
+        self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """Grey image (H, W) uint8, undistorted and scaled, of a stored one, for features; its mask as for `image`.
+
+        Ignored pixels keep their grey: no feature may be where the mask is False.
+        """
+        import cv2
+
+        mask = None if self._lookup is None else self._lookup[2]
+        grey = self._resampled(cv2.cvtColor(raw, cv2.COLOR_RGB2GRAY))
+        if valid is None:
+            return grey, mask
+        kept = self._resampled(valid.astype(np.float32)) >= 0.5
+        return grey, kept if mask is None else kept & mask
+
     def smooth(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
         """A smooth picture of the stored image's field of view (H1, W1, 3), as it is in the delivered one (H, W, 3)."""
         import cv2

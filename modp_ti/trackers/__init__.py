@@ -58,6 +58,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         from modp_ti.trackers.door import open_door
 
         return open_door(config.source, config.tracker, progress)
+    if config.tracker.kind == "klt":
+        from modp_ti.trackers.klt import open_klt
+
+        return open_klt(config.source, config.tracker, config.seed, progress)
     from modp_ti.synthetic import open_synthetic
 
     return open_synthetic(config.source, config.tracker)

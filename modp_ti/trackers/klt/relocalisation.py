@@ -1,0 +1,106 @@
+"""Frames placed by what they look like: SIFT features matched with a keyframe's, for gaps that flow cannot cross."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.trackers.features import Features, detect_features, match_features
+from modp_ti.trackers.klt.landmark_map import Keyframe, LandmarkMap
+from modp_ti.trackers.klt.pose import pose_from_points
+
+__all__ = ["Placed", "alike_keyframes", "describe", "matches", "place_by_features", "thumbnail"]
+
+# px of the followed image: a place that a feature's neighbours lend it, and one of its own.
+MAX_ERROR = 5.0
+SAME_PLACE = 2.0
+NEIGHBOURHOOD = 40.0
+FEWEST = 15  # matches that agree with a pose
+THUMBNAIL = (32, 24)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """T_camera_world (4, 4) of a frame; pairs (M, 2): features of the keyframe and of the frame that agree with it."""
+
+    keyframe: int
+    T_camera_world: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+
+
+def describe(grey: NDArray[np.uint8]) -> Features:
+    """SIFT features of a followed image (H, W) uint8."""
+    return detect_features(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))
+
+
+def matches(a: Features, b: Features) -> NDArray[np.int64]:
+    """Pairs (M, 2) of features that are clearly each other's best."""
+    nowhere = np.zeros((3, 3))  # no epipolar line: every place of the other image will do
+    return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0).pairs
+
+
+def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """A small blurred picture as vector of mean 0 and length 1: 0 where the image is of one grey."""
+    small = cv2.GaussianBlur(cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA), (5, 5), 0).astype(np.float32)
+    small -= small.mean()
+    return (small / max(float(np.linalg.norm(small)), 1.0)).reshape(-1)
+
+
+def alike_keyframes(thumbnails: NDArray[np.float32], grey: NDArray[np.uint8], count: int) -> list[int]:
+    """Numbers of the keyframes that look most like the image, best first."""
+    likeness = thumbnails @ thumbnail(grey)
+    return [int(k) for k in np.argsort(-likeness, kind="stable")[:count]]
+
+
+def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: int) -> Placed | None:
+    """Pose of a frame with these features by those of keyframe k; None where too few agree."""
+    keyframe = landmarks.keyframes[k]
+    if keyframe.described is None:
+        keyframe.described = describe(keyframe.grey)
+        keyframe.described_ids = np.full(len(keyframe.described.pixels), -1, dtype=np.int64)
+    pairs = matches(keyframe.described, features)
+    if len(pairs) < FEWEST:
+        return None
+    xyz = _places(landmarks, keyframe)[pairs[:, 0]]
+    placed = np.isfinite(xyz).all(axis=1)
+    if placed.sum() < FEWEST:
+        return None
+    rays = landmarks.lens.rays(features.pixels[pairs[:, 1]])
+    found = pose_from_points(xyz[placed], rays[placed], MAX_ERROR / landmarks.lens.focal, seed)
+    if found is None or found[1].sum() < max(FEWEST, 0.2 * placed.sum()):
+        return None
+    agreeing = np.ones(len(pairs), dtype=bool)
+    agreeing[placed] = found[1]
+    return Placed(k, found[0], pairs[agreeing])
+
+
+def _places(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
+    """World points (M, 3) of a keyframe's SIFT features; NaN where nothing tells how far away they are.
+
+    A feature that is a landmark lies there; any other at the depth of the landmarks around it, where they agree.
+    """
+    pixels, ids = keyframe.described.pixels, keyframe.described_ids
+    xyz = np.full((len(pixels), 3), np.nan)
+    own = np.flatnonzero(ids >= 0)
+    own = own[landmarks.known[ids[own]]]
+    xyz[own] = landmarks.xyz[ids[own]]
+    seen = np.flatnonzero(landmarks.known[keyframe.ids])
+    if len(seen) < 3 or len(pixels) == 0:
+        return xyz
+    T = keyframe.T_camera_world
+    depth = landmarks.xyz[keyframe.ids[seen]] @ T[2, :3] + T[2, 3]
+    distance = np.linalg.norm(pixels[:, None] - keyframe.pixels[seen][None], axis=2)
+    nearest = np.argpartition(distance, 2, axis=1)[:, :3]
+    away = np.take_along_axis(distance, nearest, axis=1)
+    around = depth[nearest]
+    middle = np.median(around, axis=1)
+    agree = (np.ptp(around, axis=1) < 0.1 * middle) & (away.max(axis=1) < NEIGHBOURHOOD) & (middle > 0)
+    at_one = away.min(axis=1) < SAME_PLACE
+    z = np.where(at_one, around[np.arange(len(around)), away.argmin(axis=1)], middle)
+    lent = np.flatnonzero((agree | at_one) & ~np.isfinite(xyz[:, 0]) & (z > 0))
+    point = np.c_[landmarks.lens.rays(pixels[lent]), np.ones(len(lent))] * z[lent, None] - T[:3, 3]
+    xyz[lent] = point @ T[:3, :3]
+    return xyz
