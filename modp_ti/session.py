@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import os
 import resource
-import shutil
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
@@ -22,60 +17,21 @@ from fields.backend import describe, initialise
 from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
-from modp_ti.config import SceneConfig, dump_scene
+from modp_ti.config import SceneConfig
+from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.errors import InputError
-from modp_ti.evaluation import FrameScore, MapVersion, evaluate, summary, trajectory_errors
-from modp_ti.exports.colmap_model import image_names, write_colmap, write_image
-from modp_ti.exports.exposure import write_exposures
-from modp_ti.exports.scores_csv import write_scores
-from modp_ti.exports.splats_ply import read_splats, write_splats
-from modp_ti.exports.trajectory import write_trajectory
+from modp_ti.evaluation import MapVersion, evaluate, trajectory_errors
 from modp_ti.lpips import open_lpips
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
-from modp_ti.tracked_points import TrackedPoints
+from modp_ti.results import Results, metrics_of
 from modp_ti.trackers import close, events, frame_count, may_read_ahead, open_tracker
-from pipelines.corrections import WorldMotion
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
-
-STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
-# Versions of a map that metrics.json has room for; null where a run does not make one.
-MAPS = ("online", "refined", "offline")
-
-
-@dataclass
-class Poses:
-    """What is kept of every frame: its name, time, camera and pose, and the points that it saw.
-
-    corrections: how many came, and how many of them moved the map.
-    """
-
-    name: list[str] = field(default_factory=list)
-    camera: list[PinholeCamera] = field(default_factory=list)
-    points: TrackedPoints = field(default_factory=TrackedPoints)
-    index: list[int] = field(default_factory=list)
-    timestamp: list[float] = field(default_factory=list)
-    tracked: list[NDArray[np.float64]] = field(default_factory=list)
-    corrections: dict[str, int] = field(default_factory=lambda: {"received": 0, "moved": 0})
-
-    def add(self, frame: TrackedFrame) -> None:
-        self.name.append(frame.name)
-        self.camera.append(frame.camera)
-        self.points.add(frame)
-        self.index.append(frame.index)
-        self.timestamp.append(frame.timestamp)
-        self.tracked.append(frame.T_camera_world)
-
-    def correct(self, correction: PoseCorrection, motion: WorldMotion) -> None:
-        """Take over the poses that the tracker names; the other frames go with the world around them."""
-        named = {int(i): T for i, T in zip(correction.index, correction.T_camera_world, strict=True)}
-        for n, index in enumerate(self.index):
-            self.tracked[n] = named[index] if index in named else motion.of(index, self.tracked[n])[0]
 
 
 def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
@@ -101,8 +57,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     tracker = open_tracker(config, line.prepare)
     held.callback(close, tracker)
     ahead = config.source.prefetch if may_read_ahead(tracker) else 0
-    with FramesAhead(events(tracker), ahead) as frames:
-        first = next(frames, None)
+    with FramesAhead(events(tracker), ahead) as arriving:
+        first = next(arriving, None)
         if first is None:
             raise InputError("the tracker delivered no frame: nothing to map")
         if isinstance(first, PoseCorrection):
@@ -119,7 +75,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
             mapper.compile()
         tick = time.perf_counter()
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
-        poses = _map(mapper, chain([first], _timed(frames, watch)), line)
+        frames = _map(mapper, chain([first], _timed(arriving, watch)), line)
         mapping_seconds = time.perf_counter() - tick
     _say(tracker.notes[said:], console)  # how a live tracker's frames ended
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
@@ -128,63 +84,40 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
             f"no frame became a keyframe: none has {config.mapping.keyframes.min_points} tracked points; "
             "give a tracker with points or lower mapping.keyframes.min_points"
         )
-    versions = {config.mode: _version(mapper, poses)}
+    versions = {config.mode: _version(mapper, frames)}
     if config.refine.steps and isinstance(mapper, OnlineMapper):
         line.start_refining(config.refine.steps)
         refine(mapper, config.refine, line.refined)
         line.stop()
-        versions["refined"] = _version(mapper, poses)
+        versions["refined"] = _version(mapper, frames)
     last = list(versions)[-1]
-    final = versions[last]
-
-    staging = config.output.with_name(config.output.name + ".partial")
-    shutil.rmtree(staging, ignore_errors=True)
-    try:
-        (staging / "renders").mkdir(parents=True)
-        write_splats(staging / "splats.ply", final.gaussians)
-        write_trajectory(staging / "trajectory.txt", poses.timestamp, final.trajectory)
-        names = image_names(poses.name, config.export.images)
-        write_colmap(staging / "colmap", names, poses.camera, final.trajectory, poses.points)
-        if mapper.keyframes[0].exposure is not None:
-            keyframes = {k.index for k in mapper.keyframes}
-            write_exposures(staging / "exposure.json", poses.index, poses.timestamp, final.exposures, keyframes)
+    results = Results(config, frames)
+    with results.writing():
+        keyframes = {keyframe.index for keyframe in mapper.keyframes}
         # What is scored is what a reader of the file gets.
-        versions[last] = replace(final, gaussians=read_splats(staging / "splats.ply"))
+        versions[last] = results.write_map(versions[last], keyframes, mapper.keyframes[0].exposure is not None)
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
-            if stage == last and config.export.images:
-                write_image(staging / "colmap", names[frame.index], frame)
-            if stage == last and frame.held_out:
-                _write_pair(staging / "renders" / f"{frame.index:06d}.png", frame.image, render)
+            if stage == last:
+                results.write_frame(frame, render)
 
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
             with FramesAhead(tracker, ahead) as again:
                 scores = evaluate(mapper, again, versions, lpips, keep)
-        write_scores(staging / "scores.csv", scores)
+        ground_truth = getattr(tracker, "ground_truth", list)()
         metrics = {
-            "frames": len(poses.index),
             "keyframes": len(mapper.keyframes),
-            "corrections": poses.corrections,
             "gaussians": len(mapper.gaussians),
             "backend": backend,
             "seed": config.seed,
-            "frames_per_second": round(len(poses.index) / mapping_seconds, 4),
+            "frames_per_second": round(len(frames) / mapping_seconds, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
             "lpips_note": no_lpips,
-            "seconds": _seconds(watch.seconds, time.perf_counter() - started),
             "breakdown_percent": breakdown,
-            **trajectory_errors(poses.tracked, final.trajectory, getattr(tracker, "ground_truth", list)()),
-            "reprojection_error": _rounded(poses.points.reprojection_error(poses.camera, final.trajectory)),
-            "reprojection_error_tracked": _rounded(poses.points.reprojection_error(poses.camera, poses.tracked)),
+            **metrics_of(scores, versions, frames, watch.seconds | {"total": time.perf_counter() - started}),
+            **trajectory_errors(frames.T_tracked, versions[last].trajectory, ground_truth),
         }
-        (staging / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-        dump_scene(config, staging / "config.yaml")
-        _publish(staging, config.output)
-    except OSError as error:
-        raise InputError(f"{config.output}: cannot be written: {error.strerror}") from None
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        results.write_scores(scores, metrics)
     line.summary(metrics)
     return config.output
 
@@ -205,14 +138,14 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | O
 
 
 def _map(
-    mapper: OnlineMapper | OfflineMapper, frames: Iterable[TrackedFrame | PoseCorrection], line: ProgressLine
-) -> Poses:
-    """Take all frames and corrections in, in their order, and finish the map; the frames' poses."""
-    poses, size = Poses(), None
+    mapper: OnlineMapper | OfflineMapper, arriving: Iterable[TrackedFrame | PoseCorrection], line: ProgressLine
+) -> DeliveredFrames:
+    """Take all frames and corrections in, in their order, and finish the map; what is kept of the frames."""
+    frames, size = DeliveredFrames(), None
     try:
-        for frame in frames:
+        for frame in arriving:
             if isinstance(frame, PoseCorrection):
-                _correct(mapper, frame, poses)
+                _correct(mapper, frame, frames)
                 continue
             size = size or (frame.camera.width, frame.camera.height)
             if (frame.camera.width, frame.camera.height) != size:
@@ -220,7 +153,7 @@ def _map(
                     f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
                     "all images of a scene must have one size"
                 )
-            poses.add(frame)
+            frames.add(frame)
             line.frame(None if frame.held_out else mapper.process(frame))
         if isinstance(mapper, OfflineMapper):
             _optimise_offline(mapper, line)
@@ -228,28 +161,26 @@ def _map(
             mapper.finish()
     finally:
         line.stop()
-    return poses
+    return frames
 
 
-def _correct(mapper: OnlineMapper | OfflineMapper, correction: PoseCorrection, poses: Poses) -> None:
+def _correct(mapper: OnlineMapper | OfflineMapper, correction: PoseCorrection, frames: DeliveredFrames) -> None:
     """Revise poses and map."""
-    if correction.index[-1] > poses.index[-1]:
+    if correction.index[-1] > frames.index[-1]:
         raise InputError(
-            f"the tracker corrects frame {correction.index[-1]} after frame {poses.index[-1]}, before it has come"
+            f"the tracker corrects frame {correction.index[-1]} after frame {frames.index[-1]}, before it has come"
         )
     report = mapper.correct(correction)
-    poses.correct(correction, report.motion)
-    poses.corrections["received"] += 1
-    poses.corrections["moved"] += report.moved
+    frames.correct(correction, report.motion, report.moved)
 
 
-def _version(mapper: OnlineMapper | OfflineMapper, poses: Poses) -> MapVersion:
+def _version(mapper: OnlineMapper | OfflineMapper, frames: DeliveredFrames) -> MapVersion:
     """The map as it stands."""
     store = mapper.keyframes
     return MapVersion(
         mapper.gaussians.to_numpy(),
-        [store.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)],
-        [store.exposure_at(i) for i in poses.index],
+        [store.corrected(i, T) for i, T in zip(frames.index, frames.T_tracked, strict=True)],
+        [store.exposure_at(i) for i in frames.index],
         mapper.renderer.view_renders,
     )
 
@@ -273,41 +204,3 @@ def _timed(
         if frame is None:
             return
         yield frame
-
-
-def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
-    """A version's means over all frames and over those held out, and what it took."""
-    of = [score for score in scores if score.stage == stage]
-    return {
-        "all": summary(of),
-        "held_out": summary([score for score in of if score.held_out]),
-        "gaussians": len(version.gaussians["position"]),
-        "view_renders": version.view_renders,
-    }
-
-
-def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
-    """A PNG with the frame on the left and the render on the right."""
-    pair = np.hstack([image, render])
-    cv2.imwrite(str(path), np.round(pair[..., ::-1] * 255.0).astype(np.uint8))
-
-
-def _seconds(stages: dict[str, float], total: float) -> dict[str, float]:
-    """Seconds of each stage of metrics.json, and what is left of the total."""
-    seconds = {"total": round(total, 3)}
-    seconds |= {stage: round(stages.get(stage, 0.0), 3) for stage in STAGES}
-    seconds["other"] = round(total - sum(stages.get(stage, 0.0) for stage in STAGES), 3)
-    return seconds
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)
-
-
-def _publish(staging: Path, output: Path) -> None:
-    """Move the finished files into the output folder, over those of an earlier run."""
-    output.mkdir(parents=True, exist_ok=True)
-    for folder in ("renders", "colmap"):
-        shutil.rmtree(output / folder, ignore_errors=True)
-    for item in staging.iterdir():
-        os.replace(item, output / item.name)

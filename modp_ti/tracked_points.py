@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.similarity import moved_points
 from fields.tracked_frame import TrackedFrame
 
 __all__ = ["TrackedPoints"]
@@ -14,7 +17,7 @@ UNSEEN = (128, 128, 128)
 
 
 class TrackedPoints:
-    """Points by the tracker's ids; 16 bytes an observation, 56 a point.
+    """Points by the tracker's ids; 16 bytes an observation, 64 a point.
 
     `rows[i]` (N,) and `pixels[i]` (N, 2) float32 are the points that frame i saw, as rows of `xyz`, and their pixels.
     """
@@ -25,6 +28,7 @@ class TrackedPoints:
         self._row_of: dict[int, int] = {}
         self._xyz = np.zeros((0, 3))
         self._colours = np.zeros((0, 4))  # sums of red, green, blue, and of how many
+        self._last = np.zeros((0, 1), dtype=np.int64)  # the frame that saw it last
 
     def __len__(self) -> int:
         return len(self._row_of)
@@ -36,6 +40,7 @@ class TrackedPoints:
         rows = np.array([of.setdefault(i, len(of)) for i in points.ids.tolist()], dtype=np.int64)
         self._grow(len(of))
         self._xyz[rows] = points.xyz
+        self._last[rows, 0] = len(self.rows)
         if not frame.held_out:
             column, row = np.floor(points.pixels).astype(int).T
             rgba = frame.rgba[row, column]
@@ -44,13 +49,25 @@ class TrackedPoints:
         self.rows.append(rows)
         self.pixels.append(points.pixels.astype(np.float32))
 
+    def correct(self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Sequence[NDArray[np.float64]]) -> None:
+        """The tracker has revised its map: points `ids` (N,) are at xyz (N, 3) now, as far as frames saw them.
+
+        The others move with the frame that saw them last. motions: S_after_before (4, 4) of the world around a frame.
+        """
+        last, places = self._last[: len(self), 0], self.xyz
+        for frame in np.unique(last):
+            seen = last == frame
+            places[seen] = moved_points(motions[frame], places[seen])
+        rows = np.array([self._row_of.get(i, -1) for i in ids.tolist()], dtype=np.int64)
+        places[rows[rows >= 0]] = xyz[rows >= 0]
+
     def _grow(self, count: int) -> None:
         if count <= len(self._xyz):
             return
         size = max(count, 2 * len(self._xyz))
-        for name in ("_xyz", "_colours"):
+        for name in ("_xyz", "_colours", "_last"):
             old = getattr(self, name)
-            new = np.zeros((size, old.shape[1]))
+            new = np.zeros((size, old.shape[1]), dtype=old.dtype)
             new[: len(old)] = old
             setattr(self, name, new)
 

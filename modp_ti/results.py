@@ -1,0 +1,140 @@
+"""The output folder of a run: everything that is written at its end, made aside and put in place at once."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.tracked_frame import TrackedFrame
+from modp_ti.config import SceneConfig, dump_scene
+from modp_ti.delivered_frames import DeliveredFrames
+from modp_ti.errors import InputError
+from modp_ti.evaluation import FrameScore, MapVersion, summary
+from modp_ti.exports.colmap_model import image_names, write_colmap, write_image
+from modp_ti.exports.exposure import write_exposures
+from modp_ti.exports.scores_csv import write_scores
+from modp_ti.exports.splats_ply import read_splats, write_splats
+from modp_ti.exports.trajectory import write_trajectory
+
+__all__ = ["Results", "metrics_of"]
+
+STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
+# Versions of a map that metrics.json has room for; null where a run does not make one.
+MAPS = ("online", "refined", "offline")
+
+
+class Results:
+    """The files of a run's last map, in a folder beside `config.output` until `writing` ends."""
+
+    def __init__(self, config: SceneConfig, frames: DeliveredFrames) -> None:
+        self.config = config
+        self.frames = frames
+        self.folder = config.output.with_name(config.output.name + ".partial")
+        self._names = image_names(frames.name, config.export.images)
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Files are written inside, and appear in the output folder together when all went well.
+
+        Raises InputError where they cannot be written.
+        """
+        shutil.rmtree(self.folder, ignore_errors=True)
+        try:
+            (self.folder / "renders").mkdir(parents=True)
+            yield
+            dump_scene(self.config, self.folder / "config.yaml")
+            _publish(self.folder, self.config.output)
+        except OSError as error:
+            raise InputError(f"{self.config.output}: cannot be written: {error.strerror}") from None
+        finally:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def write_map(self, version: MapVersion, keyframes: set[int], with_exposure: bool) -> MapVersion:
+        """Write Gaussians, poses and, where they are estimated, exposures; return the map as a reader of it gets it.
+
+        keyframes: indices of the frames that are.
+        """
+        frames = self.frames
+        write_splats(self.folder / "splats.ply", version.gaussians)
+        write_trajectory(self.folder / "trajectory.txt", frames.timestamp, version.trajectory)
+        write_colmap(self.folder / "colmap", self._names, frames.camera, version.trajectory, frames.points)
+        if with_exposure:
+            write_exposures(self.folder / "exposure.json", frames.index, frames.timestamp, version.exposures, keyframes)
+        return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
+
+    def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+        """Write the pictures of a frame: its image where asked for, and beside the map (H, W, 3) where held out."""
+        if self.config.export.images:
+            write_image(self.folder / "colmap", self._names[frame.index], frame)
+        if frame.held_out:
+            _write_pair(self.folder / "renders" / f"{frame.index:06d}.png", frame.image, render)
+
+    def write_scores(self, scores: list[FrameScore], metrics: dict) -> None:
+        """Write the scores of all frames, and the run's figures."""
+        write_scores(self.folder / "scores.csv", scores)
+        (self.folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+
+
+def metrics_of(
+    scores: list[FrameScore], versions: dict[str, MapVersion], frames: DeliveredFrames, seconds: dict[str, float]
+) -> dict:
+    """What metrics.json says of the maps, of the points under their poses, and of the time.
+
+    seconds: of the stages, and `total`.
+    """
+    points, last = frames.points, list(versions.values())[-1]
+    return {
+        "frames": len(frames),
+        "corrections": frames.corrections,
+        **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
+        "reprojection_error": _rounded(points.reprojection_error(frames.camera, last.trajectory)),
+        "reprojection_error_tracked": _rounded(points.reprojection_error(frames.camera, frames.T_tracked)),
+        "seconds": _seconds(seconds),
+    }
+
+
+def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
+    """A version's means over all frames and over those held out, and what it took."""
+    of = [score for score in scores if score.stage == stage]
+    return {
+        "all": summary(of),
+        "held_out": summary([score for score in of if score.held_out]),
+        "gaussians": len(version.gaussians["position"]),
+        "view_renders": version.view_renders,
+    }
+
+
+def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
+    """A PNG with the frame on the left and the render on the right."""
+    pair = np.hstack([image, render])
+    cv2.imwrite(str(path), np.round(pair[..., ::-1] * 255.0).astype(np.uint8))
+
+
+def _seconds(stages: dict[str, float]) -> dict[str, float]:
+    """Seconds of each stage of metrics.json, and what is left of the total."""
+    seconds = {"total": round(stages["total"], 3)}
+    seconds |= {stage: round(stages.get(stage, 0.0), 3) for stage in STAGES}
+    seconds["other"] = round(stages["total"] - sum(stages.get(stage, 0.0) for stage in STAGES), 3)
+    return seconds
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
+
+
+def _publish(staging: Path, output: Path) -> None:
+    """Move the finished files into the output folder, over those of an earlier run."""
+    output.mkdir(parents=True, exist_ok=True)
+    for folder in ("renders", "colmap"):
+        shutil.rmtree(output / folder, ignore_errors=True)
+    for item in staging.iterdir():
+        os.replace(item, output / item.name)
