@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -12,6 +11,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from fields.camera import PinholeCamera
+from fields.tracked_frame import TrackedFrame
 from modp_ti import session
 from modp_ti.config import load_scene
 from modp_ti.errors import InputError
@@ -191,15 +192,16 @@ def test_estimated_exposures_are_written_and_the_scores_are_those_of_the_develop
 
 
 class LiveTracker:
-    """Two frames of the demo room, a note that only their end brings, and something to let go of."""
+    """Two black frames, a note that only their end brings, and something to let go of."""
 
-    def __init__(self, config):
+    def __init__(self):
         self.notes = ["said first"]
         self.closed = False
-        self._frames = open_tracker(config)
 
     def __iter__(self):
-        yield from islice(self._frames, 2)
+        camera = PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)
+        for i in range(2):
+            yield TrackedFrame(i, i / 30, str(i), np.zeros((48, 64, 3), np.float32), camera, np.eye(4))
         self.notes.append("said last")
 
     def close(self):
@@ -223,7 +225,7 @@ def test_a_tracker_is_closed_and_heard_to_its_end_however_the_run_ends(tmp_path,
     file = tmp_path / "scene.yaml"
     file.write_text(SCENE)
     config = load_scene(file)
-    tracker = LiveTracker(config)
+    tracker = LiveTracker()
     monkeypatch.setattr(session, "open_tracker", lambda *_: tracker)
     monkeypatch.setattr(session, "build_mapper", lambda *_: DeafMapper())
     said = io.StringIO()
