@@ -33,6 +33,10 @@ __all__ = [
 ]
 
 
+# Trackers that need nothing but images, and so can follow a camera.
+LIVE_TRACKERS = ("klt",)
+
+
 class IntrinsicsSettings(StrictModel):
     """The camera's calibration, for the stored size of the images."""
 
@@ -211,7 +215,7 @@ class SceneConfig(StrictModel):
             raise ValueError("source.path is missing: give the folder that holds the images")
         if self.source.intrinsics.given and self.tracker.kind in ("colmap", "transforms", "synthetic"):
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
-        if self.source.stream is not None and self.tracker.kind in ("colmap", "transforms", "synthetic"):
+        if self.source.stream is not None and self.tracker.kind not in LIVE_TRACKERS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
         if self.tracker.exposure_change and self.tracker.kind != "synthetic":
             raise ValueError("tracker.exposure_change is for tracker.kind: synthetic alone; take it out")
