@@ -34,11 +34,12 @@ __all__ = [
 ]
 
 
-# Trackers that bring cameras, those whose files hold poses alone, and all that read what was tracked before.
+# Trackers that bring images too, those that bring cameras, those whose files hold poses alone, and those that need
+# nothing but images, and so can follow a camera.
 WITHOUT_SOURCE = ("synthetic", "socket")
 WITH_CAMERAS = ("colmap", "transforms", *WITHOUT_SOURCE)
 WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
-AFTERWARDS = (*WITH_CAMERAS, *WITHOUT_POINTS, "stella_vslam", "aria", "modp")
+LIVE_TRACKERS = ("klt",)
 
 
 class IntrinsicsSettings(StrictModel):
@@ -285,7 +286,7 @@ class SceneConfig(StrictModel):
             raise ValueError("source.path is missing: give the folder that holds the images")
         if self.source.intrinsics.given and self.tracker.kind in WITH_CAMERAS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
-        if self.source.stream is not None and self.tracker.kind in AFTERWARDS:
+        if self.source.stream is not None and self.tracker.kind not in LIVE_TRACKERS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
         if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")
