@@ -64,18 +64,18 @@ class VideoFile:
         self._lock = Lock()
         self._checksums: dict[int, int] = {}
         self._seeks = True
-        self._front = self._decoder(missing)
+        self._front = self._decoder(missing, in_threads=True)
         self._back: _Decoder | None = None
 
         shown: list[float] = []
         while (stop is None or len(shown) < stop) and self._front.advance():
             shown.append(self._front.shown)
             if len(shown) == 1:
-                self._first = self._front.image()
+                first = self._front.image()
         cut_off = bool(missing) and (stop is None or len(shown) < stop)
-        if not shown or cut_off:
+        if not shown or first is None or cut_off:
             self.close()
-        if not shown:
+        if not shown or first is None:
             raise self._useless(missing)
         if cut_off:
             raise InputError(
@@ -87,7 +87,8 @@ class VideoFile:
         self.names: tuple[str, ...] = tuple(f"{self.path.stem}_{i:06d}" for i in range(len(shown)))
         self._position = {name: i for i, name in enumerate(self.names)}
 
-        height, width = self._first.shape[:2]
+        height, width = first.shape[:2]
+        self._size = (width, height)
         if self._front.turned:
             self.notes.append(
                 f"{self.path} asks to be turned clockwise by {self._front.turned} degrees, and is: its frames are "
@@ -124,8 +125,7 @@ class VideoFile:
     def size(self, name: str) -> tuple[int, int]:
         """(width, height) of the frames."""
         assert name in self._position, name
-        height, width = self._first.shape[:2]
-        return width, height
+        return self._size
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Decoded frame (H, W, 3) uint8 RGB. Raises InputError where it cannot be decoded."""
@@ -149,7 +149,8 @@ class VideoFile:
         if not self._front.advance_to(index):
             return None
         image = self._front.image()
-        self._checksums[index] = _checksum(image)
+        if image is not None:
+            self._checksums[index] = _checksum(image)
         return image
 
     def _old(self, index: int) -> NDArray[np.uint8] | None:
@@ -160,7 +161,7 @@ class VideoFile:
         ahead = index - self._back.index
         if not 0 < ahead <= PASSED_OVER and known is not None and self._seeks and self._seek(index):
             image = self._back.image()
-            if _checksum(image) == known:
+            if image is not None and _checksum(image) == known:
                 return image
             self._seeks = False  # this container's times do not find frames
         if index <= self._back.index or not self._seeks:
@@ -169,6 +170,8 @@ class VideoFile:
         if not self._back.advance_to(index):
             return None
         image = self._back.image()
+        if image is None:
+            return None
         if known is None:
             self._checksums[index] = _checksum(image)
         elif _checksum(image) != known and self._seeks:
@@ -193,9 +196,9 @@ class VideoFile:
         self._back.index = len(self.names)  # somewhere: what comes next begins anew
         return False
 
-    def _decoder(self, missing: int | None = None) -> _Decoder:
+    def _decoder(self, missing: int | None = None, in_threads: bool = False) -> _Decoder:
         try:
-            return _Decoder(self.path)
+            return _Decoder(self.path, in_threads)
         except OSError:
             raise self._useless(missing) from None
 
@@ -211,13 +214,19 @@ class VideoFile:
 
 
 class _Decoder:
-    """A capture that counts. index: of the frame that was decoded last, -1 before the first."""
+    """A capture that counts. index: of the frame that was decoded last, -1 before the first.
 
-    def __init__(self, path: Path) -> None:
+    in_threads: faster, but damaged parts of a stream then look different each time.
+    """
+
+    def __init__(self, path: Path, in_threads: bool) -> None:
         import cv2
 
         with quiet_decoder():
-            self._capture: cv2.VideoCapture = cv2.VideoCapture(str(path))
+            threads = [] if in_threads else [cv2.CAP_PROP_N_THREADS, 1]
+            self._capture: cv2.VideoCapture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, threads)
+            if not self._capture.isOpened():
+                self._capture = cv2.VideoCapture(str(path))
         if not self._capture.isOpened():
             raise OSError(str(path))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
@@ -250,9 +259,10 @@ class _Decoder:
         self._capture.set(cv2.CAP_PROP_POS_MSEC, milliseconds)
         return self.shown if self.advance() else None
 
-    def image(self) -> NDArray[np.uint8]:
-        """The frame that was decoded last (H, W, 3), BGR."""
-        return self._capture.retrieve()[1]
+    def image(self) -> NDArray[np.uint8] | None:
+        """The frame that was decoded last (H, W, 3), BGR; None where it is unusable."""
+        more, image = self._capture.retrieve()
+        return image if more else None
 
     def close(self) -> None:
         self._capture.release()
@@ -287,5 +297,4 @@ def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.flo
 
 
 def _checksum(image: NDArray[np.uint8]) -> int:
-    """Of every fourth row: enough to tell frames of a camera apart, at a fraction of the time of decoding."""
-    return zlib.crc32(np.ascontiguousarray(image[::4]))
+    return zlib.crc32(np.ascontiguousarray(image))

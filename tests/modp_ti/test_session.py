@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
+from fields.camera import PinholeCamera
+from fields.tracked_frame import TrackedFrame
+from modp_ti import session
 from modp_ti.config import load_scene
+from modp_ti.errors import InputError
 from modp_ti.evaluation import absolute_trajectory_error, summary
 from modp_ti.exports.scores_csv import read_scores
 from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory
 from modp_ti.lpips import open_lpips
 from modp_ti.trackers import open_tracker
+from pipelines.stopwatch import Stopwatch
 from tests.modp_ti.runs import FILES, finished_run, run
 
 SCENE = """
@@ -182,3 +189,48 @@ def test_estimated_exposures_are_written_and_the_scores_are_those_of_the_develop
         errors.append(-10 * np.log10(((frame - render) ** 2).mean()))
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert metrics["refined"]["held_out"]["psnr"] == pytest.approx(np.mean(errors), abs=0.02)
+
+
+class LiveTracker:
+    """Two black frames, a note that only their end brings, and something to let go of."""
+
+    def __init__(self):
+        self.notes = ["said first"]
+        self.closed = False
+
+    def __iter__(self):
+        camera = PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)
+        for i in range(2):
+            yield TrackedFrame(i, i / 30, str(i), np.zeros((48, 64, 3), np.float32), camera, np.eye(4))
+        self.notes.append("said last")
+
+    def close(self):
+        self.closed = True
+
+
+class DeafMapper:
+    """A mapper that takes no keyframe."""
+
+    keyframes = ()
+    stopwatch = Stopwatch()
+
+    def compile(self) -> None: ...
+
+    def process(self, frame) -> None: ...
+
+    def finish(self) -> None: ...
+
+
+def test_a_tracker_is_closed_and_heard_to_its_end_however_the_run_ends(tmp_path, monkeypatch):
+    file = tmp_path / "scene.yaml"
+    file.write_text(SCENE)
+    config = load_scene(file)
+    tracker = LiveTracker()
+    monkeypatch.setattr(session, "open_tracker", lambda *_: tracker)
+    monkeypatch.setattr(session, "build_mapper", lambda *_: DeafMapper())
+    said = io.StringIO()
+    with pytest.raises(InputError, match="no frame became a keyframe"):
+        session.run_scene(config, Console(file=said, width=200))
+    assert tracker.closed
+    notes = [line for line in said.getvalue().splitlines() if line.startswith("note: said")]
+    assert notes == ["note: said first", "note: said last"]

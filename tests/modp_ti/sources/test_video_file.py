@@ -98,6 +98,21 @@ def test_frames_behind_a_place_that_seeking_gets_wrong_are_right_all_the_same(mp
         assert np.array_equal(made.read(made.names[i]), expected[i])
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_damaged_video_looks_the_same_whenever_it_is_read(mp4, seed):
+    rng, data = np.random.default_rng(seed), bytearray(mp4.read_bytes())
+    end = data.index(b"moov") - 4
+    for place in rng.integers(500, end, 25):
+        data[place] ^= 0xFF
+    mp4.write_bytes(data)
+    made, again = VideoFile(mp4), VideoFile(mp4)
+    first = [made.read(name) for name in made.names]
+    order = rng.permutation(len(made))
+    assert all(np.array_equal(made.read(made.names[i]), first[i]) for i in order)
+    assert all(np.array_equal(again.read(again.names[i]), first[i]) for i in order)
+    assert len(made) > 20
+
+
 def test_two_threads_may_read(mp4):
     made, expected, wrong = VideoFile(mp4), by_opencv(mp4), []
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -245,3 +246,24 @@ def test_pose_that_is_none_is_named(plane_scene):
     file.write_text("\n".join([*lines[:-1], " ".join(words)]) + "\n")
     message = failure(plane_scene)
     assert "NaN" in message or "not a readable COLMAP model" in message
+
+
+def test_model_of_a_videos_frames_gives_the_frames_that_it_gives_for_images(plane_scene):
+    points = plane_points()
+    plane_scene.write_colmap(points)
+    expected = list(open_colmap(SourceSettings(path=plane_scene.folder), TrackerSettings(kind="colmap")))
+
+    video = plane_scene.folder.parent / "room.mkv"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"FFV1"), 30.0, plane_scene.size)
+    for name in plane_scene.names:
+        writer.write(cv2.imread(str(plane_scene.folder / name)))
+    writer.release()
+    renamed = replace(plane_scene, names=[f"room_{i:06d}.png" for i in range(len(plane_scene.names))])
+    renamed.write_colmap(points)
+    tracker = open_colmap(SourceSettings(path=video), TrackerSettings(kind="colmap"))
+    assert tracker.notes == []
+    for frame, other in zip(tracker, expected, strict=True):
+        assert np.array_equal(frame.image, other.image)
+        np.testing.assert_allclose(frame.T_camera_world, other.T_camera_world)
+        assert np.array_equal(frame.points.pixels, other.points.pixels)
+    tracker.close()
