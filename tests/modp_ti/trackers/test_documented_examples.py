@@ -106,7 +106,7 @@ def test_aria(recording):
     images(recording, recording.root / "rectified", (800, 800), lambda i: f"{i:04d}.png")
     axes = ",".join(f"{axis}_world_device" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
     rows = [f"graph_uid,tracking_timestamp_us,{axes}"]
-    for i, T in enumerate(recording.T_world_camera):
+    for i, T in enumerate(recording.poses_in_world):
         pose = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
         rows.append(f"w,{149202610 + 100_000 * i}," + ",".join(f"{x:.9f}" for x in pose))
     recording.write("mps/slam/closed_loop_trajectory.csv", rows)
@@ -133,7 +133,7 @@ def test_modp(recording):
 
 def test_replica(recording):
     images(recording, recording.root / "room0/results", (1200, 680), lambda i: f"frame{i:06d}.jpg")
-    recording.write("room0/traj.txt", [" ".join(map(str, T.ravel())) for T in recording.T_world_camera])
+    recording.write("room0/traj.txt", [" ".join(map(str, T.ravel())) for T in recording.poses_in_world])
     frames = delivered(recording.root, "replica", 0, "source.stop=2")
     np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
 
