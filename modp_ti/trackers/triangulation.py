@@ -29,7 +29,7 @@ FEATURES_OF_MANY_FRAMES = 1000
 
 # Followed corners: points of narrower angles [degrees] are used where a frame would have fewer than ENOUGH points.
 SURE_ANGLE = 4.0
-ENOUGH = 100
+ENOUGH = 50
 
 # In pixels of the image that the features were found in.
 EPIPOLAR_BAND = 3.0

@@ -31,13 +31,13 @@ class Recording:
     xyz: NDArray[np.float64]
 
     @property
-    def T_world_camera(self) -> NDArray[np.float64]:
+    def poses_in_world(self) -> NDArray[np.float64]:
         return np.linalg.inv(self.T_camera_world)
 
     def tum_lines(self, first_time: float = 0.0, per_second: float = 30.0) -> list[str]:
         """One line a frame: time tx ty tz qx qy qz qw, camera to world."""
         lines = []
-        for i, T in enumerate(self.T_world_camera):
+        for i, T in enumerate(self.poses_in_world):
             numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
             lines.append(f"{first_time + i / per_second:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
         return lines

@@ -1,4 +1,4 @@
-"""Tracker `aria`: MPS's files give camera poses and the points seen; what is missing is named with what it would bring."""
+"""Tracker `aria`: MPS's files give camera poses and points; what is missing is named with what it would bring."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"
 def trajectory_rows(recording, world: str = WORLD) -> list[str]:
     """Device poses each millisecond around each frame: T_world_device = T_world_camera T_camera_device."""
     rows = []
-    for i, T_world_camera in enumerate(recording.T_world_camera):
+    for i, T_world_camera in enumerate(recording.poses_in_world):
         T = T_world_camera @ np.linalg.inv(MOUNT)
         pose = ",".join(f"{x:.9f}" for x in [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()])
         for shift in (-1000, 0, 1000):

@@ -24,7 +24,7 @@ def posed(recording):
 
 
 def lines(recording) -> list[str]:
-    return [" ".join(f"{number:.12e}" for number in T.ravel()) for T in recording.T_world_camera]
+    return [" ".join(f"{number:.12e}" for number in T.ravel()) for T in recording.poses_in_world]
 
 
 def test_every_image_has_the_line_of_its_number(posed):
@@ -50,7 +50,7 @@ def test_every_image_has_the_line_of_its_number(posed):
 )
 def test_wrong_line_is_named(posed, change, parts):
     text = lines(posed)
-    text[2] = " ".join(map(str, change(posed.T_world_camera[2])))
+    text[2] = " ".join(map(str, change(posed.poses_in_world[2])))
     posed.write("traj.txt", text)
     message = posed.failure("replica")
     for part in parts:

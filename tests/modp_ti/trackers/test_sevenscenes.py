@@ -20,7 +20,7 @@ def posed(recording):
 
 
 def write_poses(recording, folder: str = "poses") -> None:
-    for i, T in enumerate(recording.T_world_camera):
+    for i, T in enumerate(recording.poses_in_world):
         rows = ["\t".join(f"{number:.9e}" for number in row) + "\t" for row in T]  # as the data set writes them
         recording.write(f"{folder}/frame-{i:06d}.pose.txt", rows)
 
@@ -57,7 +57,7 @@ def test_frames_without_a_pose_are_skipped_and_counted(posed):
     ],
 )
 def test_wrong_pose_file_is_named(posed, change, parts):
-    rows = change(list(posed.T_world_camera[2]))
+    rows = change(list(posed.poses_in_world[2]))
     posed.write("poses/frame-000002.pose.txt", [" ".join(map(str, row)) for row in rows])
     message = posed.failure("sevenscenes")
     for part in parts:

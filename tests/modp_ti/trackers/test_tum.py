@@ -1,4 +1,4 @@
-"""Tracker `tum`: any trajectory in TUM's format, with points of a file or none; what is wrong is named with its line."""
+"""Tracker `tum`: any trajectory in TUM's format, with points of a file or none; what is wrong is named by line."""
 
 from __future__ import annotations
 
