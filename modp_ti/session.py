@@ -8,6 +8,7 @@ import resource
 import shutil
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -32,7 +33,7 @@ from modp_ti.lpips import open_lpips
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
 from modp_ti.tracked_points import TrackedPoints
-from modp_ti.trackers import Tracker, close, frame_count, may_read_ahead, open_tracker
+from modp_ti.trackers import close, frame_count, may_read_ahead, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
@@ -71,8 +72,13 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     Nothing is written before the map is finished; the files then appear together. Raises InputError for input that
     cannot be used.
     """
+    with ExitStack() as held:
+        return _run(config, console or Console(quiet=True), held)
+
+
+def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
+    """`run_scene`; held: takes what is to be closed at its end, however it ends."""
     started = time.perf_counter()
-    console = console or Console(quiet=True)
     line = ProgressLine(console)
     try:
         backend = initialise(config.device, config.threads, config.seed)
@@ -81,22 +87,7 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
     console.print(f"device: {describe(backend)}", highlight=False, soft_wrap=True)
     tick = time.perf_counter()
     tracker = open_tracker(config, line.prepare)
-    try:
-        return _run(config, console, line, backend, tracker, started, tick)
-    finally:
-        close(tracker)
-
-
-def _run(
-    config: SceneConfig,
-    console: Console,
-    line: ProgressLine,
-    backend: str,
-    tracker: Tracker,
-    started: float,
-    tick: float,
-) -> Path:
-    """The run on an opened tracker. started, tick: when the run and the opening of the tracker began."""
+    held.callback(close, tracker)
     ahead = config.source.prefetch if may_read_ahead(tracker) else 0
     with FramesAhead(tracker, ahead) as frames:
         first = next(frames, None)
@@ -104,8 +95,8 @@ def _run(
             raise InputError("the tracker delivered no frame: nothing to map")
         prepared = time.perf_counter() - tick
         lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
-        said = len(tracker.notes)
-        _say(console, [*tracker.notes[:said], *([no_lpips] if no_lpips else [])])
+        notes = [*tracker.notes, *([no_lpips] if no_lpips else [])]
+        _say(notes, console)
 
         mapper = build_mapper(config, first.camera)
         watch = mapper.stopwatch
@@ -116,7 +107,7 @@ def _run(
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
         poses = _map(mapper, chain([first], _timed(frames, watch)), line)
         mapping_seconds = time.perf_counter() - tick
-    _say(console, tracker.notes[said:])  # how a live tracker's frames ended
+    _say([note for note in tracker.notes if note not in notes], console)
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     if len(mapper.keyframes) == 0:
         raise InputError(
@@ -183,7 +174,7 @@ def _run(
     return config.output
 
 
-def _say(console: Console, notes: list[str]) -> None:
+def _say(notes: Iterable[str], console: Console) -> None:
     for note in notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
 

@@ -44,6 +44,13 @@ class TrackedPoints:
         self.rows.append(rows)
         self.pixels.append(points.pixels.astype(np.float32))
 
+    def move(self, ids: NDArray[np.int64], xyz: NDArray[np.float64]) -> None:
+        """Points that a tracker has moved, by its ids (M,), to their places (M, 3); unknown ones are ignored."""
+        for i, place in zip(ids.tolist(), xyz, strict=True):
+            row = self._row_of.get(i)
+            if row is not None:
+                self._xyz[row] = place
+
     def _grow(self, count: int) -> None:
         if count <= len(self._xyz):
             return

@@ -18,7 +18,8 @@ Progress = Callable[[str, int, int], None]
 class Tracker(Protocol):
     """Delivers frames in order, each decoded when it is asked for.
 
-    notes: one-line remarks for the user, known when the tracker is opened, such as frames that were skipped.
+    notes: one-line remarks for the user, known when the tracker is opened, such as frames that were skipped; one that
+    is live may have more of them once its frames have ended.
     A tracker that knows how many frames it will deliver has `__len__`. One whose frames may be read in a thread
     beside the mapper has `reads_ahead = True`; it must not start Taichi's kernels then, which one thread alone may do.
     A tracker that revises poses has `events()`, an iterator over its frames and, between them, `PoseCorrection`s of
@@ -38,6 +39,12 @@ def events(tracker: Tracker) -> Iterator[TrackedFrame | PoseCorrection]:
     return tracker.events() if hasattr(tracker, "events") else iter(tracker)
 
 
+def close(tracker: Tracker) -> None:
+    """Let go of what the tracker holds open: a camera, a file, a socket."""
+    if hasattr(tracker, "close"):
+        tracker.close()
+
+
 def frame_count(tracker: Tracker) -> int | None:
     """How many frames the tracker delivers; None where it does not know, as with a live camera."""
     return len(tracker) if hasattr(tracker, "__len__") else None
@@ -46,9 +53,3 @@ def frame_count(tracker: Tracker) -> int | None:
 def may_read_ahead(tracker: Tracker) -> bool:
     """Whether a thread may iterate over the tracker while the mapper works; not unless it says so."""
     return getattr(tracker, "reads_ahead", False)
-
-
-def close(tracker: Tracker) -> None:
-    """Let go of what the tracker holds open, where it holds anything."""
-    if hasattr(tracker, "close"):
-        tracker.close()

@@ -107,6 +107,7 @@ def test_a_lens_and_a_scale_are_treated_as_the_colmap_reader_does(plane_scene, t
         connection.sendall(message(END))
         got = list(tracker)
     assert len(got) == len(expected) == 7
+    assert "the tracker there is a tracker" in tracker.notes
     for ours, theirs in zip(got, expected, strict=True):
         assert ours.camera == theirs.camera
         np.testing.assert_array_equal(ours.T_camera_world, theirs.T_camera_world)
