@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,14 +67,16 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
     line = ProgressLine(console)
     tracker = open_tracker(config, line.prepare)
     try:
+        frames = iter(tracker)
+        first = next(frames, None)
+        if first is None:
+            raise InputError("the tracker delivered no frame: nothing to check")
         total = frame_count(tracker)
         line.start_mapping(total, "checking")
         try:
-            seen = survey(tracker, total, lambda _: line.frame(None))
+            seen = survey(chain([first], frames), total, lambda _: line.frame(None))
         finally:
             line.stop()
-        if not seen.frames:
-            raise InputError("the tracker delivered no frame: nothing to check")
         geometry, scale = measure_geometry(seen), measure_scale(seen.frames)
         findings = [
             *judge_geometry(geometry),

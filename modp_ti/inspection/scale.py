@@ -28,8 +28,8 @@ FIELD_OF_VIEW = (20.0, 130.0)  # [degrees] across, of cameras that are not suspi
 class Scale:
     """How deep the scene is, and how far the camera goes in it.
 
-    depth: median over the frames of the median depth of their points [scene units], NaN without points. In depths: step,
-    the median way between frames; longest, the greatest; extent, the diagonal of the box of all camera centres.
+    depth: median over the frames of the median depth of their points [scene units], NaN without points. In depths:
+    step, the median way between frames; longest, the greatest; extent, the diagonal of the box of all camera centres.
     """
 
     depth: float

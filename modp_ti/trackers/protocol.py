@@ -39,6 +39,12 @@ def events(tracker: Tracker) -> Iterator[TrackedFrame | PoseCorrection]:
     return tracker.events() if hasattr(tracker, "events") else iter(tracker)
 
 
+def close(tracker: Tracker) -> None:
+    """Let go of what the tracker holds open: a camera, a file, a socket."""
+    if hasattr(tracker, "close"):
+        tracker.close()
+
+
 def frame_count(tracker: Tracker) -> int | None:
     """How many frames the tracker delivers; None where it does not know, as with a live camera."""
     return len(tracker) if hasattr(tracker, "__len__") else None
@@ -47,9 +53,3 @@ def frame_count(tracker: Tracker) -> int | None:
 def may_read_ahead(tracker: Tracker) -> bool:
     """Whether a thread may iterate over the tracker while the mapper works; not unless it says so."""
     return getattr(tracker, "reads_ahead", False)
-
-
-def close(tracker: Tracker) -> None:
-    """Let go of what the tracker holds open: a camera, a file, a socket."""
-    if hasattr(tracker, "close"):
-        tracker.close()

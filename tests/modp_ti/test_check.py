@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import struct
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from modp_ti.cli import app
+from tests.modp_ti.trackers.door import doors
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -90,7 +94,7 @@ def test_a_planted_fault_is_named(fault: str, plane_scene, tmp_path: Path) -> No
 def test_a_planted_fault_is_named_on_desk(fault: str, shared_data, tmp_path: Path) -> None:
     desk = shared_data("desk")
     planted(desk / "sparse" / "0", tmp_path / "fault", **FAULTS[fault][0])
-    file = scene_file(tmp_path, desk / "images", tmp_path / "fault", scale=0.25, stop=15)
+    file = scene_file(tmp_path, desk / "images", tmp_path / "fault", scale=0.25, stop=9)
     assert_named(fault, *checked(file))
 
 
@@ -124,15 +128,19 @@ def test_points_of_another_world_are_told_from_wrong_poses(plane_scene, tmp_path
 def test_blurred_repeated_and_missing_frames_are_named(plane_scene, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
-    images = {name: cv2.imread(str(plane_scene.folder / name)) for name in plane_scene.names}
+    images = {}
+    for name in plane_scene.names:  # with the fine grain that photographs have
+        smooth = cv2.imread(str(plane_scene.folder / name))
+        images[name] = np.clip(smooth + rng.normal(0, 12, smooth.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(plane_scene.folder / name), images[name])
     cv2.imwrite(str(plane_scene.folder / "view10.png"), cv2.blur(images["view10.png"], (9, 1)))
     cv2.imwrite(str(plane_scene.folder / "view12.png"), images["view11.png"])
-    for i in range(6):  # frames without a pose before the last one: a gap of a fifth of a second at 30 a second
+    for i in range(6):  # frames without a pose, sorted before view13: a gap of a fifth of a second at 30 a second
         cv2.imwrite(str(plane_scene.folder / f"view13-{i}.png"), images["view13.png"])
     code, data = checked(scene_file(tmp_path, plane_scene.folder, model))
     assert data["blurred"] == ["view10.png"]
     assert data["duplicates"] == ["view12.png"]
-    assert data["time_gaps"] == ["view14.png"]
+    assert data["time_gaps"] == ["view13.png"]
     assert data["notes"] == [f"6 of 13 images have no pose in {model}: skipped"]
     assert codes(data)["duplicates"] == "warning"  # one in seven
     assert code >= 1
@@ -154,6 +162,33 @@ def test_the_figures_are_those_of_the_input(plane_scene, tmp_path: Path) -> None
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     assert 3.5 < data["scale"]["depth"] < 5
     assert data["scale"]["longest_step"] == pytest.approx(steps.max() / data["scale"]["depth"], rel=1e-4)
+
+
+def test_frames_that_come_through_a_socket_are_checked_as_they_arrive(plane_scene, tmp_path: Path) -> None:
+    K = plane_scene.K
+
+    def send() -> None:
+        path = tmp_path / "door"
+        while not path.exists():
+            time.sleep(0.05)
+        with doors.connect(path) as connection:
+            start = struct.pack("<IIII12d", 320, 240, 2, 0, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *[0.0] * 8)
+            connection.sendall(doors.message(doors.HELLO, start))
+            for i, (name, T) in enumerate(zip(plane_scene.names, plane_scene.T_camera_world, strict=True)):
+                data = (plane_scene.folder / name).read_bytes()
+                connection.sendall(doors.message(doors.FRAME, doors.frame(i, T=np.linalg.inv(T), image=data)))
+            connection.sendall(doors.message(doors.END))
+            assert doors.answer(connection)[0] == doors.WELCOME
+            assert doors.answer(connection)[0] == doors.DONE
+
+    file = tmp_path / "scene.yaml"
+    file.write_text("tracker: {kind: socket, path: door}\noutput: out\n")
+    sender = threading.Thread(target=send)
+    sender.start()
+    code, data = checked(file)
+    sender.join()
+    assert (code, data["frames"]) == (2, 7)
+    assert codes(data) == {"inverse_poses": "unusable", "points": "unusable"}
 
 
 def test_an_input_that_cannot_be_read_is_unusable(tmp_path: Path) -> None:

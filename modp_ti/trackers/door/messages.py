@@ -224,10 +224,9 @@ def parse_hello(payload: bytes) -> Hello:
     except UnicodeDecodeError:
         raise ProtocolError("HELLO: the tracker's name must be UTF-8") from None
     camera = PinholeCamera(fx, fy, cx, cy, width, height)
-    # What a terminal shows of it must be text.
-    return Hello(
-        Intrinsics(camera, distortion), Encoding(encoding), "".join(c if c.isprintable() else "?" for c in name)
-    )
+    # A terminal shows it: nothing that it could take for more than text.
+    name = "".join(c if c.isalnum() or c in " ._-" else "?" for c in name)
+    return Hello(Intrinsics(camera, distortion), Encoding(encoding), name)
 
 
 def parse_frame(payload: bytes, kind: Kind) -> Frame:

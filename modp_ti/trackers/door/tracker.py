@@ -74,6 +74,7 @@ class DoorTracker:
         self._history = History()
         self._indices: dict[int, int] = {}  # of the frames that went to the mapper, by their numbers
         self._dropped = 0
+        self._name = ""
         self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
         self._closed = Event()
         self._ended = False
@@ -174,6 +175,7 @@ class DoorTracker:
                 if header.kind is Kind.HELLO:
                     hello = parse_hello(payload)
                     self._prepare(hello)
+                    self._name = hello.name
                     connection.say(Kind.WELCOME)
                 else:
                     self._take(header.kind, payload, ordering)
@@ -227,6 +229,8 @@ class DoorTracker:
         name = self._spool.add(frame)
         self._reader.require_fitting([(name, self._undistorter)])
         ordering.add_frame(frame)
+        if len(self._spool) == 1 and self._name:
+            self.notes.append(f"the tracker there is {self._name}")
 
     def _deliver(self, ordering: Ordering) -> None:
         """Hand on what is ready, waiting for the mapper where it has enough."""
