@@ -13,7 +13,8 @@ from fields.se3 import exp_se3, inverse_se3
 from fields.similarity import motion_around, moved_points, moved_pose, scale_of
 from pipelines.corrections import WorldMotion, lag_in_pixels, revise
 from pipelines.mapping import OnlineMapper
-from pipelines.settings import MappingSettings
+from pipelines.offline import OfflineMapper
+from pipelines.settings import MappingSettings, OfflineSettings
 
 from .wall import CAMERA, frame, pose
 
@@ -96,6 +97,18 @@ def test_the_lag_is_the_shift_of_the_picture() -> None:
     assert lag_in_pixels(view) == pytest.approx(0.6, rel=1e-6)
     view.lag = motion_around(pose(0), exp_se3([0, 0, 0, 0, np.pi, 0]) @ pose(0))
     assert lag_in_pixels(view) == np.inf
+
+
+def test_an_offline_map_starts_from_the_corrected_poses_and_points(taichi_on_the_cpu: None) -> None:
+    mapper = OfflineMapper(OfflineSettings(max_gaussians=1024), 64, 48)
+    for i in range(3):
+        mapper.process(frame(i))
+    assert not mapper.correct(correction([0, 2], S)).moved
+    mapper.initialise()
+    for i, view in enumerate(mapper.keyframes):
+        np.testing.assert_allclose(view.T_camera_world, moved_pose(S, pose(i)), atol=1e-9)
+    expected = np.concatenate([moved_points(S, frame(i).points.xyz) for i in range(3)])
+    np.testing.assert_allclose(mapper.gaussians.to_numpy()["position"], expected, atol=1e-5)
 
 
 # ---- the map ---------------------------------------------------------------------------------------------------------
