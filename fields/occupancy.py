@@ -70,6 +70,7 @@ class OccupancyVoxels:
         for fan_out in inner:
             node = node.pointer(ti.ijk, (fan_out,) * 3)
         node.dense(ti.l, WORDS).place(self.words)
+        self._bricks = node
         builder.finalize()
         refuse_too_many_fields(self.words)
 
@@ -162,8 +163,10 @@ class OccupancyVoxels:
 
     @ti.kernel
     def _clear(self):
-        for place in ti.grouped(self.words):
-            self.words[place] = ti.u64(0)
+        # Over bricks: a loop over the words themselves passes some by (Taichi 1.7.4).
+        for i, j, k in self._bricks:
+            for word in range(WORDS):
+                self.words[i, j, k, word] = ti.u64(0)
 
     @ti.kernel
     def _query(self, cells: CELLS, level: LEVELS, out: FLAGS):

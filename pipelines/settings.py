@@ -172,7 +172,7 @@ class CorrectionSettings(StrictModel):
         ge=0,
         description="displacement of a keyframe's picture beyond which they do [px]; smaller ones add up until then",
     )
-    steps: int = Field(10, ge=0, description="optimisation steps on keyframes that have moved, after Gaussians have")
+    steps: int = Field(20, ge=0, description="optimisation steps on keyframes that have moved, after Gaussians have")
     views: int = Field(4, ge=1, description="such keyframes per step, drawn as the global views are")
 
 

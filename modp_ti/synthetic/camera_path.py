@@ -21,10 +21,10 @@ STATIONS = np.array(
     ]
 )
 
-# A way there, back a little lower and nearer to the furniture, and on along its beginning.
-BACK = np.array([[0.0, 0.18, -0.14], [0.0, 0.0, 0.0]])
-LOOP = np.concatenate([STATIONS[:5], STATIONS[3:0:-1] + BACK, STATIONS[:2]])
-LOOP_CLOSES = 8 / 9  # where it is at its first station again
+# The loop: around a circle, looking outwards, once and on over the views that it began with.
+LOOP_CENTRE, LOOP_RADIUS, LOOP_TILT = np.array([-0.1, -0.5, 1.42]), 0.5, -0.22  # [m], [m], rise a metre
+LOOP_START = np.radians(60.0)
+LOOP_CLOSES = 0.9  # share of the time after which it looks as at its beginning again
 
 # Hand tremor: amplitude, cycles over the whole path and phase of each coordinate, for eye and target.
 TREMOR = 0.012  # [m]
@@ -47,19 +47,29 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 def camera_path(frames: int, loop: bool = False) -> list[NDArray[np.float64]]:
     """T_camera_world (4, 4) in metres of `frames` views at equal steps of time.
 
-    loop: along a way that comes back to its beginning, at the share LOOP_CLOSES of the time.
+    loop: around the room instead; at the share LOOP_CLOSES of the time the camera is where it began.
     """
-    stations = LOOP if loop else STATIONS
-    return [look_at(*_eye_and_target(stations, t)) for t in np.linspace(0.0, 1.0, frames)]
+    return [look_at(*((_on_the_loop if loop else _on_the_way)(t) + _tremor(t))) for t in np.linspace(0.0, 1.0, frames)]
 
 
-def _eye_and_target(stations: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-    """(2, 3) at time t in [0, 1]: a Catmull-Rom spline through the stations, plus the tremor."""
-    padded = np.concatenate([2 * stations[:1] - stations[1:2], stations, 2 * stations[-1:] - stations[-2:-1]])
-    position = t * (len(stations) - 1)
-    k = min(int(position), len(stations) - 2)
+def _on_the_loop(t: float) -> NDArray[np.float64]:
+    """Eye and target (2, 3) at time t in [0, 1]."""
+    angle = LOOP_START + 2 * np.pi * t / LOOP_CLOSES
+    way = np.array([np.cos(angle), np.sin(angle), 0.0])
+    eye = LOOP_CENTRE + LOOP_RADIUS * way
+    return np.stack([eye, eye + way + [0.0, 0.0, LOOP_TILT]])
+
+
+def _on_the_way(t: float) -> NDArray[np.float64]:
+    """Eye and target (2, 3) at time t in [0, 1]: a Catmull-Rom spline through the stations."""
+    padded = np.concatenate([2 * STATIONS[:1] - STATIONS[1:2], STATIONS, 2 * STATIONS[-1:] - STATIONS[-2:-1]])
+    position = t * (len(STATIONS) - 1)
+    k = min(int(position), len(STATIONS) - 2)
     s = position - k
     a, b, c, d = padded[k : k + 4]
-    smooth = b + 0.5 * s * (c - a + s * (2 * a - 5 * b + 4 * c - d + s * (3 * (b - c) + d - a)))
-    tremor = TREMOR * np.sin(2 * np.pi * TREMOR_CYCLES * t + TREMOR_PHASES).sum(axis=0)
-    return smooth + tremor
+    return b + 0.5 * s * (c - a + s * (2 * a - 5 * b + 4 * c - d + s * (3 * (b - c) + d - a)))
+
+
+def _tremor(t: float) -> NDArray[np.float64]:
+    """What the hand adds to eye and target (2, 3) at time t in [0, 1]."""
+    return TREMOR * np.sin(2 * np.pi * TREMOR_CYCLES * t + TREMOR_PHASES).sum(axis=0)

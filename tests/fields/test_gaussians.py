@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.gaussians import GaussianField
+from fields.gaussians import NO_ANCHOR, GaussianField
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +78,21 @@ def test_a_gaussian_in_a_place_that_was_freed_has_no_history(gaussians: Gaussian
     gaussians.append(**state(10, 1))
     for field in (gaussians.position_m, gaussians.sh_v, gaussians.steps, gaussians.position.grad):
         assert (field.to_numpy()[:10] == 0).all()
+
+
+def test_anchors_stay_with_their_gaussians_through_growth_and_removal(gaussians: GaussianField) -> None:
+    for anchor in (7, 3, 0):
+        gaussians.append(**state(900, anchor), anchor=anchor)
+    gaussians.append(**state(10, 9))
+    # The first coefficient tells which Gaussian it is.
+    owner = dict(zip(gaussians.to_numpy()["sh"][:, 0, 0].tolist(), gaussians.anchors().tolist(), strict=True))
+    assert gaussians.anchors().tolist() == [7] * 900 + [3] * 900 + [0] * 900 + [NO_ANCHOR] * 10
+    gaussians.remove(np.random.default_rng(0).random(len(gaussians)) < 0.4)
+    gaussians.append(**state(50, 11), anchor=12)
+    kept = gaussians.to_numpy()["sh"][:-50, 0, 0].tolist()
+    assert gaussians.anchors().tolist() == [owner[value] for value in kept] + [12] * 50
+    gaussians.load(gaussians.to_numpy())
+    assert (gaussians.anchors() == NO_ANCHOR).all()
 
 
 def test_loading_what_was_saved_changes_nothing(gaussians: GaussianField) -> None:

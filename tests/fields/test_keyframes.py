@@ -6,6 +6,7 @@ import pytest
 from fields.camera import PinholeCamera
 from fields.keyframes import KeyframeStore
 from fields.se3 import exp_se3
+from fields.similarity import motion_around
 from fields.tracked_frame import SparsePoints, TrackedFrame
 
 CAMERA = PinholeCamera(10.0, 40.0, 4.0, 3.0, 8, 6)
@@ -96,3 +97,24 @@ def test_exposure_that_is_not_estimated_is_none() -> None:
     store.append(frame(0))
     assert store.append(frame(1)).exposure is None
     assert store.exposure_at(5) is None
+
+
+def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
+    store = KeyframeStore()
+    keyframe = store.append(frame(0, T=exp_se3([1, 2, 3, 0.1, 0.2, 0.3])))
+    keyframe.T_camera_world = exp_se3([0.02, 0.01, -0.03, 0.002, 0.001, 0.004]) @ keyframe.T_tracked
+    refinement, points = keyframe.correction, keyframe.points
+    seen = points.xyz @ keyframe.T_camera_world[:3, :3].T + keyframe.T_camera_world[:3, 3]
+    T = exp_se3([-0.5, 0.3, 2, -0.4, 0.1, 0])
+    S = motion_around(keyframe.T_tracked, T, 1.5)
+    keyframe.revise(T, S)
+    store.take_in_depths()
+    np.testing.assert_array_equal(keyframe.T_tracked, T)
+    refinement[:3, 3] *= 1.5
+    np.testing.assert_allclose(keyframe.correction, refinement, atol=1e-12)
+    now = keyframe.points.xyz @ keyframe.T_camera_world[:3, :3].T + keyframe.T_camera_world[:3, 3]
+    np.testing.assert_allclose(now, 1.5 * seen, atol=1e-12)
+    assert store.scene_depth == keyframe.median_depth == pytest.approx(6.0)
+    np.testing.assert_allclose(keyframe.lag, S)
+    keyframe.revise_points(SparsePoints(now @ T[:3, :3], points.pixels, points.ids))
+    assert keyframe.median_depth == pytest.approx(np.median(now[:, 2]) + T[2, 3])

@@ -169,6 +169,17 @@ def test_the_level_is_the_finest_with_cells_no_smaller_than_asked(voxels: Callab
     assert v.level_of([1.0, 0.05, 0.0501, 0.025, 0.0251, 0.05 / 128, 1e-9, 0.0]).tolist() == [0, 0, 0, 1, 0, 7, 7, 7]
 
 
+def test_cleared_voxels_are_as_good_as_fresh_ones(voxels: Callable[..., OccupancyVoxels]) -> None:
+    rng = np.random.default_rng(3)
+    v, plain = voxels(1.0, levels=6, resolution=64), PlainVoxels(0.7, 6)
+    v.update(rng.uniform(-2, 2, (500, 3)), 0.05)
+    v.clear()
+    v.settle(0.7, (0.0, 0.0, 0.0))
+    points = rng.uniform(-2, 2, (500, 3))
+    assert not v.query(points, 5.0).any()
+    assert v.admit(points, 0.1).tolist() == [plain.admit(p, 0.1) for p in points]
+
+
 @pytest.mark.parametrize("wrong", [{"levels": 0}, {"levels": 12, "resolution": 512}, {"coarsest": 0.0}])
 def test_impossible_voxels_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="voxels need"):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fields.camera import PinholeCamera
+from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 from modp_ti.errors import InputError
 from modp_ti.prefetch import FramesAhead
@@ -59,6 +60,16 @@ def test_frames_and_their_pyramids_are_ready_before_they_are_asked_for_but_no_mo
         assert [level.rgba.shape for level in first.pyramid] == [(200, 240, 4), (100, 120, 4)]
         assert source.reached.wait(timeout=30)
         assert len(source.read) == 4
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 8])
+def test_corrections_come_in_their_places(ahead: int) -> None:
+    items: list[TrackedFrame | PoseCorrection] = list(Source(6))
+    items.insert(3, PoseCorrection(np.arange(3), np.tile(np.eye(4), (3, 1, 1))))
+    items.append(PoseCorrection(np.arange(6), np.tile(np.eye(4), (6, 1, 1))))
+    with FramesAhead(items, ahead) as ready:
+        taken = list(ready)
+    assert len(taken) == 8 and all(a is b for a, b in zip(taken, items, strict=True))
 
 
 @pytest.mark.parametrize("ahead", [0, 1, 8])

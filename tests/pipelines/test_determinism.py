@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[2]
-# The wall of test_mapping.py: every stage, with pruning, pose refinement and post refinement.
+# The wall of test_mapping.py: every stage, with a correction, pruning, pose refinement and post refinement.
 CODE = """
 import hashlib, sys
+import numpy as np
 from fields.backend import initialise
+from fields.pose_correction import PoseCorrection
+from fields.se3 import exp_se3
 from pipelines.mapping import OnlineMapper
 from pipelines.refinement import refine
 from pipelines.settings import RefineSettings
@@ -20,6 +23,9 @@ initialise("cpu", threads=int(sys.argv[1]))
 mapper = OnlineMapper(SETTINGS, 64, 48, seed=5)
 for i in range(5):
     mapper.process(frame(i))
+    if i == 3:
+        ends = np.stack([exp_se3([0.2, 0, 0.1, 0, 0.03 * j, 0]) @ frame(j).T_camera_world for j in (0, 3)])
+        assert mapper.correct(PoseCorrection(np.array([0, 3]), ends)).moved
 mapper.finish()
 refine(mapper, RefineSettings(steps=20))
 digest = hashlib.sha256()

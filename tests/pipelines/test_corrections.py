@@ -1,0 +1,234 @@
+"""Corrections of a tracker, on the wall of test_mapping.py, whose right poses are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fields.keyframes import KeyframeStore
+from fields.pose_correction import PoseCorrection
+from fields.se3 import exp_se3, inverse_se3
+from fields.similarity import motion_around, moved_points, moved_pose, scale_of
+from pipelines.corrections import WorldMotion, lag_in_pixels, revise
+from pipelines.mapping import OnlineMapper
+from pipelines.offline import OfflineMapper
+from pipelines.settings import MappingSettings, OfflineSettings
+
+from .wall import CAMERA, frame, pose
+
+# The world after a correction by the world before: turned, shifted, grown.
+S = np.diag([1.2, 1.2, 1.2, 1.0]) @ exp_se3([0.4, -0.1, 0.3, 0.05, 0.2, -0.1])
+
+
+def correction(index: list[int], S: np.ndarray, points: bool = True) -> PoseCorrection:
+    """The tracker has moved by S what these frames saw."""
+    frames = [frame(i) for i in index]
+    poses = np.stack([moved_pose(S, f.T_camera_world) for f in frames])
+    if not points:
+        return PoseCorrection(np.array(index), poses)
+    ids = np.concatenate([f.points.ids for f in frames])
+    xyz = np.concatenate([moved_points(S, f.points.xyz) for f in frames])
+    order = np.random.default_rng(0).permutation(len(ids))
+    return PoseCorrection(np.array(index), poses, ids[order], xyz[order])
+
+
+# ---- poses and points ------------------------------------------------------------------------------------------------
+
+
+def test_frames_go_with_the_named_ones_around_them() -> None:
+    a, b = exp_se3([0.3, 0, 0.1, 0, 0.2, 0]), S
+    T = [pose(i) for i in range(7)]
+    motion = WorldMotion(np.array([2, 4]), np.stack([moved_pose(a, T[2]), moved_pose(b, T[4])]), np.stack([a, b]))
+    for index, M in ((0, a), (2, a), (4, b), (6, b)):
+        after, around = motion.of(index, T[index])
+        np.testing.assert_allclose(after, moved_pose(M, T[index]), atol=1e-9)
+        np.testing.assert_allclose(around, M, atol=1e-9)
+    after, around = motion.of(3, T[3])
+    # Half way between where it would be with either: as far from one as from the other.
+    ends = [moved_pose(M, T[3]) for M in (a, b)]
+    np.testing.assert_allclose(after @ inverse_se3(ends[0]), ends[1] @ inverse_se3(after), atol=1e-9)
+    assert scale_of(around) == pytest.approx(np.sqrt(1.2))
+    np.testing.assert_allclose(moved_pose(around, T[3]), after, atol=1e-9)
+
+
+def test_a_correction_that_names_no_known_frame_moves_nothing() -> None:
+    motion = revise(KeyframeStore(), {}, correction([3], S))
+    after, around = motion.of(5, pose(5))
+    np.testing.assert_array_equal(after, pose(5))
+    np.testing.assert_array_equal(around, np.eye(4))
+
+
+def test_keyframes_take_poses_points_and_scale_over() -> None:
+    store = KeyframeStore()
+    for i in range(5):
+        store.append(frame(i))
+    tracked = {i: frame(i).T_camera_world for i in range(5)}
+    depth = store.scene_depth
+    # Frames 1 and 4 are not named, nor are the points of frame 3.
+    named = correction([0, 2, 3], S)
+    known = ~np.isin(named.ids, frame(3).points.ids)
+    revise(store, tracked, PoseCorrection(named.index, named.T_camera_world, named.ids[known], named.xyz[known]))
+    for i, view in enumerate(store):
+        np.testing.assert_allclose(view.T_tracked, moved_pose(S, pose(i)), atol=1e-9)
+        np.testing.assert_allclose(view.points.xyz, moved_points(S, frame(i).points.xyz), atol=1e-9)
+        np.testing.assert_allclose(view.lag, S, atol=1e-9)
+    assert store.scene_depth == pytest.approx(1.2 * depth)
+
+
+def test_without_points_the_scale_stays() -> None:
+    store = KeyframeStore()
+    for i in range(3):
+        store.append(frame(i))
+    revise(store, {i: frame(i).T_camera_world for i in range(3)}, correction([0, 1, 2], S, points=False))
+    for i, view in enumerate(store):
+        assert scale_of(view.lag) == pytest.approx(1.0)
+        assert view.median_depth == pytest.approx(np.median(frame(i).points.depths(pose(i))))
+
+
+def test_the_lag_is_the_shift_of_the_picture() -> None:
+    store = KeyframeStore()
+    view = store.append(frame(0))
+    assert lag_in_pixels(view) == 0.0
+    # Sideways by a hundredth of the depth: the focal length is 60 pixels.
+    view.revise(exp_se3([0.01 * view.median_depth, 0, 0, 0, 0, 0]) @ view.T_tracked, np.eye(4))
+    view.lag = motion_around(pose(0), view.T_tracked)
+    assert lag_in_pixels(view) == pytest.approx(0.6, rel=1e-6)
+    view.lag = motion_around(pose(0), exp_se3([0, 0, 0, 0, np.pi, 0]) @ pose(0))
+    assert lag_in_pixels(view) == np.inf
+
+
+def test_an_offline_map_starts_from_the_corrected_poses_and_points(taichi_on_the_cpu: None) -> None:
+    mapper = OfflineMapper(OfflineSettings(max_gaussians=1024), 64, 48)
+    for i in range(3):
+        mapper.process(frame(i))
+    assert not mapper.correct(correction([0, 2], S)).moved
+    mapper.initialise()
+    for i, view in enumerate(mapper.keyframes):
+        np.testing.assert_allclose(view.T_camera_world, moved_pose(S, pose(i)), atol=1e-9)
+    expected = np.concatenate([moved_points(S, frame(i).points.xyz) for i in range(3)])
+    np.testing.assert_allclose(mapper.gaussians.to_numpy()["position"], expected, atol=1e-5)
+
+
+# ---- the map ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mapped(taichi_on_the_cpu: None) -> OnlineMapper:
+    """A map of five frames of the wall. Tests leave it in a world of their own: each starts from the poses it finds."""
+    settings = MappingSettings(
+        optimise={"steps": 5, "last_steps": 5}, densify={"warm_up": 2, "pixels": 3000}, corrections={"steps": 0}
+    )
+    mapper = OnlineMapper(settings, 64, 48, seed=1)
+    for i in range(5):
+        mapper.process(frame(i))
+    return mapper
+
+
+def moving(mapper: OnlineMapper, S: np.ndarray) -> PoseCorrection:
+    """All keyframes and their points go with S."""
+    views = list(mapper.keyframes)
+    return PoseCorrection(
+        np.array([view.index for view in views]),
+        np.stack([moved_pose(S, view.T_tracked) for view in views]),
+        np.concatenate([view.points.ids for view in views]),
+        np.concatenate([moved_points(S, view.points.xyz) for view in views]),
+    )
+
+
+def everything(mapper: OnlineMapper) -> dict[str, np.ndarray]:
+    """All that the next frame would be mapped with."""
+    state = mapper.gaussians.to_numpy()
+    state["anchor"] = mapper.gaussians.anchors()
+    for name in ("position_m", "quaternion_v", "sh_m"):
+        state[name] = getattr(mapper.gaussians, name).to_numpy()[: len(mapper.gaussians)]
+    for view in mapper.keyframes:
+        state[f"pose {view.index}"], state[f"points {view.index}"] = view.T_camera_world, view.points.xyz
+    sizes = mapper.voxels.coarsest / 2.0 ** np.arange(mapper.voxels.levels)
+    state["occupied"] = np.stack([mapper.voxels.query(state["position"], size) for size in sizes])
+    state["draws"] = np.array(str(mapper.rng.bit_generator.state))
+    return state
+
+
+def test_a_correction_of_nothing_changes_no_bit(mapped: OnlineMapper) -> None:
+    settings = mapped.settings
+    changed = settings.corrections.model_copy(update={"min_pixels": 0.0, "steps": 5})
+    mapped.settings = settings.model_copy(update={"corrections": changed})
+    before = everything(mapped)
+    assert not mapped.correct(moving(mapped, np.eye(4))).moved
+    mapped.settings = settings
+    after = everything(mapped)
+    for name in before:
+        np.testing.assert_array_equal(after[name], before[name], err_msg=name)
+
+
+def test_disabled_corrections_move_poses_alone(mapped: OnlineMapper) -> None:
+    settings = mapped.settings
+    disabled = settings.corrections.model_copy(update={"enabled": False})
+    mapped.settings = settings.model_copy(update={"corrections": disabled})
+    before, T = mapped.gaussians.to_numpy(), mapped.keyframes[2].T_tracked
+    assert not mapped.correct(moving(mapped, S)).moved
+    np.testing.assert_allclose(mapped.keyframes[2].T_tracked, moved_pose(S, T), atol=1e-9)
+    # And back.
+    mapped.correct(moving(mapped, np.linalg.inv(S)))
+    mapped.settings = settings
+    np.testing.assert_array_equal(mapped.gaussians.to_numpy()["position"], before["position"])
+
+
+def test_small_corrections_add_up_until_they_count(mapped: OnlineMapper) -> None:
+    before, moved = mapped.gaussians.to_numpy(), mapped.keyframes[1]
+    T, depth = moved.T_tracked.copy(), moved.median_depth
+    shift = exp_se3([0.33 / CAMERA.focal * depth, 0, 0, 0, 0, 0])  # a third of a pixel
+    poses = np.stack([view.T_tracked for view in mapped.keyframes])
+    poses[1] = shift @ poses[1]
+    assert not mapped.correct(PoseCorrection(np.arange(5), poses)).moved
+    for name, value in mapped.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(value, before[name])
+    np.testing.assert_array_equal(moved.T_tracked, poses[1])
+    poses[1] = shift @ poses[1]
+    assert mapped.correct(PoseCorrection(np.arange(5), poses)).moved
+    way = mapped.gaussians.to_numpy()["position"] - before["position"]
+    mine = np.array([anchor.keyframe is moved for anchor in mapped.anchors])[mapped.gaussians.anchors()]
+    expected = T[:3, :3].T @ [-0.66 / CAMERA.focal * depth, 0, 0]
+    np.testing.assert_allclose(way[mine], np.tile(expected, (mine.sum(), 1)), atol=1e-5)
+    assert (way[~mine] == 0).all()
+    assert mine.sum() > 20 and lag_in_pixels(moved) == 0.0
+
+
+def test_a_world_that_moves_as_a_whole_looks_as_before_in_the_voxels_of_a_fresh_insertion(mapped: OnlineMapper) -> None:
+    view = mapped.keyframes[3]
+    spacing = np.array([anchor.spacing for anchor in mapped.anchors])
+    coarsest = mapped.voxels.coarsest
+    before = mapped.renderer.render(view.camera, view.T_camera_world, mapped.near).colour
+    assert mapped.correct(moving(mapped, S)).moved
+    now = mapped.renderer.render(view.camera, view.T_camera_world, mapped.near).colour
+    np.testing.assert_allclose(now, before, atol=5e-4)
+
+    assert mapped.voxels.coarsest == pytest.approx(1.2 * coarsest)
+    xyz = mapped.gaussians.to_numpy()["position"].astype(np.float64)
+    sizes = 1.2 * spacing[mapped.gaussians.anchors()]
+    # The oracle: sets of cells in Python.
+    widths = mapped.voxels.coarsest / 2.0 ** np.arange(mapped.voxels.levels)
+    cells = [np.floor((xyz - mapped.voxels.origin) / width).astype(int) for width in widths]
+    finest = mapped.voxels.level_of(sizes)
+    marked = [set(map(tuple, cells[k][finest >= k].tolist())) for k in range(len(widths))]
+    asked = np.concatenate([xyz, xyz + np.random.default_rng(0).normal(size=xyz.shape) * sizes[:, None]])
+    shares = []
+    for k, width in enumerate(widths):
+        places = np.floor((asked - mapped.voxels.origin) / width).astype(int).tolist()
+        answer = mapped.voxels.query(asked, width)
+        assert answer.tolist() == [tuple(place) in marked[k] for place in places]
+        shares.append(answer.mean())
+    assert shares[0] > 0.9 and 0.3 < shares[4] < 0.7 and shares[7] == 0.0
+
+
+def test_the_corrected_world_is_mapped_on(mapped: OnlineMapper) -> None:
+    """The next frame comes where the correction says; hardly a place of the wall is free."""
+    # What the correction before this test has made of the world, by a frame that all have moved with.
+    world = motion_around(frame(0).T_camera_world, mapped.keyframes[0].T_tracked, 1.2)
+    f, count = frame(5), len(mapped.gaussians)
+    points = replace(f.points, xyz=moved_points(world, f.points.xyz))
+    report = mapped.process(replace(f, T_camera_world=moved_pose(world, f.T_camera_world), points=points))
+    assert report.is_keyframe and report.psnr > 20
+    assert len(mapped.gaussians) - count < 0.3 * count
