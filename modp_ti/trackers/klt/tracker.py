@@ -26,12 +26,12 @@ from modp_ti.trackers.replay import is_held_out, points_inside, unmasked
 
 __all__ = ["KltTracker", "open_klt"]
 
-FOLLOWED_SIDE = 640  # px: features are followed in images of this longer side at most
+FOLLOWED_SIDE = 960  # px: features are followed in images of this longer side at most
 MAX_ERROR = 2.5  # px of those: a point farther from where it is seen is not delivered
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
-# px of the followed image: keyframes that moved by the first are told of, and the others that moved by the second.
-TOLD_FROM = 1.0
+# px of the followed image: one keyframe that moved by the first is told of, with all that moved by the second.
+TOLD_FROM = 2.0
 MOVED = 0.2
 DIAGONAL_35MM = 43.27  # mm
 
