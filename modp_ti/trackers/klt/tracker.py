@@ -26,7 +26,7 @@ from modp_ti.trackers.replay import is_held_out, points_inside, unmasked
 
 __all__ = ["KltTracker", "open_klt"]
 
-FOLLOWED_SIDE = 960  # px: features are followed in images of this longer side at most
+FOLLOWED_SIDE = 640  # px: features are followed in images of this longer side at most
 MAX_ERROR = 2.5  # px of those: a point farther from where it is seen is not delivered
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3

@@ -55,7 +55,7 @@ def test_a_turn_on_the_spot_makes_no_map(box_room):
 
 def test_frames_that_only_turned_at_the_start_get_poses_once_there_is_a_map(box_room, box_walk):
     eye, target = inverse_se3(box_walk.poses[0])[:3, 3], np.array([-1.0, 3.0, 1.04])
-    turns = [look_at(eye, target + [x, 0.0, 0.0]) for x in np.linspace(-1.0, 0.0, 12, endpoint=False)]
+    turns = [look_at(eye, target + np.array([x, 0.0, 0.0])) for x in np.linspace(-1.0, 0.0, 12, endpoint=False)]
     poses = [*turns, *box_walk.poses[:35]]
     odometry, views = tracked(box_room, [*(box_room.grey(T) for T in turns), *box_walk.grey[:35]])
     assert sorted(views) == list(range(47))
@@ -110,7 +110,7 @@ def test_the_same_images_give_the_same_poses(box_room, box_walk):
 
 
 def test_light_that_changes_does_not_lose_the_camera(box_room, box_walk):
-    greys = [np.clip(g * (1 + 0.3 * np.sin(i / 4)), 0, 255).astype(np.uint8) for i, g in enumerate(box_walk.grey)]
+    greys = [np.clip(g * (0.8 + 0.3 * np.sin(i / 4)), 0, 255).astype(np.uint8) for i, g in enumerate(box_walk.grey)]
     odometry, views = tracked(box_room, greys)
     assert len(views) == 60
     assert errors(odometry, views, dict(enumerate(box_walk.poses))).max() < 0.02
