@@ -248,7 +248,8 @@ class KltTracker:
                 "and a camera that moves sideways and does not only turn"
             )
         if without:
-            first = names[counts.numbers_lost[0]] if counts.numbers_lost else names[-1]
+            placed = {told.name for told in self._told}
+            first = next(name for name in names if name not in placed)
             self.notes.append(
                 f"{without} of {len(names)} images could not be placed (the first is {first}): skipped; the camera was "
                 f"found again {counts.recovered} times"

@@ -154,7 +154,7 @@ def test_flow_follows_a_shift_and_gives_up_what_is_gone(box_room, box_walk):
     inner = (found > 40).all(axis=1) & (found < (280, 200)).all(axis=1)
     away = (found[:, 0] < 120) | (found[:, 0] > 220)
     np.testing.assert_allclose(
-        (there - found)[good & inner & away], [[7.0, 3.0]] * (good & inner & away).sum(), atol=0.1
+        (there - found)[good & inner & away], [[7.0, 3.0]] * (good & inner & away).sum(), atol=0.2
     )
     gone = (found[:, 0] > 165) & (found[:, 0] < 180)
     assert good[inner & away].mean() > 0.95 and not good[gone].any()
@@ -171,7 +171,7 @@ def test_corners_keep_to_the_mask_and_off_those_taken(box_walk):
 
 
 def test_landmarks_are_found_again_from_another_side_to_a_fraction_of_a_pixel(box_room, box_walk):
-    """Frame 0 and frame 40 are 1.2 m apart; the true place comes from the room's geometry."""
+    """Frames 0 and 25 are 0.75 m apart; the true place comes from the room's geometry."""
     landmarks = LandmarkMap(Lens.pinhole(box_room.camera))
     T_a, T_b = box_walk.poses[0], box_walk.poses[25]
     at = corners(box_walk.grey[0], np.zeros((0, 2)), 150)
