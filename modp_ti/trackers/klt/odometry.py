@@ -9,27 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.se3 import inverse_se3, orthonormalised
-from modp_ti.trackers.features import Features, essential_matrix
+from modp_ti.trackers.features import Features
 from modp_ti.trackers.klt.beginning import Beginning, SeenFrame
 from modp_ti.trackers.klt.bundle_adjustment import adjust_bundle
 from modp_ti.trackers.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.trackers.klt.lens import Lens
-from modp_ti.trackers.klt.optical_flow import BORDER, corners, flow
-from modp_ti.trackers.klt.patch_alignment import align_landmarks, reference_views
-from modp_ti.trackers.klt.pose import pose_from_points, ray_errors, refine_pose
-from modp_ti.trackers.klt.relocalisation import alike_keyframes, describe, place_by_features, thumbnail
+from modp_ti.trackers.klt.localisation import FEWEST, MAX_ERROR, SIGMA, localised, realigned, searched
+from modp_ti.trackers.klt.optical_flow import corners, flow
+from modp_ti.trackers.klt.pose import ray_errors, refine_pose
+from modp_ti.trackers.klt.relocalisation import alike_keyframes, describe, inherited, place_by_features, thumbnail
 
 __all__ = ["Odometry", "View"]
 
 WANTED = 450  # features that are followed
-MAX_ERROR = 3.0  # px: a landmark farther from where it should be is not followed on
-SIGMA = 1.0  # px
-FEWEST = 20  # landmarks that a pose rests upon
 # A keyframe is made where the features have moved by this share of the image's longer side since the last one, or
 # where fewer than this share of its landmarks are still seen.
 KEYFRAME_SHIFT = 0.05
 KEYFRAME_SHARE = 0.65
-SEARCHED = 300  # landmarks of the map that are looked for in a keyframe
 WINDOW = 8  # keyframes that a bundle adjustment moves
 HELD = 12  # keyframes that it holds
 WIDE_EVERY = 12  # keyframes between bundle adjustments of WIDE_WINDOW of them
@@ -154,7 +150,7 @@ class Odometry:
                 T = landmarks.keyframes[k].T_camera_world
                 views[i] = self._view_of_keyframe(k)
                 continue
-            located = self._located(frames[i].ids, frames[i].pixels, T)
+            located = localised(self.map, frames[i].ids, frames[i].pixels, T, self._seed)
             if located is not None:
                 T, kept = located
                 views[i] = self._view(frames[i].number, T, frames[i].ids[kept], frames[i].pixels[kept])
@@ -187,14 +183,14 @@ class Odometry:
             frame = frames[i]
             pixels, found = flow(after.grey, frame.grey, after.pixels, after.pixels)
             ids, pixels = after.ids[found], pixels[found]
-            located = self._located(ids, pixels, after.T)
+            located = localised(self.map, ids, pixels, after.T, self._seed)
             if located is None:
                 return
             T, kept = located
             ids, pixels = ids[kept], pixels[kept]
-            more_ids, more_pixels = self._searched(T, frame.grey, ids, pixels)
+            more_ids, more_pixels = searched(self.map, T, frame.grey, ids, pixels)
             ids, pixels = np.concatenate([ids, more_ids]), np.concatenate([pixels, more_pixels])
-            located = self._located(ids, pixels, T)
+            located = localised(self.map, ids, pixels, T, self._seed)
             if located is None:
                 return
             T, kept = located
@@ -208,10 +204,10 @@ class Odometry:
         state = self._state
         predicted = orthonormalised(self._motion @ state.T)
         pixels, found = flow(state.grey, grey, state.pixels, self._predicted(predicted))
-        located = self._located(state.ids[found], pixels[found], predicted)
+        located = localised(self.map, state.ids[found], pixels[found], predicted, self._seed)
         if located is None:  # the motion may have been another
             pixels, found = flow(state.grey, grey, state.pixels, state.pixels)
-            located = self._located(state.ids[found], pixels[found], state.T)
+            located = localised(self.map, state.ids[found], pixels[found], state.T, self._seed)
         if located is None:
             return self._bridge(number, grey, valid)
         T, kept = located
@@ -239,53 +235,6 @@ class Odometry:
         guess = guess + (state.pixels - here)
         return np.where(np.isfinite(guess).all(axis=1)[:, None], guess, state.pixels)
 
-    def _located(
-        self, ids: NDArray[np.int64], pixels: NDArray[np.float64], T_guess: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-        """Pose (4, 4) from features, and which (N,) to keep: landmarks that agree, and all that are none yet."""
-        known = np.flatnonzero(self.map.known[ids])
-        if len(known) < FEWEST:
-            return None
-        focal = self.map.lens.focal
-        xyz, rays = self.map.xyz[ids[known]], self.map.lens.rays(pixels[known])
-        T = refine_pose(T_guess, xyz, rays, SIGMA / focal)
-        good = ray_errors(T, xyz, rays) * focal < MAX_ERROR
-        if good.sum() < 0.7 * len(known):
-            found = pose_from_points(xyz, rays, MAX_ERROR / focal, self._seed)
-            if found is not None and found[1].sum() > good.sum():
-                T = refine_pose(found[0], xyz[found[1]], rays[found[1]], SIGMA / focal)
-                good = ray_errors(T, xyz, rays) * focal < MAX_ERROR
-        if good.sum() < max(FEWEST, 0.3 * len(known)):
-            return None
-        kept = np.ones(len(ids), dtype=bool)
-        kept[known] = good
-        return T, kept
-
-    def _searched(
-        self, T: NDArray[np.float64], grey: NDArray[np.uint8], ids: NDArray[np.int64], pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Landmarks (M,) of the map that should be in view and are not among `ids`, found there; their pixels."""
-        landmarks = self.map
-        height, width = grey.shape
-        candidate = landmarks.known.copy()
-        candidate[ids] = False
-        candidate &= (landmarks.looked < 4) | (landmarks.found > 0.25 * landmarks.looked)
-        candidate = np.flatnonzero(candidate)
-        at = landmarks.lens.pixels(landmarks.xyz[candidate] @ T[:3, :3].T + T[:3, 3])
-        inside = np.isfinite(at).all(axis=1)
-        inside[inside] = ((at[inside] >= BORDER) & (at[inside] <= (width - BORDER, height - BORDER))).all(axis=1)
-        candidate, at = candidate[inside], at[inside]
-        if len(candidate) == 0:
-            return np.zeros(0, dtype=np.int64), np.zeros((0, 2))
-        keyframe, pixel, visible = reference_views(landmarks, candidate, T)
-        candidate, at, keyframe, pixel = candidate[visible], at[visible], keyframe[visible], pixel[visible]
-        chosen = _spread(at, SEARCHED, width, height, landmarks.found[candidate])
-        candidate, at, keyframe, pixel = candidate[chosen], at[chosen], keyframe[chosen], pixel[chosen]
-        there, found = align_landmarks(landmarks, candidate, keyframe, pixel, grey, T, at)
-        landmarks.looked[candidate] += 1
-        landmarks.found[candidate[found]] += 1
-        return candidate[found], there[found]
-
     # ------------------------------------------------------------------------------------------------- keyframes
 
     def _wants_keyframe(self) -> bool:
@@ -300,27 +249,17 @@ class Odometry:
 
     def _make_keyframe(self) -> None:
         """The last frame becomes a keyframe: its landmarks placed exactly, more of them found, the map adjusted."""
-        state, landmarks = self._state, self.map
-        ids, pixels = self._realigned(state)
-        more_ids, more_pixels = self._searched(state.T, state.grey, ids, pixels)
+        state = self._state
+        ids = state.ids
+        pixels = realigned(self.map, state.T, state.grey, ids, state.pixels)
+        more_ids, more_pixels = searched(self.map, state.T, state.grey, ids, pixels)
         ids, pixels = np.concatenate([ids, more_ids]), np.concatenate([pixels, more_pixels])
-        located = self._located(ids, pixels, state.T)
+        located = localised(self.map, ids, pixels, state.T, self._seed)
         if located is not None:
             state.T, kept = located
             ids, pixels = ids[kept], pixels[kept]
         state.ids, state.pixels = ids, pixels
         self._insert_keyframe()
-
-    def _realigned(self, state: _State) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Followed features, the landmarks among them moved to where the keyframe that saw them first says."""
-        ids, pixels = state.ids, state.pixels.copy()
-        known = np.flatnonzero(self.map.known[ids])
-        keyframe, pixel, visible = reference_views(self.map, ids[known], state.T)
-        known, keyframe, pixel = known[visible], keyframe[visible], pixel[visible]
-        there, found = align_landmarks(self.map, ids[known], keyframe, pixel, state.grey, state.T, pixels[known])
-        near = found & (np.linalg.norm(there - pixels[known], axis=1) < MAX_ERROR)
-        pixels[known[near]] = there[near]
-        return ids, pixels
 
     def _insert_keyframe(self) -> None:
         state, landmarks = self._state, self.map
@@ -445,11 +384,11 @@ class Odometry:
                 continue
             T = placed.T_camera_world
             nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
-            ids, pixels = self._searched(T, grey, *nothing)
-            more_ids, more_pixels = self._inherited(k, features, placed.pairs, T)
+            ids, pixels = searched(self.map, T, grey, *nothing)
+            more_ids, more_pixels = inherited(self.map, k, features, placed.pairs, T)
             fresh = ~np.isin(more_ids, ids)
             ids, pixels = np.concatenate([ids, more_ids[fresh]]), np.concatenate([pixels, more_pixels[fresh]])
-            located = self._located(ids, pixels, T)
+            located = localised(self.map, ids, pixels, T, self._seed)
             if located is None:
                 continue
             T, kept = located
@@ -458,41 +397,3 @@ class Odometry:
             self._insert_keyframe()
             return self._view_of_keyframe(len(self.map.keyframes) - 1)
         return None
-
-    def _inherited(
-        self, k: int, features: Features, pairs: NDArray[np.int64], T: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Features of keyframe k that were matched in a frame at T: their numbers and pixels there.
-
-        Those that have none yet get one, and are observed by the keyframe from now on.
-        """
-        landmarks, keyframe = self.map, self.map.keyframes[k]
-        a, b = keyframe.described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
-        rays_a, rays_b = landmarks.lens.rays(a), landmarks.lens.rays(b)
-        lines = np.c_[rays_a, np.ones(len(a))] @ essential_matrix(keyframe.T_camera_world, T).T
-        off = np.abs((lines * np.c_[rays_b, np.ones(len(b))]).sum(axis=1))
-        off /= np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
-        good = off * landmarks.lens.focal < MAX_ERROR
-        slots, b = pairs[good, 0], b[good]
-        slots, first = np.unique(slots, return_index=True)
-        b = b[first]
-        fresh = keyframe.described_ids[slots] < 0
-        ids = landmarks.new_ids(int(fresh.sum()))
-        keyframe.described_ids[slots[fresh]] = ids
-        pixels = keyframe.described.pixels[slots[fresh]]
-        keyframe.append(ids, pixels, landmarks.lens.rays(pixels))
-        landmarks.note_observations(k, ids, pixels)
-        return keyframe.described_ids[slots], b
-
-
-def _spread(
-    pixels: NDArray[np.float64], count: int, width: int, height: int, merit: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Places (M,) of at most `count` of the pixels (N, 2), spread over the image, those of most merit first."""
-    if len(pixels) <= count:
-        return np.arange(len(pixels))
-    cell = max(1.0, np.sqrt(width * height / count))
-    of_cell = np.floor(pixels[:, 1] / cell).astype(np.int64) * 100_000 + np.floor(pixels[:, 0] / cell).astype(np.int64)
-    order = np.lexsort((np.arange(len(pixels)), -merit, of_cell))
-    rank = np.arange(len(order)) - np.searchsorted(of_cell[order], of_cell[order])
-    return order[np.lexsort((order, rank))[:count]]

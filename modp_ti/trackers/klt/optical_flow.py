@@ -30,6 +30,7 @@ def flow(
     if len(pixels) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=bool)
     height, width = before.shape
+    before = _lit_alike(before, after)
     # cv2 counts pixel centres from 0 and wants float32.
     start = (pixels - 0.5).astype(np.float32)[:, None]
     there = np.clip(guess - 0.5, (-width, -height), (2 * width, 2 * height)).astype(np.float32)[:, None]
@@ -49,6 +50,16 @@ def flow(
     result = there[:, 0].astype(np.float64) + 0.5
     found &= (result >= BORDER).all(axis=1) & (result <= (width - BORDER, height - BORDER)).all(axis=1)
     return result, found
+
+
+def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image before in the light of the one after: flow takes a brightness that changes for motion."""
+    (mean,), (deviation,) = (each.ravel() for each in cv2.meanStdDev(before))
+    (mean_after,), (deviation_after,) = (each.ravel() for each in cv2.meanStdDev(after))
+    gain = float(deviation_after / max(deviation, 1e-6))
+    if not 0.5 < gain < 2.0 or (abs(gain - 1.0) < 0.02 and abs(mean - mean_after) < 2.0):
+        return before
+    return cv2.convertScaleAbs(before, alpha=gain, beta=float(mean_after - gain * mean))
 
 
 def _levels(grey: NDArray[np.uint8]) -> int:

@@ -8,15 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.trackers.features import Features, detect_features, match_features
+from modp_ti.trackers.features import Features, detect_features, essential_matrix, match_features
 from modp_ti.trackers.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.trackers.klt.pose import pose_from_points
 
-__all__ = ["Placed", "alike_keyframes", "describe", "matches", "place_by_features", "thumbnail"]
+__all__ = ["Placed", "alike_keyframes", "describe", "inherited", "matches", "place_by_features", "thumbnail"]
 
 # px of the followed image: a place that a feature's neighbours lend it, and one of its own.
 MAX_ERROR = 5.0
 SAME_PLACE = 2.0
+MAX_OFF_LINE = 3.0  # from the epipolar line
 NEIGHBOURHOOD = 40.0
 FEWEST = 15  # matches that agree with a pose
 THUMBNAIL = (32, 24)
@@ -75,6 +76,32 @@ def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: 
     agreeing = np.ones(len(pairs), dtype=bool)
     agreeing[placed] = found[1]
     return Placed(k, found[0], pairs[agreeing])
+
+
+def inherited(
+    landmarks: LandmarkMap, k: int, features: Features, pairs: NDArray[np.int64], T: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Features of keyframe k that were matched in a frame at T: their numbers and pixels there.
+
+    Those that have none yet get one, and are observed by the keyframe from now on.
+    """
+    keyframe = landmarks.keyframes[k]
+    a, b = keyframe.described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
+    rays_a, rays_b = landmarks.lens.rays(a), landmarks.lens.rays(b)
+    lines = np.c_[rays_a, np.ones(len(a))] @ essential_matrix(keyframe.T_camera_world, T).T
+    off = np.abs((lines * np.c_[rays_b, np.ones(len(b))]).sum(axis=1))
+    off /= np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
+    good = off * landmarks.lens.focal < MAX_OFF_LINE
+    slots, b = pairs[good, 0], b[good]
+    slots, first = np.unique(slots, return_index=True)
+    b = b[first]
+    fresh = keyframe.described_ids[slots] < 0
+    ids = landmarks.new_ids(int(fresh.sum()))
+    keyframe.described_ids[slots[fresh]] = ids
+    pixels = keyframe.described.pixels[slots[fresh]]
+    keyframe.append(ids, pixels, landmarks.lens.rays(pixels))
+    landmarks.note_observations(k, ids, pixels)
+    return keyframe.described_ids[slots], b
 
 
 def _places(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:

@@ -30,8 +30,8 @@ FOLLOWED_SIDE = 640  # px: features are followed in images of this longer side a
 MAX_ERROR = 2.5  # px of those: a point farther from where it is seen is not delivered
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
-# px of the followed image: keyframes that moved by the first are told of, and the others that moved by the second.
-TOLD_FROM = 1.0
+# px of the followed image: one keyframe that moved by the first is told of, with all that moved by the second.
+TOLD_FROM = 2.0
 MOVED = 0.2
 DIAGONAL_35MM = 43.27  # mm
 
@@ -248,7 +248,8 @@ class KltTracker:
                 "and a camera that moves sideways and does not only turn"
             )
         if without:
-            first = names[counts.numbers_lost[0]] if counts.numbers_lost else names[-1]
+            placed = {told.name for told in self._told}
+            first = next(name for name in names if name not in placed)
             self.notes.append(
                 f"{without} of {len(names)} images could not be placed (the first is {first}): skipped; the camera was "
                 f"found again {counts.recovered} times"
