@@ -33,10 +33,11 @@ __all__ = [
 ]
 
 
-# Trackers that bring cameras, those whose files hold poses alone, and all that read what was tracked before.
+# Trackers that bring cameras, and those whose files hold poses alone.
 WITH_CAMERAS = ("colmap", "transforms", "synthetic")
 WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
-AFTERWARDS = (*WITH_CAMERAS, *WITHOUT_POINTS, "stella_vslam", "aria", "modp")
+# Trackers that need nothing but images, and so can follow a camera.
+LIVE_TRACKERS = ("klt",)
 
 
 class IntrinsicsSettings(StrictModel):
@@ -251,7 +252,7 @@ class SceneConfig(StrictModel):
             raise ValueError("source.path is missing: give the folder that holds the images")
         if self.source.intrinsics.given and self.tracker.kind in WITH_CAMERAS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
-        if self.source.stream is not None and self.tracker.kind in AFTERWARDS:
+        if self.source.stream is not None and self.tracker.kind not in LIVE_TRACKERS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
         if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import re
 import signal
 import tempfile
@@ -64,9 +65,11 @@ class LiveSource:
         self.frame_size = (first[1].shape[1], first[1].shape[0])
         self._waiting.append(first)
         self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
-        # A daemon, so that a process whose owner forgot to close ends all the same.
+        # A daemon, so that a stalled stream does not hold the process; and an end before Python's own, which would
+        # break the thread off inside the decoder.
         self._thread = threading.Thread(target=self._take, name=f"frames of {self.path}", daemon=True)
         self._thread.start()
+        atexit.register(self.close)
         self._interrupt = None
         if threading.current_thread() is threading.main_thread():
             self._interrupt = signal.signal(signal.SIGINT, self._interrupted)
@@ -151,6 +154,7 @@ class LiveSource:
         self._thread.join(1.0)
         self._give_back_interrupt()
         self._kept.cleanup()
+        atexit.unregister(self.close)
 
     def _grab(self) -> tuple[float, NDArray[np.uint8]] | None:
         """The next frame (BGR) with the time of its arrival; None at the end of the stream."""

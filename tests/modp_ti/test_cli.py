@@ -96,6 +96,17 @@ def test_bad_input_gets_one_line_and_exit_code_two(scene, session, arguments, pa
     assert part in failure(scene, *arguments)
 
 
+def test_faulty_data_set_or_video_gets_one_line(scene, session):
+    folder = scene.parent
+    (folder / "fr1").mkdir()
+    (folder / "fr1" / "rgb.txt").write_text("# time file\n1.0 rgb/1.png\n0.5 rgb/2.png\n")
+    said = failure(scene, "--set", "source.path=fr1")
+    assert "rgb.txt:3: time stamp 0.5 is not later than the one before; sort the listing" in said
+    (folder / "walk.mp4").write_bytes(b"\0\0\0\x10ftypisom\0\0\0\0\0\1\0\0mdat")
+    said = failure(scene, "--set", "source.path=walk.mp4")
+    assert "walk.mp4: the video is cut off, 65528 bytes are missing: copy it again" in said
+
+
 def test_missing_scene_file_gets_one_line(tmp_path, session):
     assert "gone.yaml: no such scene file" in failure(tmp_path / "gone.yaml")
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -210,6 +212,18 @@ def test_closing_gives_ctrl_c_back(camera, opened):
     camera.end()
     source.close()
     assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_process_that_forgets_to_close_ends_cleanly(camera):
+    code = (
+        "import sys; from modp_ti.sources.live import LiveSource; source = LiveSource(sys.argv[1]); "
+        "print(next(source.arriving(0, None, 1))); print(source._kept.name)"
+    )
+    camera.send(*range(40))
+    result = subprocess.run([sys.executable, "-c", code, camera.url], capture_output=True, text=True, check=True)
+    assert result.stderr == ""
+    name, folder = result.stdout.split()
+    assert name == "live_000000" and not Path(folder).exists()
 
 
 def test_passwords_are_not_shown(camera, opened):
