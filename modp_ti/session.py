@@ -65,8 +65,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
             raise InputError("the tracker corrects poses before its first frame")
         prepared = time.perf_counter() - tick
         lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
-        said = len(tracker.notes)
-        _say([*tracker.notes[:said], *([no_lpips] if no_lpips else [])], console)
+        notes = [*tracker.notes, *([no_lpips] if no_lpips else [])]
+        _say(notes, console)
 
         mapper = build_mapper(config, first.camera)
         watch = mapper.stopwatch
@@ -77,7 +77,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
         frames = _map(mapper, chain([first], _timed(arriving, watch)), line)
         mapping_seconds = time.perf_counter() - tick
-    _say(tracker.notes[said:], console)  # how a live tracker's frames ended
+    _say([note for note in tracker.notes if note not in notes], console)  # how a live tracker's frames ended
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     if len(mapper.keyframes) == 0:
         raise InputError(

@@ -23,10 +23,14 @@ OFF_CENTRE = 0.2
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """camera: pinhole part at the stored size, pixel centres at +0.5. distortion: the lens."""
+    """camera: pinhole part at the stored size, pixel centres at +0.5. distortion: the lens.
+
+    note: what the user should know where they are relied upon.
+    """
 
     camera: PinholeCamera
     distortion: Distortion = NO_DISTORTION
+    note: str | None = None
 
     def undistorter(self, scale: float) -> Undistorter:
         """What takes the stored images to the working size."""
@@ -57,10 +61,15 @@ def given_intrinsics(given: IntrinsicsSettings, width: int, height: int) -> Intr
 
 
 def require_intrinsics(images: ImageSource) -> Intrinsics:
-    """The camera of the source, for a tracker that brings none. Raises InputError where it is not known."""
+    """The camera of the source, for a tracker that brings none; its note goes to the source's.
+
+    Raises InputError where it is not known.
+    """
     if images.intrinsics is None:
         raise InputError(
             f"{images.path}: the camera is not known: give source.intrinsics: {{fx: ..., fy: ..., cx: ..., cy: ...}} "
             "in pixels of the stored images"
         )
+    if images.intrinsics.note is not None:
+        images.notes.append(images.intrinsics.note)
     return images.intrinsics

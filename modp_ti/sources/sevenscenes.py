@@ -45,10 +45,7 @@ def open_sevenscenes(path: Path, fps: float) -> ListedImages:
         sequences = sorted(folder.name for folder in path.glob("seq-*") if folder.is_dir())
         hint = f"; give one of its sequences, such as {sequences[0]}" if sequences else ""
         raise InputError(f"{path}: holds no frame-000000.color.png, ..., nor does its folder images{hint}")
-    note = (
-        "7-Scenes publishes no calibration of its colour camera: nominal intrinsics (f = 525 px, no distortion) are "
-        "taken where neither the tracker nor source.intrinsics brings any"
-    )
+    note = "7-Scenes publishes no calibration of its colour camera: nominal intrinsics (f = 525 px, no distortion)"
     folder = next(iter(files.values())).parent
     names, times = [file.name for file in files.values()], [number / fps for number in files]
-    return ListedImages(folder, names, times, Intrinsics(CAMERA), [note])
+    return ListedImages(folder, names, times, Intrinsics(CAMERA, note=note))

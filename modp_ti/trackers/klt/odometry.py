@@ -102,18 +102,6 @@ class Odometry:
         """T_camera_world (4, 4) of a view as the map has it now."""
         return orthonormalised(view.T_camera_keyframe @ self.map.keyframes[view.keyframe].T_camera_world)
 
-    def refined_pose(self, view: View) -> NDArray[np.float64]:
-        """The pose of a view by the places that its landmarks have now."""
-        T = self.pose(view)
-        known = self.map.known[view.ids]
-        if known.sum() < FEWEST:
-            return T
-        rays, xyz = self.map.lens.rays(view.pixels[known]), self.map.xyz[view.ids[known]]
-        near = ray_errors(T, xyz, rays) * self.map.lens.focal < 3 * MAX_ERROR
-        if near.sum() < FEWEST:
-            return T
-        return refine_pose(T, xyz[near], rays[near], SIGMA / self.map.lens.focal)
-
     def process(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> list[View]:
         """Views that have got a pose with this frame, in their order: none, this one, or all since the start.
 

@@ -15,7 +15,7 @@ from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import FrameReader, ImageSource, Intrinsics, open_source
+from modp_ti.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
 from modp_ti.sources.exif import focal_length_35mm
 from modp_ti.trackers.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
 from modp_ti.trackers.klt.lens import Lens
@@ -57,7 +57,7 @@ def open_klt(
     there = arrived.there
     _require_one_size(images, there, width, height)
     notes = []
-    intrinsics = images.intrinsics
+    intrinsics = None if images.intrinsics is None else require_intrinsics(images)
     blank = Intrinsics(PinholeCamera(max(width, height), max(width, height), width / 2, height / 2, width, height))
     reader.require_fitting([(name, (intrinsics or blank).undistorter(1.0)) for name in there])
     if intrinsics is None:
@@ -186,7 +186,7 @@ class KltTracker:
         seed: int = 0,
         notes: Sequence[str] = (),
     ) -> None:
-        self.notes = [*reader.images.notes, *notes]
+        self._notes = list(notes)
         self.intrinsics = intrinsics
         self._reader = reader
         self._names = names
@@ -214,6 +214,11 @@ class KltTracker:
                 pass
         for index in range(len(self._told)):
             yield self._frame(index)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the source has to say, and what the tracker has found so far."""
+        return [*self._reader.images.notes, *self._notes]
 
     def close(self) -> None:
         self._reader.images.close()
@@ -250,7 +255,7 @@ class KltTracker:
         if without:
             placed = {told.name for told in self._told}
             first = next(name for name in names if name not in placed)
-            self.notes.append(
+            self._notes.append(
                 f"{without} of {len(names)} images could not be placed (the first is {first}): skipped; the camera was "
                 f"found again {counts.recovered} times"
             )

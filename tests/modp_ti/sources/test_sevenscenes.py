@@ -8,7 +8,7 @@ import pytest
 
 from modp_ti.config import SourceSettings
 from modp_ti.errors import InputError
-from modp_ti.sources import open_source
+from modp_ti.sources import open_source, require_intrinsics
 
 
 def sequence(folder, *names):
@@ -29,8 +29,14 @@ def test_colour_images_are_taken_alone_and_timed_by_their_number(tmp_path, insid
     np.testing.assert_allclose([made.timestamp(name) for name in NAMES], np.array([2, 4, 11]) / 30)
     camera = made.intrinsics.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (525, 525, 320, 240)
-    assert made.notes[0] == f"{tmp_path} is read as what `source.kind: sevenscenes` says"
-    assert "nominal intrinsics (f = 525 px, no distortion)" in made.notes[1]
+    assert made.notes == [f"{tmp_path} is read as what `source.kind: sevenscenes` says"]
+
+
+def test_a_tracker_that_relies_on_the_nominal_camera_says_so(tmp_path):
+    sequence(tmp_path, *NAMES)
+    made = open_source(SourceSettings(path=tmp_path))
+    assert require_intrinsics(made) is made.intrinsics
+    assert "nominal intrinsics (f = 525 px, no distortion)" in made.notes[-1]
 
 
 def test_same_number_twice_is_named(tmp_path):
