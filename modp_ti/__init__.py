@@ -21,7 +21,7 @@ _HOMES = {
     "PinholeCamera": "fields.camera",
     "RefineSettings": "pipelines.settings",
     "Renderer": "pipelines.rendering",
-    "SceneConfig": "modp_ti.config",
+    "SceneConfig": "modp_ti.settings",
     "SparsePoints": "fields.tracked_frame",
     "TrackedFrame": "fields.tracked_frame",
     "initialise": "fields.backend",

@@ -14,8 +14,8 @@ from modp_ti.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from modp_ti.config import SceneConfig
     from modp_ti.inspection.report import Report
+    from modp_ti.settings import SceneConfig
     from modp_ti.trackers import Tracker
 
 __all__ = ["check", "inspect_scene"]

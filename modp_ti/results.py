@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.tracked_frame import TrackedFrame
-from modp_ti.config import SceneConfig, dump_scene
+from modp_ti.config import dump_scene
 from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.errors import InputError
 from modp_ti.evaluation import FrameScore, MapVersion, summary
@@ -24,6 +24,7 @@ from modp_ti.exports.exposure import write_exposures
 from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats, write_splats
 from modp_ti.exports.trajectory import write_trajectory
+from modp_ti.settings import SceneConfig
 
 __all__ = ["Results", "metrics_of"]
 

@@ -17,7 +17,6 @@ from fields.backend import describe, initialise
 from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
-from modp_ti.config import SceneConfig
 from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.errors import InputError
 from modp_ti.evaluation import MapVersion, evaluate, trajectory_errors
@@ -25,6 +24,7 @@ from modp_ti.lpips import open_lpips
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
 from modp_ti.results import Results, metrics_of
+from modp_ti.settings import SceneConfig
 from modp_ti.trackers import close, events, frame_count, may_read_ahead, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper

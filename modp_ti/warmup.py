@@ -14,7 +14,7 @@ from modp_ti.errors import InputError
 from modp_ti.run import BAD_INPUT
 
 if TYPE_CHECKING:
-    from modp_ti.config import SceneConfig
+    from modp_ti.settings import SceneConfig
 
 __all__ = ["compile_size", "warmup"]
 
@@ -46,7 +46,8 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], say: Cal
         raise InputError("nothing to compile for: name a scene file, or give --size 640x480")
     wanted = [_size(text) for text in sizes] or [None]
     # Imported here: asking for help must not wait for the compiler and the readers.
-    from modp_ti.config import SceneConfig, TrackerSettings, load_scene
+    from modp_ti.config import load_scene
+    from modp_ti.settings import SceneConfig, TrackerSettings
 
     if scene is None:
         # Any scene of default settings; nothing of it is opened.

@@ -21,7 +21,7 @@ from modp_ti.sources.video_file import VideoFile
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from modp_ti.config import SourceSettings
+    from modp_ti.settings import SourceSettings
 
 __all__ = [
     "NO_DISTORTION",

@@ -19,7 +19,7 @@ from modp_ti.sources.listed_images import find_frame, selected_names
 from modp_ti.sources.vignette import read_vignette
 
 if TYPE_CHECKING:
-    from modp_ti.config import VrsSettings
+    from modp_ti.settings import VrsSettings
 
 __all__ = ["AriaRecording"]
 

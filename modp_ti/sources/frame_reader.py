@@ -16,7 +16,7 @@ from modp_ti.sources.undistortion import Undistorter
 from modp_ti.sources.vignette import LEAST_LIGHT, read_vignette
 
 if TYPE_CHECKING:
-    from modp_ti.config import SourceSettings
+    from modp_ti.settings import SourceSettings
 
 __all__ = ["FrameReader", "Picture"]
 

@@ -11,7 +11,7 @@ from modp_ti.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.sources.undistortion import Undistorter
 
 if TYPE_CHECKING:
-    from modp_ti.config import IntrinsicsSettings
+    from modp_ti.settings import IntrinsicsSettings
     from modp_ti.sources.protocol import ImageSource
 
 __all__ = ["Intrinsics", "given_intrinsics", "require_intrinsics"]

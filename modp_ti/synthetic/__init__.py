@@ -11,7 +11,7 @@ from modp_ti.synthetic.loop import Loop
 from modp_ti.synthetic.simulated_tracker import FRAMES, LOOP_FRAMES, SMALLEST, SyntheticTracker, TrackerNoise
 
 if TYPE_CHECKING:
-    from modp_ti.config import SourceSettings, TrackerSettings
+    from modp_ti.settings import SourceSettings, TrackerSettings
 
 __all__ = ["LightChange", "Loop", "SyntheticTracker", "TrackerNoise", "open_synthetic"]
 

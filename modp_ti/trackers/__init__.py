@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from modp_ti.trackers.protocol import Progress, Tracker, close, events, frame_count, may_read_ahead
 
 if TYPE_CHECKING:
-    from modp_ti.config import SceneConfig
+    from modp_ti.settings import SceneConfig
 
 __all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ahead", "open_tracker"]
 

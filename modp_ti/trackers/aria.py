@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import ImageSource, open_source
 from modp_ti.sources.intrinsics import require_intrinsics
 from modp_ti.trackers.aria_mps import (

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.sources.distortion import colmap_intrinsics
 from modp_ti.trackers.colmap_files import require_whole_binary_model

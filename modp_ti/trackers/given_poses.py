@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.tracked_frame import SparsePoints
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.sources.intrinsics import require_intrinsics
 from modp_ti.trackers.point_cloud import visible_points

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers.given_poses import found_file
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import ReplayedTracker

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.config import SourceSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
 
 __all__ = [

@@ -9,8 +9,8 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import ImageSource, open_source
 from modp_ti.trackers.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
 from modp_ti.trackers.number_rows import NumberRows, read_number_rows

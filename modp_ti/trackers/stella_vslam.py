@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.tracked_frame import SparsePoints
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import ImageSource, Intrinsics, Undistorter, open_source
 from modp_ti.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
 from modp_ti.trackers.point_cloud import visible_points

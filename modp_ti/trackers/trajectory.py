@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.config import TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import TrackerSettings
 from modp_ti.sources import ImageSource
 from modp_ti.sources.association import associate
 from modp_ti.trackers.number_rows import read_number_rows

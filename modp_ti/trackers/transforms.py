@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import Distortion, FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.trackers.point_cloud import read_ply_points, visible_points
 from modp_ti.trackers.protocol import Progress

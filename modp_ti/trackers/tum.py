@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from modp_ti.config import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import open_source
 from modp_ti.trackers.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
 from modp_ti.trackers.protocol import Progress

@@ -8,9 +8,10 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from modp_ti.config import SceneConfig, dump_scene, load_scene
+from modp_ti.config import dump_scene, load_scene
 from modp_ti.config_keys import documented_keys, markdown_of_keys
 from modp_ti.errors import InputError
+from modp_ti.settings import SceneConfig
 
 MINIMAL = "source: {path: images}\ntracker: {kind: colmap}\noutput: out/here\n"
 

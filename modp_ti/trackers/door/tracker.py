@@ -11,8 +11,8 @@ import numpy as np
 
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, Undistorter
 from modp_ti.trackers.door.connection import GLANCE, Connection, SenderGoneError
 from modp_ti.trackers.door.history import Delivered, History

@@ -14,9 +14,8 @@ from modp_ti.trackers.klt.beginning import Beginning, SeenFrame
 from modp_ti.trackers.klt.bundle_adjustment import adjust_bundle
 from modp_ti.trackers.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.trackers.klt.lens import Lens
-from modp_ti.trackers.klt.localisation import FEWEST, MAX_ERROR, SIGMA, localised, realigned, searched
+from modp_ti.trackers.klt.localisation import FEWEST, localised, realigned, searched
 from modp_ti.trackers.klt.optical_flow import corners, flow
-from modp_ti.trackers.klt.pose import ray_errors, refine_pose
 from modp_ti.trackers.klt.relocalisation import alike_keyframes, describe, inherited, place_by_features, thumbnail
 
 __all__ = ["Odometry", "View"]

@@ -13,8 +13,8 @@ from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
 from modp_ti.sources.exif import focal_length_35mm
 from modp_ti.trackers.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics

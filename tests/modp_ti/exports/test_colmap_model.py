@@ -11,8 +11,8 @@ import pytest
 
 from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.exports.colmap_model import image_names, write_colmap, write_image
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.tracked_points import TrackedPoints
 from modp_ti.trackers.colmap import open_colmap
 

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config import SourceSettings, VrsSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, VrsSettings
 from modp_ti.sources import FrameReader, open_source
 
 needs_library = pytest.mark.skipif(

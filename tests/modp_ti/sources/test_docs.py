@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from modp_ti.config import SourceSettings, TrackerSettings, load_scene
+from modp_ti.config import load_scene
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import open_source
 from modp_ti.sources.recognition import recognised_kind
 

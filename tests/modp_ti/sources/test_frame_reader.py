@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fields.camera import PinholeCamera
-from modp_ti.config import SourceSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import Distortion, FrameReader, ImageFolder, Undistorter
 
 WIDTH, HEIGHT = 64, 48

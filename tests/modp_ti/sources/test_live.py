@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config import IntrinsicsSettings, SourceSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.sources import open_source
 from modp_ti.sources.live import WAITING, LiveSource
 

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config import IntrinsicsSettings, SourceSettings, load_scene
+from modp_ti.config import load_scene
 from modp_ti.errors import InputError
+from modp_ti.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.sources import ImageFolder, open_source, require_intrinsics
 from modp_ti.sources.recognition import recognised_kind
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config import SourceSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import open_source
 from modp_ti.sources.tum_rgbd import open_tum_rgbd
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.synthetic import LightChange, SyntheticTracker, open_synthetic
 from modp_ti.synthetic.renderer import RoomRenderer
 

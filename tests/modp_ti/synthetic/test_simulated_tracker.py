@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fields.tracked_frame import TrackedFrame
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.synthetic import SyntheticTracker, TrackerNoise, open_synthetic, simulated_tracker
 from modp_ti.synthetic.renderer import RoomRenderer
 from modp_ti.trackers.protocol import Tracker, frame_count

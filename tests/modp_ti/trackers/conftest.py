@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from modp_ti.config import SceneConfig, SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SceneConfig, SourceSettings, TrackerSettings
 from modp_ti.trackers import open_tracker
 from modp_ti.trackers.replay import ReplayedTracker
 

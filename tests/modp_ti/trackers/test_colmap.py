@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers import Tracker, frame_count
 from modp_ti.trackers.colmap import open_colmap
 

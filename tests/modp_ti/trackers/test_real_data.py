@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from modp_ti.config import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers.colmap import open_colmap
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker
 from modp_ti.trackers.transforms import open_transforms

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from modp_ti.config import IntrinsicsSettings, SourceSettings, TrackerSettings
+from modp_ti.settings import IntrinsicsSettings, SourceSettings, TrackerSettings
 from modp_ti.trackers.aria import open_aria
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker
 from modp_ti.trackers.sevenscenes import open_sevenscenes

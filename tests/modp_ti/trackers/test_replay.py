@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fields.camera import PinholeCamera
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import Undistorter
 from modp_ti.trackers.colmap import open_colmap
 from modp_ti.trackers.replay import checked_pose, points_inside

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers import Tracker
 from modp_ti.trackers.transforms import open_transforms
 

@@ -10,7 +10,7 @@ import pytest
 
 from fields.keyframes import Keyframe, KeyframeStore
 from fields.tracked_frame import SparsePoints
-from modp_ti.config import SceneConfig, SourceSettings, TrackerSettings
+from modp_ti.settings import SceneConfig, SourceSettings, TrackerSettings
 from modp_ti.trackers import open_tracker
 from pipelines.depth import DepthEstimator, EpipolarDepth, FusedDepth, GaussianProcessDepth, ImageGuidedDepth
 from pipelines.depth.estimate import point_depths

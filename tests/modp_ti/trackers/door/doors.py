@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from modp_ti.config import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers.door import DoorTracker, open_door
 
 HELLO, FRAME, POSE, CORRECTION, END = 1, 2, 3, 4, 5

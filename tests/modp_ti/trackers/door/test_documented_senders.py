@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modp_ti.config import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers.door import open_door
 
 PAGE = (Path(__file__).parents[4] / "docs" / "door.md").read_text()

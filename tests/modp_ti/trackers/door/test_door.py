@@ -19,8 +19,8 @@ import pytest
 
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers import Tracker, events
 from modp_ti.trackers.colmap import open_colmap
 from modp_ti.trackers.door import open_door

@@ -8,9 +8,9 @@ import pytest
 
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
-from modp_ti.config import SourceSettings, TrackerSettings
 from modp_ti.errors import InputError
 from modp_ti.evaluation import absolute_trajectory_error
+from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.sources.distortion import Distortion
 from modp_ti.trackers.klt import KltTracker, open_klt

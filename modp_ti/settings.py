@@ -1,0 +1,285 @@
+"""The settings of a scene: one strict model, of which `modp_ti.config` reads and writes the files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
+
+__all__ = [
+    "EvaluationSettings",
+    "ExportSettings",
+    "IntrinsicsSettings",
+    "SceneConfig",
+    "SourceSettings",
+    "TrackerSettings",
+    "VrsSettings",
+]
+
+# Trackers that bring images too, those that bring cameras, those whose files hold poses alone, and those that need
+# nothing but images, and so can follow a camera.
+WITHOUT_SOURCE = ("synthetic", "socket")
+WITH_CAMERAS = ("colmap", "transforms", *WITHOUT_SOURCE)
+WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
+LIVE_TRACKERS = ("klt",)
+
+
+class IntrinsicsSettings(StrictModel):
+    """The camera's calibration, for the stored size of the images."""
+
+    fx: float | None = Field(
+        None,
+        gt=0,
+        description="focal length in pixels of the stored images; this section wins over what the source itself says "
+        "of its camera. Empty for no such section",
+    )
+    fy: float | None = Field(None, gt=0, description="vertical focal length; empty for fx")
+    cx: float | None = Field(
+        None,
+        description="principal point; pixel centres lie at +0.5, so add 0.5 to what OpenCV or ROS calibrated. "
+        "Empty for the middle",
+    )
+    cy: float | None = Field(None, description="as cx")
+    k1: float = Field(0.0, description="radial distortion, as in OpenCV")
+    k2: float = Field(0.0, description="as k1")
+    p1: float = Field(0.0, description="tangential distortion, as in OpenCV")
+    p2: float = Field(0.0, description="as p1")
+    k3: float = Field(0.0, description="as k1")
+    k4: float = Field(0.0, description="as k1; with `fisheye` only")
+    fisheye: bool = Field(False, description="k1 to k4 are those of OpenCV's fisheye model")
+    width: int | None = Field(
+        None, ge=1, description="width that this calibration is for; the images are then checked against it"
+    )
+    height: int | None = Field(None, ge=1, description="as width")
+
+    @property
+    def given(self) -> bool:
+        return self.fx is not None
+
+    @model_validator(mode="after")
+    def _one_model(self) -> IntrinsicsSettings:
+        if not self.given and self.model_fields_set - {"fx"} and self != IntrinsicsSettings():
+            raise ValueError("source.intrinsics.fx is missing: the focal length in pixels of the stored images")
+        if self.fisheye and (self.p1 or self.p2):
+            raise ValueError("source.intrinsics: OpenCV's fisheye model has no p1 and p2; take them out")
+        if self.k4 and not self.fisheye:
+            raise ValueError("source.intrinsics.k4 is for `fisheye: true` alone; take it out")
+        if (self.width is None) != (self.height is None):
+            raise ValueError("source.intrinsics: give width and height, or neither")
+        return self
+
+
+class VrsSettings(StrictModel):
+    """The pinhole camera that Aria's fisheye images are undistorted to."""
+
+    width: int = Field(800, ge=8, description="width of the undistorted image (Aria VRS only)")
+    height: int = Field(800, ge=8, description="height of the undistorted image (Aria VRS only)")
+    focal: float = Field(400.0, gt=0, description="its focal length in pixels; 400 at 800x800 sees 90 degrees")
+
+
+class SourceSettings(StrictModel):
+    """Where the frames are."""
+
+    kind: Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] = Field(
+        "auto",
+        description="what `path` or `stream` is; `auto` recognises it. `images`: a folder of images; `release`: the "
+        "folder of an Aria sequence as the paper's authors publish it; `vrs`: a Project Aria recording",
+    )
+    path: Path | None = Field(
+        None,
+        description="folder of the images (subfolders are searched too), data set, video file or recording "
+        "(not used by `synthetic` and `socket`)",
+    )
+    stream: int | str | None = Field(
+        None, description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live"
+    )
+    intrinsics: IntrinsicsSettings = IntrinsicsSettings()
+    vrs: VrsSettings = VrsSettings()
+    scale: float = Field(1.0, gt=0, le=1, description="factor on width and height of every frame")
+    holdout: int | None = Field(
+        None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
+    )
+    fps: float = Field(
+        30.0,
+        gt=0,
+        description="frames per second: time stamp = position in the folder / fps, where the source has no times",
+    )
+    start: int = Field(0, ge=0, description="first frame, as position in the folder")
+    stop: int | None = Field(None, ge=1, description="position after the last frame; empty for all")
+    step: int = Field(1, ge=1, description="every n-th frame")
+    masks: Path | None = Field(
+        None,
+        description="folder with one mask an image, of its name and size: white valid, black ignored; empty for none",
+    )
+    mask_colour: tuple[int, int, int] | None = Field(
+        None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty for none"
+    )
+    mask_tolerance: int = Field(
+        0, ge=0, le=255, description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG"
+    )
+    prefetch: int = Field(
+        4,
+        ge=0,
+        description="frames that a thread decodes, undistorts and halves ahead of the mapper; 0 for no thread. "
+        "The map is the same",
+    )
+    vignette: Path | None = Field(
+        None,
+        description="image of how much light reaches each pixel, brightest where all does; with `vrs` Aria's "
+        "vignetting mask, of the recorded image; empty for none, or for the source's own",
+    )
+
+    @field_validator("mask_colour")
+    @classmethod
+    def _colour_has_8_bits(cls, colour: tuple[int, int, int] | None) -> tuple[int, int, int] | None:
+        if colour is not None and not all(0 <= value <= 255 for value in colour):
+            raise ValueError(f"source.mask_colour must be three numbers from 0 to 255, not {list(colour)}")
+        return colour
+
+    @model_validator(mode="after")
+    def _one_place(self) -> SourceSettings:
+        if self.stream is None and self.kind == "live":
+            raise ValueError("source.stream is missing: `source.kind: live` needs a camera number or a URL")
+        if self.stream is not None and self.kind not in ("auto", "live"):
+            raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; take one of them out")
+        if self.stream is not None and self.path is not None:
+            raise ValueError("source.path and source.stream cannot both be given; take one of them out")
+        return self
+
+    @model_validator(mode="after")
+    def _range_is_not_empty(self) -> SourceSettings:
+        if self.stop is not None and self.stop <= self.start:
+            raise ValueError(f"source.stop ({self.stop}) must be larger than source.start ({self.start})")
+        return self
+
+
+class TrackerSettings(StrictModel):
+    """Where the camera poses and the sparse points come from."""
+
+    kind: Literal[
+        "colmap",
+        "transforms",
+        "klt",
+        "tum",
+        "orbslam3",
+        "stella_vslam",
+        "aria",
+        "modp",
+        "replica",
+        "sevenscenes",
+        "socket",
+        "synthetic",
+    ] = Field(
+        description="`colmap` (a model), `transforms` (transforms.json), `klt` (the images alone: our own tracker), "
+        "`tum` (any trajectory in TUM's format), `orbslam3`, `stella_vslam` (its map.msg), `aria` (what MPS writes), "
+        "`modp` (the paper's release), `replica`, `sevenscenes`, `socket` (another program sends frames and poses: "
+        "docs/door.md) or `synthetic` (the embedded demo)"
+    )
+    path: Path | None = Field(
+        None,
+        description="model folder or file; empty: the file of the kind's usual name near the images. `socket`: a Unix "
+        "socket to be made there, instead of tracker.address",
+    )
+    points: Path | None = Field(
+        None,
+        description="world points for `tum`, `orbslam3`, `replica` and `sevenscenes`: PLY, or text with `x y z` a "
+        "line; empty to have features tracked and triangulated with the poses",
+    )
+    max_points: int = Field(
+        2000, ge=10, description="points of a point file, or of MPS, that one frame is shown at most"
+    )
+    max_difference: float = Field(
+        0.02, gt=0, description="seconds by which a pose's time may differ from its image's time"
+    )
+    time_offset: float = Field(
+        0.0, description="seconds added to the times of the poses, where their clock is not that of the images"
+    )
+    camera: str = Field("camera-rgb", description="`aria` only: label of the camera in online_calibration.jsonl")
+    max_inv_dist_std: float = Field(
+        0.005, gt=0, description="`aria` only: points whose inverse distance is less certain [1/m] are left out"
+    )
+    max_dist_std: float = Field(
+        0.05, gt=0, description="`aria` only: points whose distance is less certain [m] are left out"
+    )
+    address: str | None = Field(
+        None,
+        description="`socket` only: host:port to listen at; empty: 127.0.0.1:7007, which only this machine reaches",
+    )
+    patience: float = Field(
+        120.0, gt=0, description="`socket` only: seconds without a whole message after which the stream counts as ended"
+    )
+    exposure_change: float = Field(
+        0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
+    )
+    drift: float = Field(
+        0.0,
+        ge=0,
+        le=0.5,
+        description="`synthetic` only: the camera walks in a loop, at whose end the world is off by this: shift in "
+        "scene depths, turn in radians, scale by its exponential",
+    )
+    correction: bool = Field(
+        False, description="`synthetic` only: where the loop closes, the tracker corrects all that has drifted"
+    )
+
+
+class EvaluationSettings(StrictModel):
+    """How the finished map is scored."""
+
+    lpips_weights: Path | None = Field(
+        None,
+        description="folder with `alexnet-owt-7be5be79.pth` (torchvision) and `alex.pth` (the `lpips` package, v0.1); "
+        "empty: torch's cache and the installed package; LPIPS is null where they are not",
+    )
+
+
+class ExportSettings(StrictModel):
+    """What a run writes beside its map."""
+
+    images: bool = Field(
+        False,
+        description="write the undistorted images, as mapped, into `colmap/images`: to go on with elsewhere, since the "
+        "cameras of `colmap/` are theirs",
+    )
+
+
+class SceneConfig(StrictModel):
+    """Everything that a run depends on."""
+
+    source: SourceSettings = SourceSettings()
+    tracker: TrackerSettings
+    output: Path = Field(description="folder of the results, made where it is missing")
+    device: Literal["cpu", "cuda", "auto"] = Field("auto", description="`auto` takes CUDA where there is a GPU")
+    mode: Literal["online", "offline"] = Field(
+        "online",
+        description="`online` maps while frames arrive and then refines; `offline` is 3DGS on all frames at once",
+    )
+    seed: int = Field(0, ge=0, description="seed of all randomness")
+    threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
+    mapping: MappingSettings = MappingSettings()
+    refine: RefineSettings = RefineSettings()
+    offline: OfflineSettings = OfflineSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+    export: ExportSettings = ExportSettings()
+
+    @model_validator(mode="after")
+    def _images_are_named(self) -> SceneConfig:
+        if self.source.path is None and self.source.stream is None and self.tracker.kind not in WITHOUT_SOURCE:
+            raise ValueError("source.path is missing: give the folder that holds the images")
+        if self.source.intrinsics.given and self.tracker.kind in WITH_CAMERAS:
+            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
+        if self.source.stream is not None and self.tracker.kind not in LIVE_TRACKERS:
+            raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
+        if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
+            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")
+        if self.tracker.address is not None and self.tracker.kind != "socket":
+            raise ValueError("tracker.address is for tracker.kind: socket alone; take it out")
+        if self.tracker.address is not None and self.tracker.path is not None:
+            raise ValueError("tracker.address and tracker.path both say where to listen: take one out")
+        for key in ("exposure_change", "drift", "correction"):
+            if getattr(self.tracker, key) and self.tracker.kind != "synthetic":
+                raise ValueError(f"tracker.{key} is for tracker.kind: synthetic alone; take it out")
+        return self
