@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
 from modp_ti.sources.intrinsics import Intrinsics
-from modp_ti.sources.listed_images import find_frame, selected_names
+from modp_ti.sources.known_frames import KnownFrames
 from modp_ti.sources.vignette import read_vignette
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ __all__ = ["AriaRecording"]
 RGB = "camera-rgb"
 
 
-class AriaRecording:
+class AriaRecording(KnownFrames):
     """An `ImageSource` of a VRS file's `camera-rgb`. Frame n is called `<file's name without suffix>_<n, six digits>`.
 
     The images are those of a pinhole camera in the place of the fisheye, with its axes: Aria's RGB camera is mounted
@@ -48,7 +48,6 @@ class AriaRecording:
             raise InputError(
                 f"{path}: reading a VRS recording needs projectaria-tools ({error}): pip install 'modp-ti[aria]'"
             ) from None
-        self.path = path
         self._lock = Lock()
         if not path.is_file():
             raise InputError(f"{path}: no such VRS file (source.path)")
@@ -76,9 +75,8 @@ class AriaRecording:
         self.T_device_camera: NDArray[np.float64] = np.asarray(fisheye.get_transform_device_camera().to_matrix())
 
         nanoseconds = provider.get_timestamps_ns(self._stream, sensor_data.TimeDomain.DEVICE_TIME)
-        self._times = np.array(nanoseconds, dtype=np.float64) * 1e-9
-        self.names: tuple[str, ...] = tuple(f"{path.stem}_{i:06d}" for i in range(len(nanoseconds)))
-        self._position = {name: i for i, name in enumerate(self.names)}
+        times = np.array(nanoseconds, dtype=np.float64) * 1e-9
+        super().__init__(path, [f"{path.stem}_{i:06d}" for i in range(len(times))], times)
 
         raw = self._recorded(0)
         width, height = (int(value) for value in fisheye.get_image_size())
@@ -103,29 +101,6 @@ class AriaRecording:
                 "Aria's lens darkens toward the edge: give its vignetting mask as source.vignette "
                 "(rgb_vignetting_half_reso_mask.png or rgb_vignetting_full_reso_mask.png of Project Aria)"
             )
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def position(self, name: str) -> int:
-        """Number of the image, from 0."""
-        return self._position[name]
-
-    def timestamp(self, name: str) -> float:
-        """When it was captured [s], on the device's clock."""
-        return float(self._times[self._position[name]])
-
-    def find(self, name: str) -> str | None:
-        """The image of that name, whatever folders before it and image suffix behind it; None for any other name."""
-        return find_frame(name, self._position)
-
-    def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        """Names at positions start, start + step, ... before stop; raises InputError where that is none."""
-        return selected_names(self, start, stop, step)
-
-    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        """The same names, one by one."""
-        return iter(self.selected(start, stop, step))
 
     def size(self, name: str) -> tuple[int, int]:
         """(width, height) of the pinhole images."""

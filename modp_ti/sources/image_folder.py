@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from modp_ti.errors import InputError
-from modp_ti.sources.listed_images import IMAGE_SUFFIXES, ListedImages
+from modp_ti.sources.known_frames import IMAGE_SUFFIXES
+from modp_ti.sources.listed_images import ListedImages
 from modp_ti.sources.name_times import times_of_names
 
 __all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key"]

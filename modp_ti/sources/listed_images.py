@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from modp_ti.errors import InputError
 from modp_ti.sources.image_header import read_image_header
 from modp_ti.sources.intrinsics import Intrinsics
-from modp_ti.sources.protocol import ImageSource
+from modp_ti.sources.known_frames import IMAGE_SUFFIXES, KnownFrames
 
-__all__ = ["IMAGE_SUFFIXES", "ListedImages", "decoded", "find_frame", "selected_names"]
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+__all__ = ["ListedImages", "decoded"]
 
 
-class ListedImages:
+class ListedImages(KnownFrames):
     """An `ImageSource` of files under one folder.
 
     names: relative to the folder, with forward slashes, each once. times [s]: of each. intrinsics: what the data set
@@ -36,27 +34,13 @@ class ListedImages:
         notes: Iterable[str] = (),
         vignette: NDArray[np.float32] | None = None,
     ) -> None:
-        self.path = path
-        self.names: tuple[str, ...] = tuple(names)
+        super().__init__(path, names, times)
         self.intrinsics = intrinsics
         self.notes = list(notes)
         self.vignette = vignette
-        self._times = times
-        self._position = {name: i for i, name in enumerate(self.names)}
         self._by_stem: dict[str, str] = {}
         for name in self.names:
             self._by_stem.setdefault(str(PurePosixPath(name).with_suffix("")), name)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def position(self, name: str) -> int:
-        """Place of an image in the order, from 0."""
-        return self._position[name]
-
-    def timestamp(self, name: str) -> float:
-        """When the image was taken [s]."""
-        return float(self._times[self._position[name]])
 
     def find(self, name: str) -> str | None:
         """The image that a tracker's file name means, or None.
@@ -77,14 +61,6 @@ class ListedImages:
     def with_stem(self, stem: str) -> str | None:
         """The image with this path without its suffix, or None."""
         return self._by_stem.get(stem)
-
-    def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        """Names at positions start, start + step, ... before stop; raises InputError where that is none."""
-        return selected_names(self, start, stop, step)
-
-    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        """The same names, one by one."""
-        return iter(self.selected(start, stop, step))
 
     def size(self, name: str) -> tuple[int, int]:
         """(width, height) as stored. Raises InputError for an image that is unreadable or cut off."""
@@ -138,25 +114,3 @@ def decoded(data: bytes) -> NDArray[np.uint8] | None:
     finally:
         cv2.utils.logging.setLogLevel(log_level)
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def selected_names(images: ImageSource, start: int, stop: int | None, step: int) -> Sequence[str]:
-    """Names at positions start, start + step, ... before stop; raises InputError where that is none."""
-    names = images.names[start:stop:step]
-    if not names:
-        raise InputError(
-            f"{images.path}: source.start={start} leaves no frame of the {len(images.names)} "
-            f"in the {'folder' if images.path.is_dir() else 'file'}"
-        )
-    return names
-
-
-def find_frame(name: str, frames: Container[str]) -> str | None:
-    """The frame of that name, whatever folders before it and image suffix behind it; None for any other name.
-
-    For sources that name their frames themselves. A number alone finds nothing: programs that extract frames count
-    from 0 or from 1.
-    """
-    path = PurePosixPath(name.replace("\\", "/"))
-    tail = path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
-    return tail if tail in frames else None

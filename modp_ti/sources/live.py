@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
 from modp_ti.sources.intrinsics import Intrinsics
-from modp_ti.sources.listed_images import decoded, find_frame
+from modp_ti.sources.known_frames import find_frame
+from modp_ti.sources.listed_images import decoded
 from modp_ti.sources.video_file import quiet_decoder
 
 __all__ = ["LiveSource"]

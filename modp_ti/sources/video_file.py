@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
 from modp_ti.sources.intrinsics import Intrinsics
-from modp_ti.sources.listed_images import find_frame, selected_names
+from modp_ti.sources.known_frames import KnownFrames
 from modp_ti.sources.video_container import missing_bytes
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ PASSED_OVER = 60
 SEEK_MARGIN = 100.0
 
 
-class VideoFile:
+class VideoFile(KnownFrames):
     """An `ImageSource` of a video file. Frame n, from 0, is called `<file's name without suffix>_<n with six digits>`.
 
     The file is decoded once when it is opened, as only that tells how many frames it has and when they are shown;
@@ -83,9 +83,8 @@ class VideoFile:
                 f"{len(shown)} to use the frames that can be read"
             )
         self._shown = np.array(shown)
-        self._times, timed = _frame_times(self._shown, fps)
-        self.names: tuple[str, ...] = tuple(f"{self.path.stem}_{i:06d}" for i in range(len(shown)))
-        self._position = {name: i for i, name in enumerate(self.names)}
+        times, timed = _frame_times(self._shown, fps)
+        super().__init__(self.path, [f"{self.path.stem}_{i:06d}" for i in range(len(shown))], times)
 
         height, width = first.shape[:2]
         self._size = (width, height)
@@ -98,29 +97,6 @@ class VideoFile:
             self.notes.append(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
         self._front.close()
         self._front = self._decoder(missing)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def position(self, name: str) -> int:
-        """Number of the frame, from 0."""
-        return self._position[name]
-
-    def timestamp(self, name: str) -> float:
-        """When the frame is shown [s]."""
-        return float(self._times[self._position[name]])
-
-    def find(self, name: str) -> str | None:
-        """The frame of that name, whatever folders before it and image suffix behind it; None for any other name."""
-        return find_frame(name, self._position)
-
-    def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        """Names at positions start, start + step, ... before stop; raises InputError where that is none."""
-        return selected_names(self, start, stop, step)
-
-    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        """The same names, one by one."""
-        return iter(self.selected(start, stop, step))
 
     def size(self, name: str) -> tuple[int, int]:
         """(width, height) of the frames."""
