@@ -12,9 +12,9 @@ from fields.backend import initialise
 from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
+from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.evaluation import absolute_trajectory_error
 from modp_ti.exports.trajectory import read_trajectory
-from modp_ti.session import Poses
 from modp_ti.synthetic import Loop, SyntheticTracker
 from modp_ti.synthetic.renderer import RoomRenderer
 from modp_ti.trackers import events
@@ -60,21 +60,21 @@ def mapped(items: list[TrackedFrame | PoseCorrection]) -> tuple[float, float, bo
     """Held-out PSNR of the finished map; that at the corrected poses before Gaussians followed; whether they did."""
     initialise("cpu")
     mapper = OnlineMapper(SETTINGS, *SIZE, seed=0)
-    frames, poses, before, moved = [], Poses(), 0.0, False
+    frames, delivered, before, moved = [], DeliveredFrames(), 0.0, False
     for item in items:
         if isinstance(item, PoseCorrection):
             before = held_out_psnr(mapper, frames, list(item.T_camera_world))
             report = mapper.correct(item)
-            poses.correct(item, report.motion)
+            delivered.correct(item, report.motion, report.moved)
             moved = report.moved
             continue
         frames.append(item)
-        poses.add(item)
+        delivered.add(item)
         if not item.held_out:
             mapper.process(item)
     mapper.finish()
     store = mapper.keyframes
-    refined = [store.corrected(i, T) for i, T in zip(poses.index, poses.tracked, strict=True)]
+    refined = [store.corrected(i, T) for i, T in zip(delivered.index, delivered.T_tracked, strict=True)]
     return held_out_psnr(mapper, frames, refined), before, moved
 
 
