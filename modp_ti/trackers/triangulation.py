@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,10 @@ from modp_ti.sources import ImageSource
 from modp_ti.trackers.feature_tracks import feature_tracks
 from modp_ti.trackers.features import MAX_FEATURES, Features, detect_features, essential_matrix, match_features
 from modp_ti.trackers.followed_features import follow_features, looks_like_video
-from modp_ti.trackers.observations import Observations
-from modp_ti.trackers.pose_adjustment import adjusted_poses
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage, points_inside
 
-__all__ = ["neighbouring_views", "solve_points", "triangulated_frames"]
+__all__ = ["Observations", "neighbouring_views", "solve_points", "triangulated_frames"]
 
 # Pairs of views that are matched: these many frames apart, and as many of the nearest others by pose. The
 # growing gaps give parallax where the frames are those of a video.
@@ -44,8 +42,26 @@ MIN_VIEWS = 3
 MIN_ANGLE = 1.5  # degrees between the rays that fix a point
 SOLVER_STEPS = 6
 ROUNDS = 3
-# Poses are adjusted and points solved anew so often: better poses bring more observations.
-ADJUSTMENTS = 3
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What is seen of which point where.
+
+    frame, point: (M,) int64. rays: (M, 2) ideal coordinates. sigma: (M,) their uncertainty, one pixel of
+    detection.
+    """
+
+    frame: NDArray[np.int64]
+    point: NDArray[np.int64]
+    rays: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def where(self, kept: NDArray[np.bool_]) -> Observations:
+        return Observations(self.frame[kept], self.point[kept], self.rays[kept], self.sigma[kept])
 
 
 def triangulated_frames(
@@ -53,11 +69,8 @@ def triangulated_frames(
     frames: Sequence[PosedImage],
     solves: NDArray[np.bool_],
     progress: Progress | None = None,
-    adjust: bool = False,
 ) -> list[PosedImage]:
     """The frames with points that keep their ids from view to view.
-
-    adjust: whether their poses are bundle adjusted with the points.
 
     solves: (F,) False for frames that must not take part in where a point lies (held-out ones): they are only
     told which of the points they see. The result depends on nothing but the images and poses.
@@ -67,18 +80,13 @@ def triangulated_frames(
     features are matched.
     """
     poses = np.stack([frame.T_camera_world for frame in frames])
-    follows = len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
-    found = _followed(images, frames, solves, progress) if follows else _matched(images, frames, poses, progress)
-    xyz, seen = solve_points(poses, found, solves)
-    if adjust:
-        for round_ in range(ADJUSTMENTS):
-            if progress is not None:
-                progress("adjusting poses", round_, ADJUSTMENTS)
-            poses = adjusted_poses(poses, seen, xyz, solves)
-            xyz, seen = solve_points(poses, found, solves)
-        frames = [replace(frame, T_camera_world=T) for frame, T in zip(frames, poses, strict=True)]
-    if follows:
+    if len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves):
+        seen = _followed(images, frames, solves, progress)
+        xyz, seen = solve_points(poses, seen, solves)
         xyz, seen = _surest(poses, seen, xyz, solves)
+    else:
+        seen = _matched(images, frames, poses, progress)
+        xyz, seen = solve_points(poses, seen, solves)
     result = []
     for i, frame in enumerate(frames):
         mine = seen.where(seen.frame == i)
