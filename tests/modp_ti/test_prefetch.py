@@ -57,7 +57,7 @@ def test_frames_and_their_pyramids_are_ready_before_they_are_asked_for_but_no_mo
         source.reached.clear()
         first = next(frames)
         assert "pyramid" in vars(first)
-        assert [level.rgba.shape for level in first.pyramid] == [(200, 240, 4), (100, 120, 4)]
+        assert [level.rgba.shape for level in first.pyramid] == [(200, 240, 4), (100, 120, 4), (50, 60, 4), (25, 30, 4)]
         assert source.reached.wait(timeout=30)
         assert len(source.read) == 4
 
