@@ -27,6 +27,14 @@ from modp_ti.sources.live import WAITING, LiveSource
 PATIENCE = 30.0  # seconds until a test gives up
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Ctrl-C as in a shell's foreground: a process that was started in the background may ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def jpeg(number: int) -> bytes:
     """A flat picture whose grey value tells its number."""
     _, data = cv2.imencode(".jpg", np.full((48, 64, 3), 5 * number, np.uint8))
