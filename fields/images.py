@@ -5,7 +5,7 @@ import taichi as ti
 
 from fields.backend import on_gpu
 from fields.device_images import DeviceImages
-from fields.launch import Launch
+from fields.launch import LoopLaunch
 from fields.parallel import HANDED_OUT
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 
@@ -29,6 +29,7 @@ class ImageBuffers:
     kernels of the offline cache.
 
     cache_gb: device memory for copies of reference images, on a GPU.
+    masked: whether the reference has masked pixels. On a GPU always False: the loss masks them on its way.
     """
 
     def __init__(
@@ -44,9 +45,10 @@ class ImageBuffers:
         self.stride = (1 << (max_width - 1).bit_length()) + 2 * PAD
         self.plane = self.stride * (-(-max_height // 256) * 256 + 2 * PAD)
         self.width = self.height = 0
+        self.masked = False
         self._references = DeviceImages(cache_gb * 2**30) if on_gpu() else None
-        self._take_reference = Launch(
-            self._set_reference_rows if self._references is None else self._set_reference_pixels
+        self._take_reference = LoopLaunch(
+            self._set_reference_rows if self._references is None else self._set_reference_pixels, 6
         )
 
         def scalar():
@@ -114,8 +116,9 @@ class ImageBuffers:
 
     def set_reference(self, image: np.ndarray) -> None:
         """Take a reference image (H, W, 4) uint8: RGB and 255 where the pixel is valid, 0 where it is masked."""
+        self.masked = self._references is None and not image[..., 3].all()
         pixels = np.ascontiguousarray(image) if self._references is None else self._references.of(image)
-        self._take_reference(self.width, self.height, pixels)
+        self._take_reference(self.width * self.height, self.width, self.height, pixels)
 
     def set_gradients(self, colour: np.ndarray, depth: np.ndarray, opacity: np.ndarray) -> None:
         """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W)."""
@@ -153,19 +156,28 @@ class ImageBuffers:
         return out
 
     @ti.kernel
-    def _set_reference_rows(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):
+    def _set_reference_rows(
+        self, alone: ti.template(), width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)
+    ):
+        ti.loop_config(serialize=alone)
         for i in range(height * SPREAD):
             if i % SPREAD == 0:
                 y = i // SPREAD
                 row = (y + PAD) * self.stride + PAD
-                for x in range(width):
-                    for c in ti.static(range(3)):
+                # A first access out here makes Taichi fetch the tree's root once, not at every pixel.
+                self.valid[row] = 0.0
+                for c in ti.static(range(3)):
+                    for x in range(width):
                         self.reference[c * self.plane + row + x] = ti.cast(image[y, x, c], self.real) / 255.0
+                for x in range(width):
                     self.valid[row + x] = ti.cast(image[y, x, 3], self.real) / 255.0
 
     @ti.kernel
-    def _set_reference_pixels(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)):
+    def _set_reference_pixels(
+        self, alone: ti.template(), width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)
+    ):
         """The same with a thread a pixel, for a GPU."""
+        ti.loop_config(serialize=alone)
         for i in range(width * height):
             x, y = i % width, i // width
             at = (y + PAD) * self.stride + PAD + x

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from fields.gaussians import GaussianField
-from fields.launch import Launch
+from fields.launch import LoopLaunch
 
 __all__ = ["Adam", "LearningRates"]
 
@@ -41,7 +41,7 @@ class Adam:
     def __init__(self, gaussians: GaussianField) -> None:
         self.gaussians = gaussians
         self.real = gaussians.real
-        self._update_all = Launch(self._step)
+        self._update_all = LoopLaunch(self._step, 60)
 
     def step(self, rates: LearningRates, batch: int = 1, sh_degree: int | None = None) -> None:
         """Update and clear the gradients of every touched Gaussian.
@@ -57,7 +57,8 @@ class Adam:
         steps = (float(root * v) for v in values)
         # beta^t is exp(t log beta), cheaper than a power. A beta of 0 counts as 1e-30, whose powers vanish too.
         logs = (float(np.log(max(beta, 1e-30))) for beta in (beta1, beta2))
-        self._update_all(self.gaussians.count, active, *steps, float(beta1), float(beta2), *logs, 1e-15 / root)
+        n = self.gaussians.count
+        self._update_all(n, n, active, *steps, float(beta1), float(beta2), *logs, 1e-15 / root)
 
     @ti.func
     def _update(self, value, gradient, m: ti.template(), v: ti.template(), lr, betas, corrections, eps):
@@ -69,6 +70,7 @@ class Adam:
     @ti.kernel
     def _step(
         self,
+        alone: ti.template(),
         count: ti.i32,
         active: ti.i32,
         lr_position: ti.f32,
@@ -82,6 +84,7 @@ class Adam:
         log_beta2: ti.f32,
         eps: ti.f32,
     ):
+        ti.loop_config(serialize=alone)
         for i in range(count):
             if self.gaussians.touched[i] != 0:
                 self.gaussians.touched[i] = 0

@@ -7,7 +7,7 @@ them are taken in depth order, and the same for any number of threads.
 import numpy as np
 import taichi as ti
 
-from fields.launch import Launch
+from fields.launch import Launch, LoopLaunch
 from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_WIDTH, TilePairs
@@ -65,7 +65,7 @@ class Binning:
         self.pairs = pairs
         self._total = np.zeros(1, dtype=np.int64)
         self._count, self._scan = Launch(self._count_chunks), Launch(self._scan_counts)
-        self._scatter = Launch(self._scatter_chunks)
+        self._scatter = LoopLaunch(self._scatter_chunks, 50)
 
     def forward(self, exact: bool = True) -> int:
         """Bin the projected Gaussians of the current view; return the number of pairs. Always exact, on the CPU."""
@@ -77,7 +77,7 @@ class Binning:
         total = int(self._total[0])
         if total > self.pairs.max_pairs:
             raise ValueError(f"{total} tile pairs exceed the room for {self.pairs.max_pairs}; the map is degenerate")
-        self._scatter(slots)
+        self._scatter(slots, slots)
         self.pairs.count = total
         return total
 
@@ -176,7 +176,8 @@ class Binning:
                 pairs += n
 
     @ti.kernel
-    def _scatter_chunks(self, slots: ti.i32):
+    def _scatter_chunks(self, alone: ti.template(), slots: ti.i32):
+        ti.loop_config(serialize=alone)
         for i in range(CHUNKS * SPREAD):
             if i % SPREAD == 0:
                 self._scatter_chunk(i // SPREAD, slots)

@@ -11,7 +11,7 @@ Gaussian outside, pixels inside: the transpose of the form for GPUs). Only rows 
 import taichi as ti
 
 from fields.images import PAD, ImageBuffers
-from fields.launch import Launch
+from fields.launch import Launch, LoopLaunch
 from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TilePairs
@@ -43,7 +43,7 @@ class Compositing:
         self.pairs = pairs
         self.images = images
         self.real = images.real
-        self._composite, self._add_up = Launch(self._forward), Launch(self._gather)
+        self._composite, self._add_up = Launch(self._forward), LoopLaunch(self._gather, 80)
         self._differentiate = {False: Launch(self._backward), True: Launch(self._backward_with_depth)}
 
     def forward(self) -> None:
@@ -53,7 +53,7 @@ class Compositing:
     def backward(self, with_depth: bool = False) -> None:
         """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
         self._differentiate[with_depth](self.view.width, self.view.height)
-        self._add_up(self.projected.count)
+        self._add_up(self.projected.count, self.projected.count)
 
     @ti.kernel
     def _forward(self, width: ti.i32, height: ti.i32):
@@ -231,8 +231,9 @@ class Compositing:
             self.pairs.gradient[k].fill(0.0)
 
     @ti.kernel
-    def _gather(self, slots: ti.i32):
+    def _gather(self, alone: ti.template(), slots: ti.i32):
         """Sum every slot's pairs, in their order, into the gradients of what was composited."""
+        ti.loop_config(serialize=alone)
         for s in range(slots):
             total = ti.Vector.zero(self.real, 10)
             for e in range(self.projected.first_pair[s], self.projected.end_pair[s]):

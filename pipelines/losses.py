@@ -14,7 +14,7 @@ import taichi as ti
 
 from fields.gaussians import GaussianField
 from fields.images import PAD, STRIPS, ImageBuffers
-from fields.launch import Launch
+from fields.launch import Launch, LoopLaunch
 from fields.parallel import HANDED_OUT
 
 __all__ = ["AspectPenalty", "LossValues", "PhotometricLoss", "window_weights"]
@@ -59,7 +59,7 @@ class PhotometricLoss:
         self.real = images.real
         self.weights = window_weights()
         self._sums = np.zeros((3 * STRIPS, 4), dtype=np.float64)
-        self._mask, self._compare = Launch(self._mask_rows), Launch(self._compare_strips)
+        self._mask, self._compare = LoopLaunch(self._mask_rows, 8), Launch(self._compare_strips)
         self._differentiate = Launch(self._differentiate_strips)
 
     def forward(self) -> LossValues:
@@ -67,9 +67,11 @@ class PhotometricLoss:
 
         Masked pixels of the render are replaced by the reference, so that they add nothing to any window.
         """
-        self._mask(self.images.width, self.images.height)
+        width, height = self.images.width, self.images.height
+        if self.images.masked:
+            self._mask(width * height, width, height)
         self._sums[:] = 0.0
-        self._compare(self.images.width, self.images.height, self._sums)
+        self._compare(width, height, self._sums)
         l1, ssim, square, count = (float(v) for v in self._sums.sum(axis=0))
         count = max(count, 1.0)
         return LossValues(l1 / count, ssim / count, square / count)
@@ -89,7 +91,8 @@ class PhotometricLoss:
         )
 
     @ti.kernel
-    def _mask_rows(self, width: ti.i32, height: ti.i32):
+    def _mask_rows(self, alone: ti.template(), width: ti.i32, height: ti.i32):
+        ti.loop_config(serialize=alone)
         for i in range(height * SPREAD):
             if i % SPREAD == 0:
                 row = (i // SPREAD + PAD) * self.images.stride + PAD
@@ -226,15 +229,17 @@ class AspectPenalty:
     def __init__(self, gaussians: GaussianField, max_ratio: float = 10.0) -> None:
         self.gaussians = gaussians
         self.max_ratio = max_ratio
-        self._add = Launch(self._backward)
+        self._add = LoopLaunch(self._backward, 20)
 
     def backward(self, weight: float, scene_depth: float) -> None:
         """Add the gradient of the penalty to that of the log-scales."""
-        if self.gaussians.count:
-            self._add(self.gaussians.count, weight / self.gaussians.count, 1.0 / float(scene_depth))
+        count = self.gaussians.count
+        if count:
+            self._add(count, count, weight / count, 1.0 / float(scene_depth))
 
     @ti.kernel
-    def _backward(self, count: ti.i32, weight: ti.f64, per_depth: ti.f64):
+    def _backward(self, alone: ti.template(), count: ti.i32, weight: ti.f64, per_depth: ti.f64):
+        ti.loop_config(serialize=alone)
         for i in range(count):
             if self.gaussians.touched[i] != 0:
                 scale = ti.exp(self.gaussians.log_scale[i]) * ti.cast(per_depth, self.gaussians.real)

@@ -10,7 +10,7 @@ import torch
 
 from fields.gaussians import SH_C0, GaussianField
 from fields.late import Late
-from fields.launch import Launch
+from fields.launch import LoopLaunch
 from fields.parallel import HANDED_OUT
 from fields.projected import ProjectedGaussians
 from fields.se3 import ti_rotation_from_quaternion
@@ -42,14 +42,15 @@ class Projection:
         self._keys = np.zeros(1, dtype=np.uint64)
         self._depths = np.zeros(1, dtype=np.float32)
         self._chunk_counts = np.zeros(1, dtype=np.int32)
-        self._cull, self._compact = Launch(self._cull_chunks), Launch(self._compact_chunks)
-        self._set_order, self._sum_tangents = Launch(self._set_sorted), Launch(self._sum_tangents_of_chunks)
+        self._cull, self._compact = LoopLaunch(self._cull_chunks, 35), LoopLaunch(self._compact_chunks, 10)
+        self._set_order = LoopLaunch(self._set_sorted, 3)
+        self._sum_tangents = LoopLaunch(self._sum_tangents_of_chunks, 8)
         self._prepare_differentiable()
 
     def _prepare_differentiable(self) -> None:
-        self._project, self._shade = Launch(self.project), Launch(self.shade)
-        self._project_back, self._shade_back = Launch(self.project, reverse=True), Launch(self.shade, reverse=True)
-        self._clear = Launch(self._clear_tangent_gradients)
+        self._project, self._project_back = LoopLaunch(self.project, 30), LoopLaunch(self.project, 80, reverse=True)
+        self._shade, self._shade_back = LoopLaunch(self.shade, 4), LoopLaunch(self.shade, 6, reverse=True)
+        self._clear = LoopLaunch(self._clear_tangent_gradients, 4)
 
     def forward(self) -> int:
         """Fill `projected` for the current view; return how many Gaussians it sees."""
@@ -57,9 +58,9 @@ class Projection:
         if count:
             # Keys are unique (depth above, slot below), so any sort of them is stable in the Gaussians' order.
             self._keys[:count].sort()
-            self._set_order(count, self._keys)
-            self._project()
-            self._shade()
+            self._set_order(count, count, self._keys)
+            self._project(count)
+            self._shade(count)
         else:
             self.projected.seen[None] = 0
         return count
@@ -67,9 +68,9 @@ class Projection:
     def backward(self) -> None:
         """From the gradients in `projected` to those of the Gaussians and of the slots' camera tangents."""
         if self.projected.count:
-            self._clear()
-            self._shade_back()
-            self._project_back()
+            self._clear(self.projected.count)
+            self._shade_back(self.projected.count)
+            self._project_back(self.projected.count)
 
     def camera_gradient(self) -> np.ndarray:
         """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order."""
@@ -77,7 +78,7 @@ class Projection:
         chunks = -(-count // CHUNK)
         partial = np.zeros((chunks, 6), dtype=np.float64)
         if count:
-            self._sum_tangents(count, partial)
+            self._sum_tangents(count, count, partial)
         return partial.sum(axis=0)
 
     def late_camera_gradient(self) -> Late:
@@ -97,15 +98,16 @@ class Projection:
             self._keys = np.zeros(size, dtype=np.uint64)
             self._chunk_counts = np.zeros(-(-size // CHUNK), dtype=np.int32)
         chunks = -(-n // CHUNK)
-        self._cull(n, self._depths, self._chunk_counts)
+        self._cull(n, n, self._depths, self._chunk_counts)
         ends = np.cumsum(self._chunk_counts[:chunks])
         self._chunk_counts[1:chunks] = ends[:-1]
         self._chunk_counts[0] = 0
-        self._compact(n, self._depths, self._chunk_counts, self._keys)
+        self._compact(n, n, self._depths, self._chunk_counts, self._keys)
         return int(ends[-1])
 
     @ti.kernel
-    def _cull_chunks(self, n: ti.i32, depths: ti.types.ndarray(), counts: ti.types.ndarray()):
+    def _cull_chunks(self, alone: ti.template(), n: ti.i32, depths: ti.types.ndarray(), counts: ti.types.ndarray()):
+        ti.loop_config(serialize=alone)
         for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
             if i % SPREAD == 0:
                 self._cull_chunk(i // SPREAD, n, depths, counts)
@@ -154,8 +156,14 @@ class Projection:
 
     @ti.kernel
     def _compact_chunks(
-        self, n: ti.i32, depths: ti.types.ndarray(), first: ti.types.ndarray(), keys: ti.types.ndarray()
+        self,
+        alone: ti.template(),
+        n: ti.i32,
+        depths: ti.types.ndarray(),
+        first: ti.types.ndarray(),
+        keys: ti.types.ndarray(),
     ):
+        ti.loop_config(serialize=alone)
         for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
             if i % SPREAD == 0:
                 self._compact_chunk(i // SPREAD, n, depths, first, keys)
@@ -173,16 +181,18 @@ class Projection:
                 slot += 1
 
     @ti.kernel
-    def _set_sorted(self, count: ti.i32, keys: ti.types.ndarray()):
+    def _set_sorted(self, alone: ti.template(), count: ti.i32, keys: ti.types.ndarray()):
         self.projected.seen[None] = count
+        ti.loop_config(serialize=alone)
         for k in range(count):
             self.projected.order[k] = ti.cast(keys[k] & ti.u64(0xFFFFFFFF), ti.i32)
 
     # ---- the differentiable part -----------------------------------------------------------------------------
 
     @ti.kernel
-    def project(self):
+    def project(self, alone: ti.template()):
         """Ellipse, depth and compensated opacity of every slot."""
+        ti.loop_config(serialize=alone)
         for s in range(self.projected.seen[None]):
             i = self.projected.gaussian[s]
             xi = self.projected.tangent[s]
@@ -219,8 +229,9 @@ class Projection:
             self.projected.opacity[s] = compensation / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
 
     @ti.kernel
-    def shade(self):
+    def shade(self, alone: ti.template()):
         """Colour of every slot from its spherical harmonics and the direction it is seen in."""
+        ti.loop_config(serialize=alone)
         for s in range(self.projected.seen[None]):
             i = self.projected.gaussian[s]
             if ti.static(self.gaussians.sh_degree == 0):
@@ -235,13 +246,15 @@ class Projection:
                 self.projected.colour[s] = ti.max(0.5 + colour, 0.0)
 
     @ti.kernel
-    def _clear_tangent_gradients(self):
+    def _clear_tangent_gradients(self, alone: ti.template()):
+        ti.loop_config(serialize=alone)
         for s in range(self.projected.seen[None]):
             self.projected.tangent.grad[s].fill(0.0)
             self.gaussians.touched[self.projected.gaussian[s]] = 1
 
     @ti.kernel
-    def _sum_tangents_of_chunks(self, count: ti.i32, partial: ti.types.ndarray()):
+    def _sum_tangents_of_chunks(self, alone: ti.template(), count: ti.i32, partial: ti.types.ndarray()):
+        ti.loop_config(serialize=alone)
         for i in range(((count + CHUNK - 1) // CHUNK) * SPREAD):
             if i % SPREAD == 0:
                 self._sum_tangents_chunk(i // SPREAD, count, partial)

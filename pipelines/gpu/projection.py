@@ -49,8 +49,8 @@ class DeviceProjection(Projection):
         # Stable: equal depths stay in the Gaussians' order.
         ordered, gaussian = torch.sort(depths, stable=True)
         self._assign(ordered, gaussian)
-        self._project()
-        self._shade()
+        self._project(n)
+        self._shade(n)
         return n
 
     def camera_gradient(self) -> np.ndarray:

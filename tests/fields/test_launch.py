@@ -3,7 +3,7 @@ import pytest
 import taichi as ti
 import torch
 
-from fields.launch import Launch
+from fields.launch import ALONE_BELOW, Launch, LoopLaunch
 
 
 @ti.data_oriented
@@ -26,6 +26,19 @@ class Sums:
     def square(self):
         for i in range(4):
             self.y[i] = self.x[i] * self.x[i]
+
+    @ti.kernel
+    def tell(self, alone: ti.template(), out: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+        ti.loop_config(serialize=alone)
+        for i in range(4):
+            self.y[i] = self.x[i]
+            out[i] = ti.select(alone, 1.0, 2.0)
+
+    @ti.kernel
+    def cube(self, alone: ti.template()):
+        ti.loop_config(serialize=alone)
+        for i in range(4):
+            self.y[i] = self.x[i] * self.x[i] * self.x[i]
 
 
 def test_every_call_takes_its_own_arguments() -> None:
@@ -70,3 +83,24 @@ def test_wrong_types_of_a_later_call_are_refused() -> None:
     add(1, 0.5, np.zeros(4))
     with pytest.raises(TypeError, match="argument 0 of a kernel is a int64"):
         add(np.int64(1), 0.5, np.zeros(4))
+
+
+def test_little_work_is_done_by_the_calling_thread_and_much_by_all() -> None:
+    sums, out = Sums(), np.zeros(4, dtype=np.float32)
+    tell = LoopLaunch(sums.tell, nanoseconds=10.0)
+    at_most = int(ALONE_BELOW / 10.0)
+    for items, expected in ((at_most, 1.0), (at_most + 1, 2.0), (1, 1.0), (10**9, 2.0)):
+        tell(items, out)
+        assert (out == expected).all()
+
+
+@pytest.mark.parametrize("items", [1, 10**9])
+def test_both_ways_give_the_gradient(items: int) -> None:
+    sums = Sums()
+    sums.x.from_numpy(np.arange(4, dtype=np.float32))
+    backward = LoopLaunch(sums.cube, nanoseconds=1.0, reverse=True)
+    for _ in range(2):
+        sums.x.grad.fill(0.0)
+        sums.y.grad.fill(1.0)
+        backward(items)
+        np.testing.assert_allclose(sums.x.grad.to_numpy(), 3 * np.arange(4) ** 2)
