@@ -90,7 +90,8 @@ def replay_poses(
     """A tracker over the images that have a pose `T_camera_world`, in the source's order.
 
     Points are those of `tracker.points` that project into each image; without such a file features are tracked and
-    triangulated here with the poses, before the first frame is delivered. Raises InputError for a camera that nobody
+    triangulated here with the poses, before the first frame is delivered, and the poses adjusted with them where
+    `tracker.adjust` says so. Raises InputError for a camera that nobody
     knows, images that do not fit it, and a point file that is none.
     """
     undistorter = require_intrinsics(images).undistorter(source.scale)
@@ -108,7 +109,7 @@ def replay_poses(
             )
     else:
         solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
-        frames = triangulated_frames(images, frames, solves, progress)
+        frames = triangulated_frames(images, frames, solves, progress, tracker.adjusts)
     return ReplayedTracker(reader, frames, source, notes)
 
 

@@ -7,7 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from modp_ti.trackers.features import detect_features, essential_matrix, match_features
-from modp_ti.trackers.triangulation import Observations, neighbouring_views, solve_points
+from modp_ti.trackers.observations import Observations
+from modp_ti.trackers.point_solving import solve_points
+from modp_ti.trackers.triangulation import neighbouring_views
 
 VIEWS, POINTS = 6, 80
 SIGMA = 1 / 500
