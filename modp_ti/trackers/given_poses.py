@@ -17,7 +17,7 @@ from modp_ti.trackers.point_cloud import visible_points
 from modp_ti.trackers.point_file import read_point_file
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, is_held_out, require_fitting_sizes
-from modp_ti.trackers.triangulation import triangulated_frames
+from modp_ti.trackers.triangulation import adjusted_frames, triangulated_frames
 
 __all__ = [
     "checked_reader",
@@ -109,7 +109,11 @@ def replay_poses(
             )
     else:
         solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
-        frames = triangulated_frames(images, frames, solves, progress, tracker.adjusts)
+        if tracker.adjusts:
+            frames, note = adjusted_frames(images, frames, solves, progress)
+            notes = [*notes, note]
+        else:
+            frames = triangulated_frames(images, frames, solves, progress)
     return ReplayedTracker(reader, frames, source, notes)
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from modp_ti.trackers.observations import Observations
 
-__all__ = ["MAX_ERROR", "point_errors", "solve_points", "surest_points"]
+__all__ = ["MAX_ERROR", "placed_anew", "point_errors", "solve_points", "surest_points"]
 
 MAX_ERROR = 2.0  # pixels of the image that the features were found in
 
@@ -56,6 +56,25 @@ def solve_points(
     seen = seen.where(enough[seen.point] & (point_errors(poses, seen, xyz) <= max_error))
     numbers = np.cumsum(enough) - 1
     return xyz[enough], Observations(seen.frame, numbers[seen.point], seen.rays, seen.sigma)
+
+
+def placed_anew(
+    poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], solves: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """The points (P, 3) moved to where frames with `solves` (F,) see them under the poses (F, 4, 4).
+
+    A point stays where fewer than two of these see it, or where no place near its own has a smaller robust error.
+    """
+    used = seen.where(solves[seen.frame])
+    used = used.where(np.bincount(used.point, minlength=len(xyz))[used.point] >= 2)
+    if len(used) == 0:
+        return xyz
+    moved = _refined(poses, used, xyz)
+    costs = []
+    for places in (xyz, moved):
+        error = point_errors(poses, used, places)
+        costs.append(np.bincount(used.point, weights=np.log1p(error**2), minlength=len(xyz)))
+    return np.where((costs[1] < costs[0])[:, None], moved, xyz)
 
 
 def surest_points(

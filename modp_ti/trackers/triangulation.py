@@ -13,12 +13,12 @@ from modp_ti.trackers.feature_tracks import feature_tracks
 from modp_ti.trackers.features import MAX_FEATURES, Features, detect_features, essential_matrix, match_features
 from modp_ti.trackers.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
 from modp_ti.trackers.observations import Observations
-from modp_ti.trackers.point_solving import solve_points, surest_points
+from modp_ti.trackers.point_solving import point_errors, solve_points, surest_points
 from modp_ti.trackers.pose_adjustment import adjusted_poses
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage, points_inside
 
-__all__ = ["neighbouring_views", "triangulated_frames"]
+__all__ = ["adjusted_frames", "neighbouring_views", "triangulated_frames"]
 
 # Pairs of views that are matched: these many frames apart, and as many of the nearest others by pose. The
 # growing gaps give parallax where the frames are those of a video.
@@ -35,7 +35,7 @@ FEATURES_OF_MANY_FRAMES = 1000
 WIDE_BAND = 12.0
 FIRST_GATES = (16.0, 8.0)
 GATES = (16.0, 8.0, 4.0, 2.0, 2.0)
-# Views that are matched to find places again: a new one where fewer than this share of the last one's corners are
+# Views that are matched to find places again: a new one where no more than this share of the last one's corners are
 # still followed. Each is matched with so many of the nearest by pose.
 STILL_SEEN = 0.7
 REVISITED = 6
@@ -46,37 +46,77 @@ def triangulated_frames(
     frames: Sequence[PosedImage],
     solves: NDArray[np.bool_],
     progress: Progress | None = None,
-    adjust: bool = False,
 ) -> list[PosedImage]:
     """The frames with points that keep their ids from view to view.
 
     solves: (F,) False for frames that must not take part in where a point lies (held-out ones): they are only
     told which of the points they see. The result depends on nothing but the images and poses.
-    adjust: whether the poses are bundle adjusted with the points; a frame that does not solve gets its pose by the
-    points that it sees.
 
     A few frames have their features matched with those of views around them. Of many, as of a video, corners are
     followed from frame to frame, which takes a tenth of the time; where the frames are too far apart for that, fewer
     features are matched.
     """
-    poses = np.stack([frame.T_camera_world for frame in frames])
-    band = WIDE_BAND if adjust else EPIPOLAR_BAND
-    everything = np.arange(len(frames))
-    follows = len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
+    follows = _are_followed(images, frames, solves)
+    seen = _seen(images, frames, solves, follows, EPIPOLAR_BAND, progress)
+    return _with_points(frames, seen, solves, follows)
+
+
+def adjusted_frames(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    progress: Progress | None = None,
+) -> tuple[list[PosedImage], str]:
+    """The same with poses that are bundle adjusted with the points; and a remark on what that has done.
+
+    A frame that does not solve takes no part in the others' poses and gets its own by the points that it sees.
+    """
+    follows = _are_followed(images, frames, solves)
+    seen = _seen(images, frames, solves, follows, WIDE_BAND, progress)
+    given = poses = np.stack([frame.T_camera_world for frame in frames])
     if follows:
-        seen = _followed(images, frames, solves, band, progress)
+        poses = adjusted_poses(poses, seen, solves, FIRST_GATES)
+        views, most = _views_apart(seen, solves), FEATURES_OF_MANY_FRAMES
+        again = _matched(images, frames, poses, views, solves, most, REVISITED, WIDE_BAND, progress)
+        poses = adjusted_poses(poses, seen.beside(again), solves, GATES)
     else:
-        most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
-        seen = _matched(images, frames, poses, everything, most, NEIGHBOURS, band, progress)
-    if adjust:
-        if follows:
-            poses = adjusted_poses(poses, seen, solves, FIRST_GATES)
-            views = _views_apart(seen, solves)
-            again = _matched(images, frames, poses, views, FEATURES_OF_MANY_FRAMES, REVISITED, band, progress)
-            poses = adjusted_poses(poses, seen.beside(again), solves, GATES)
-        else:
-            poses = adjusted_poses(poses, seen, solves, GATES)
-        frames = [replace(frame, T_camera_world=T) for frame, T in zip(frames, poses, strict=True)]
+        poses = adjusted_poses(poses, seen, solves, GATES)
+    (before, count), (after, _) = (_median_error(each, seen, solves) for each in (given, poses))
+    frames = [replace(frame, T_camera_world=T) for frame, T in zip(frames, poses, strict=True)]
+    note = (
+        f"the poses are bundle adjusted with {count} points that the images show: median reprojection error "
+        f"{before:.2f} px before, {after:.2f} px after (tracker.adjust)"
+        if count
+        else "the images show too little in common to adjust the poses: they stay as given (tracker.adjust)"
+    )
+    return _with_points(frames, seen, solves, follows), note
+
+
+def _are_followed(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
+    return len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
+
+
+def _seen(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    follows: bool,
+    band: float,
+    progress: Progress | None,
+) -> Observations:
+    """What the frames see, followed or matched."""
+    if follows:
+        return _followed(images, frames, solves, band, progress)
+    most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
+    poses = np.stack([frame.T_camera_world for frame in frames])
+    return _matched(images, frames, poses, np.arange(len(frames)), solves, most, NEIGHBOURS, band, progress)
+
+
+def _with_points(
+    frames: Sequence[PosedImage], seen: Observations, solves: NDArray[np.bool_], follows: bool
+) -> list[PosedImage]:
+    """The frames with the points that are certain enough under their poses."""
+    poses = np.stack([frame.T_camera_world for frame in frames])
     xyz, seen = solve_points(poses, seen, solves)
     if follows:
         xyz, seen = surest_points(poses, seen, xyz, solves)
@@ -88,6 +128,13 @@ def triangulated_frames(
         points = points_inside(xyz[mine.point], pixels, mine.point, frame.undistorter, frame.T_camera_world)
         result.append(frame.with_points(points))
     return result
+
+
+def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_]) -> tuple[float, int]:
+    """Reprojection error [px of detection] of points placed under these poses, wide gates open; how many they are."""
+    xyz, agreeing = solve_points(poses, seen, solves, GATES[0])
+    errors = point_errors(poses, agreeing, xyz)
+    return (float(np.median(errors)) if len(errors) else float("nan")), len(xyz)
 
 
 def _followed(
@@ -112,6 +159,7 @@ def _matched(
     frames: Sequence[PosedImage],
     poses: NDArray[np.float64],
     views: NDArray[np.int64],
+    solves: NDArray[np.bool_],
     most: int,
     neighbours: int,
     band: float,
@@ -140,7 +188,7 @@ def _matched(
         if progress is not None:
             progress("matching features", done + 1, len(pairs))
 
-    view, number, track = feature_tracks([each.pixels for each in features], matches)
+    view, number, track = feature_tracks([each.pixels for each in features], matches, ~solves[views])
     seen_rays = np.array([rays[i][j] for i, j in zip(view, number, strict=True)]).reshape(-1, 2)
     return Observations(views[view], track, seen_rays, sigma[view])
 
@@ -176,6 +224,6 @@ def _views_apart(seen: Observations, solves: NDArray[np.bool_]) -> NDArray[np.in
     of = [seen.point[seen.frame == i] for i in range(len(solves))]
     views: list[int] = []
     for i in np.flatnonzero(solves).tolist():
-        if not views or np.isin(of[views[-1]], of[i]).sum() < STILL_SEEN * len(of[views[-1]]) or len(of[i]) == 0:
+        if not views or np.isin(of[views[-1]], of[i]).sum() <= STILL_SEEN * len(of[views[-1]]):
             views.append(i)
     return np.array(views, dtype=np.int64)
