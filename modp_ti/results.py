@@ -93,12 +93,17 @@ def metrics_of(
     seconds: of the stages, and `total`.
     """
     points, last = frames.points, list(versions.values())[-1]
+    anew = {
+        name: points.reprojection_error(frames.camera, poses, points.placed_anew(frames.camera, poses))
+        for name, poses in (("", last.trajectory), ("_tracked", frames.T_tracked))
+    }
     return {
         "frames": len(frames),
         "corrections": frames.corrections,
         **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
         "reprojection_error": _rounded(points.reprojection_error(frames.camera, last.trajectory)),
         "reprojection_error_tracked": _rounded(points.reprojection_error(frames.camera, frames.T_tracked)),
+        **{f"reprojection_error_anew{name}": _rounded(error) for name, error in anew.items()},
         "seconds": _seconds(seconds),
     }
 

@@ -188,6 +188,11 @@ class TrackerSettings(StrictModel):
         description="world points for `tum`, `orbslam3`, `replica` and `sevenscenes`: PLY, or text with `x y z` a "
         "line; empty to have features tracked and triangulated with the poses",
     )
+    adjust: bool | None = Field(
+        None,
+        description="for these four without `points`: bundle adjust the poses with the triangulated points before the "
+        "first frame, where they are those of another sensor or not exact to a pixel; empty: for `sevenscenes` alone",
+    )
     max_points: int = Field(
         2000, ge=10, description="points of a point file, or of MPS, that one frame is shown at most"
     )
@@ -224,6 +229,11 @@ class TrackerSettings(StrictModel):
     correction: bool = Field(
         False, description="`synthetic` only: where the loop closes, the tracker corrects all that has drifted"
     )
+
+    @property
+    def adjusts(self) -> bool:
+        """Whether given poses are adjusted: 7-Scenes' are those of the depth camera, and noisy."""
+        return self.kind == "sevenscenes" if self.adjust is None else self.adjust
 
 
 class EvaluationSettings(StrictModel):
@@ -275,6 +285,8 @@ class SceneConfig(StrictModel):
             raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
         if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
             raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")
+        if self.tracker.adjust and (self.tracker.kind not in WITHOUT_POINTS or self.tracker.points is not None):
+            raise ValueError(f"tracker.adjust is for {', '.join(WITHOUT_POINTS)} without tracker.points; take it out")
         if self.tracker.address is not None and self.tracker.kind != "socket":
             raise ValueError("tracker.address is for tracker.kind: socket alone; take it out")
         if self.tracker.address is not None and self.tracker.path is not None:

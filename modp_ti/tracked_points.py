@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from fields.similarity import moved_points
 from fields.tracked_frame import TrackedFrame
+from modp_ti.trackers.observations import Observations
+from modp_ti.trackers.point_solving import placed_anew
 
 __all__ = ["TrackedPoints"]
 
@@ -25,6 +27,7 @@ class TrackedPoints:
     def __init__(self) -> None:
         self.rows: list[NDArray[np.int64]] = []
         self.pixels: list[NDArray[np.float32]] = []
+        self._held_out: list[bool] = []
         self._row_of: dict[int, int] = {}
         self._xyz = np.zeros((0, 3))
         self._colours = np.zeros((0, 4))  # sums of red, green, blue, and of how many
@@ -48,6 +51,7 @@ class TrackedPoints:
             np.add.at(self._colours, rows[seen], np.c_[rgba[seen, :3], np.ones(seen.sum())])
         self.rows.append(rows)
         self.pixels.append(points.pixels.astype(np.float32))
+        self._held_out.append(frame.held_out)
 
     def correct(self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Sequence[NDArray[np.float64]]) -> None:
         """The tracker has revised its map: points `ids` (N,) are at xyz (N, 3) now, as far as frames saw them.
@@ -89,15 +93,35 @@ class TrackedPoints:
         mean[sums[:, 3] == 0] = UNSEEN
         return mean
 
-    def reprojection_error(self, cameras: list, poses: list[NDArray[np.float64]]) -> float | None:
+    def reprojection_error(
+        self, cameras: list, poses: list[NDArray[np.float64]], places: NDArray[np.float64] | None = None
+    ) -> float | None:
         """Mean distance [px] of the points from their pixels in cameras at T_camera_world (4, 4), frame by frame.
 
-        Over all observations before the camera; None where there is none.
+        Over all observations before the camera; None where there is none. places: (P, 3), others than `xyz`.
         """
+        xyz = self.xyz if places is None else places
         total, count = 0.0, 0
         for camera, T, rows, pixels in zip(cameras, poses, self.rows, self.pixels, strict=True):
-            p = self.xyz[rows] @ T[:3, :3].T + T[:3, 3]
+            p = xyz[rows] @ T[:3, :3].T + T[:3, 3]
             before = p[:, 2] > 0
             total += float(np.linalg.norm(camera.project(p[before]) - pixels[before], axis=1).sum())
             count += int(before.sum())
         return total / count if count else None
+
+    def placed_anew(self, cameras: list, poses: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Places (P, 3) of the points under other poses than the tracker's: where frames not held out see them."""
+        if len(self) == 0:
+            return self.xyz
+        rays = [
+            (pixels.astype(np.float64) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+            for camera, pixels in zip(cameras, self.pixels, strict=True)
+        ]
+        counts = [len(rows) for rows in self.rows]
+        seen = Observations(
+            np.repeat(np.arange(len(counts)), counts),
+            np.concatenate(self.rows),
+            np.concatenate(rays),
+            np.repeat([1.0 / camera.fx for camera in cameras], counts),
+        )
+        return placed_anew(np.stack(poses), seen, self.xyz, ~np.array(self._held_out))

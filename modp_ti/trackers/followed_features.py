@@ -13,7 +13,7 @@ from modp_ti.trackers.features import essential_matrix
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage
 
-__all__ = ["FollowedFeatures", "follow_features", "looks_like_video"]
+__all__ = ["EPIPOLAR_BAND", "FollowedFeatures", "follow_features", "looks_like_video"]
 
 MAX_SIDE = 640  # longer side of the images that corners are followed in
 CORNERS = 800  # followed at a time
@@ -22,7 +22,7 @@ MIN_DISTANCE = 1 / 80  # between new corners, as a share of the longer side
 QUALITY = 0.01  # of the weakest corner, as a share of the strongest
 WINDOW, LEVELS = 21, 3  # of the optical flow
 THERE_AND_BACK = 1.0  # [px] that a corner may be away from its start when it is followed back
-EPIPOLAR_BAND = 3.0  # [px] that a corner may leave the line where the poses allow it
+EPIPOLAR_BAND = 3.0  # [px] that a corner may leave the line where exact poses allow it
 
 # Frames that are looked at to tell whether a sequence is a video, and the share of corners that must survive a step.
 SAMPLES = 8
@@ -81,13 +81,17 @@ class _Picture:
 
 
 def follow_features(
-    images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_], progress: Progress | None = None
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    progress: Progress | None = None,
+    band: float = EPIPOLAR_BAND,
 ) -> FollowedFeatures:
     """Corners of the frames, each followed for as long as it is found again.
 
     solves: (F,) False for frames (held-out ones) that nothing is followed through: the chain leads from the frame
     before them to the frame after, and they are told where its corners lie in them. So no place in another frame
-    depends on their images.
+    depends on their images. band: [px] that a corner may leave the line where the poses allow it.
     """
     chain = np.flatnonzero(solves)
     seen: list[tuple[int, NDArray[np.int64], NDArray[np.float64]]] = []
@@ -102,7 +106,7 @@ def follow_features(
         picture = _Picture(images, frames[index])
         pixel = picture.pixel
         if before is not None:
-            places, kept = _followed(before, picture, places)
+            places, kept = _followed(before, picture, places, band)
             tracks = tracks[kept]
         if len(places) < REFILL_BELOW * CORNERS:
             fresh = _new_corners(picture, places)
@@ -114,7 +118,7 @@ def follow_features(
         behind = range(index + 1, int(chain[done + 1]) if done + 1 < len(chain) else len(frames))
         for other in [*(range(index) if done == 0 else ()), *behind]:
             aside = _Picture(images, frames[other])
-            found, kept = _followed(picture, aside, places)
+            found, kept = _followed(picture, aside, places, band)
             tell(other, found, tracks[kept], aside)
         before = picture
         if progress is not None:
@@ -157,7 +161,7 @@ def _new_corners(picture: _Picture, places: NDArray[np.float32]) -> NDArray[np.f
 
 
 def _followed(
-    one: _Picture, other: _Picture, places: NDArray[np.float32]
+    one: _Picture, other: _Picture, places: NDArray[np.float32], band: float = EPIPOLAR_BAND
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Places (K, 2) in the other picture of those places (N, 2) that are found there, and their numbers (K,).
 
@@ -190,12 +194,12 @@ def _followed(
     good = (found.ravel() > 0) & (found_back.ravel() > 0)
     good &= np.linalg.norm(back - start, axis=1) <= THERE_AND_BACK
     good &= ((there >= 0) & (there <= np.subtract(other.size, 1))).all(axis=1)
-    good[good] = _near_line(one, other, rays[numbers[good]], other.rays(there[good]))
+    good[good] = _near_line(one, other, rays[numbers[good]], other.rays(there[good]), band)
     return there[good], numbers[good]
 
 
 def _near_line(
-    one: _Picture, other: _Picture, rays_one: NDArray[np.float64], rays_other: NDArray[np.float64]
+    one: _Picture, other: _Picture, rays_one: NDArray[np.float64], rays_other: NDArray[np.float64], band: float
 ) -> NDArray[np.bool_]:
     """Which of the rays (N, 2) of two pictures may belong to one point of the world, as the poses are."""
     E = essential_matrix(one.frame.T_camera_world, other.frame.T_camera_world)
@@ -203,4 +207,4 @@ def _near_line(
     length = np.linalg.norm(lines[:, :2], axis=1)
     off = np.abs((lines * np.c_[rays_other, np.ones(len(rays_other))]).sum(axis=1))
     # Where the camera has hardly moved there is no line: off and length are both nothing.
-    return off * other.focal <= EPIPOLAR_BAND * np.maximum(length, 1e-12)
+    return off * other.focal <= band * np.maximum(length, 1e-12)

@@ -17,7 +17,7 @@ from modp_ti.trackers.point_cloud import visible_points
 from modp_ti.trackers.point_file import read_point_file
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, is_held_out, require_fitting_sizes
-from modp_ti.trackers.triangulation import triangulated_frames
+from modp_ti.trackers.triangulation import adjusted_frames, triangulated_frames
 
 __all__ = [
     "checked_reader",
@@ -90,7 +90,8 @@ def replay_poses(
     """A tracker over the images that have a pose `T_camera_world`, in the source's order.
 
     Points are those of `tracker.points` that project into each image; without such a file features are tracked and
-    triangulated here with the poses, before the first frame is delivered. Raises InputError for a camera that nobody
+    triangulated here with the poses, before the first frame is delivered, and the poses adjusted with them where
+    `tracker.adjust` says so. Raises InputError for a camera that nobody
     knows, images that do not fit it, and a point file that is none.
     """
     undistorter = require_intrinsics(images).undistorter(source.scale)
@@ -108,7 +109,11 @@ def replay_poses(
             )
     else:
         solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
-        frames = triangulated_frames(images, frames, solves, progress)
+        if tracker.adjusts:
+            frames, note = adjusted_frames(images, frames, solves, progress)
+            notes = [*notes, note]
+        else:
+            frames = triangulated_frames(images, frames, solves, progress)
     return ReplayedTracker(reader, frames, source, notes)
 
 

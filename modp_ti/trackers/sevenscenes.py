@@ -45,8 +45,8 @@ def open_sevenscenes(
     poses = dict(zip(found, inverse_poses(np.stack(matrices)), strict=True))
     notes = [
         *missing_frames_note(selected, poses, folder),
-        "poses of 7-Scenes are those of the depth camera, some centimetres beside the colour camera; nothing here "
-        "knows by how much",
+        "poses of 7-Scenes are those of the depth camera, some centimetres beside the colour camera"
+        + ("" if tracker.adjusts and tracker.points is None else "; nothing here knows by how much"),
     ]
     return replay_poses(images, source, tracker, poses, notes, progress)
 

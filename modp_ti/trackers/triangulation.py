@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from modp_ti.sources import ImageSource
 from modp_ti.trackers.feature_tracks import feature_tracks
 from modp_ti.trackers.features import MAX_FEATURES, Features, detect_features, essential_matrix, match_features
-from modp_ti.trackers.followed_features import follow_features, looks_like_video
+from modp_ti.trackers.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
+from modp_ti.trackers.observations import Observations
+from modp_ti.trackers.point_solving import point_errors, solve_points, surest_points
+from modp_ti.trackers.pose_adjustment import adjusted_poses
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage, points_inside
 
-__all__ = ["Observations", "neighbouring_views", "solve_points", "triangulated_frames"]
+__all__ = ["adjusted_frames", "neighbouring_views", "triangulated_frames"]
 
 # Pairs of views that are matched: these many frames apart, and as many of the nearest others by pose. The
 # growing gaps give parallax where the frames are those of a video.
@@ -27,41 +30,15 @@ MAX_TURN = 45.0  # degrees between the optical axes of views that are matched
 FEW_FRAMES = 60
 FEATURES_OF_MANY_FRAMES = 1000
 
-# Followed corners: points of narrower angles [degrees] are used where a frame would have fewer than ENOUGH points.
-SURE_ANGLE = 4.0
-ENOUGH = 50
-
-# In pixels of the image that the features were found in.
-EPIPOLAR_BAND = 3.0
-MAX_ERROR = 2.0
-
-# Two views agree on any match along the epipolar line: it takes a third to confirm a point. Measured on a
-# real sequence: one in ten points of two views was off by more than 6 % in depth, one in a hundred with more
-# views.
-MIN_VIEWS = 3
-MIN_ANGLE = 1.5  # degrees between the rays that fix a point
-SOLVER_STEPS = 6
-ROUNDS = 3
-
-
-@dataclass(frozen=True)
-class Observations:
-    """What is seen of which point where.
-
-    frame, point: (M,) int64. rays: (M, 2) ideal coordinates. sigma: (M,) their uncertainty, one pixel of
-    detection.
-    """
-
-    frame: NDArray[np.int64]
-    point: NDArray[np.int64]
-    rays: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def where(self, kept: NDArray[np.bool_]) -> Observations:
-        return Observations(self.frame[kept], self.point[kept], self.rays[kept], self.sigma[kept])
+# Poses that are adjusted: features may leave the epipolar line so far [px], and points their pixels in each round,
+# before and after places that are seen again have been matched.
+WIDE_BAND = 12.0
+FIRST_GATES = (16.0, 8.0)
+GATES = (16.0, 8.0, 4.0, 2.0, 2.0)
+# Views that are matched to find places again: a new one where no more than this share of the last one's corners are
+# still followed. Each is matched with so many of the nearest by pose.
+STILL_SEEN = 0.7
+REVISITED = 6
 
 
 def triangulated_frames(
@@ -79,14 +56,70 @@ def triangulated_frames(
     followed from frame to frame, which takes a tenth of the time; where the frames are too far apart for that, fewer
     features are matched.
     """
-    poses = np.stack([frame.T_camera_world for frame in frames])
-    if len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves):
-        seen = _followed(images, frames, solves, progress)
-        xyz, seen = solve_points(poses, seen, solves)
-        xyz, seen = _surest(poses, seen, xyz, solves)
+    follows = _are_followed(images, frames, solves)
+    seen = _seen(images, frames, solves, follows, EPIPOLAR_BAND, progress)
+    return _with_points(frames, seen, solves, follows)
+
+
+def adjusted_frames(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    progress: Progress | None = None,
+) -> tuple[list[PosedImage], str]:
+    """The same with poses that are bundle adjusted with the points; and a remark on what that has done.
+
+    A frame that does not solve takes no part in the others' poses and gets its own by the points that it sees.
+    """
+    follows = _are_followed(images, frames, solves)
+    seen = _seen(images, frames, solves, follows, WIDE_BAND, progress)
+    given = poses = np.stack([frame.T_camera_world for frame in frames])
+    if follows:
+        poses = adjusted_poses(poses, seen, solves, FIRST_GATES)
+        views, most = _views_apart(seen, solves), FEATURES_OF_MANY_FRAMES
+        again = _matched(images, frames, poses, views, solves, most, REVISITED, WIDE_BAND, progress)
+        poses = adjusted_poses(poses, seen.beside(again), solves, GATES)
     else:
-        seen = _matched(images, frames, poses, progress)
-        xyz, seen = solve_points(poses, seen, solves)
+        poses = adjusted_poses(poses, seen, solves, GATES)
+    (before, count), (after, _) = (_median_error(each, seen, solves) for each in (given, poses))
+    frames = [replace(frame, T_camera_world=T) for frame, T in zip(frames, poses, strict=True)]
+    note = (
+        f"the poses are bundle adjusted with {count} points that the images show: median reprojection error "
+        f"{before:.2f} px before, {after:.2f} px after (tracker.adjust)"
+        if count
+        else "the images show too little in common to adjust the poses: they stay as given (tracker.adjust)"
+    )
+    return _with_points(frames, seen, solves, follows), note
+
+
+def _are_followed(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
+    return len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
+
+
+def _seen(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    follows: bool,
+    band: float,
+    progress: Progress | None,
+) -> Observations:
+    """What the frames see, followed or matched."""
+    if follows:
+        return _followed(images, frames, solves, band, progress)
+    most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
+    poses = np.stack([frame.T_camera_world for frame in frames])
+    return _matched(images, frames, poses, np.arange(len(frames)), solves, most, NEIGHBOURS, band, progress)
+
+
+def _with_points(
+    frames: Sequence[PosedImage], seen: Observations, solves: NDArray[np.bool_], follows: bool
+) -> list[PosedImage]:
+    """The frames with the points that are certain enough under their poses."""
+    poses = np.stack([frame.T_camera_world for frame in frames])
+    xyz, seen = solve_points(poses, seen, solves)
+    if follows:
+        xyz, seen = surest_points(poses, seen, xyz, solves)
     result = []
     for i, frame in enumerate(frames):
         mine = seen.where(seen.frame == i)
@@ -97,11 +130,22 @@ def triangulated_frames(
     return result
 
 
+def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_]) -> tuple[float, int]:
+    """Reprojection error [px of detection] of points placed under these poses, wide gates open; how many they are."""
+    xyz, agreeing = solve_points(poses, seen, solves, GATES[0])
+    errors = point_errors(poses, agreeing, xyz)
+    return (float(np.median(errors)) if len(errors) else float("nan")), len(xyz)
+
+
 def _followed(
-    images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_], progress: Progress | None
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    band: float,
+    progress: Progress | None,
 ) -> Observations:
     """Corners followed along the frames."""
-    found = follow_features(images, frames, solves, progress)
+    found = follow_features(images, frames, solves, progress, band)
     rays = np.zeros((len(found.frame), 2))
     for i, frame in enumerate(frames):
         mine = found.frame == i
@@ -111,34 +155,42 @@ def _followed(
 
 
 def _matched(
-    images: ImageSource, frames: Sequence[PosedImage], poses: NDArray[np.float64], progress: Progress | None
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    poses: NDArray[np.float64],
+    views: NDArray[np.int64],
+    solves: NDArray[np.bool_],
+    most: int,
+    neighbours: int,
+    band: float,
+    progress: Progress | None,
 ) -> Observations:
-    """Features matched between views that may see the same."""
-    most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
+    """Features, `most` a view, matched between those of the frames `views` (V,) that may see the same."""
     features: list[Features] = []
     rays: list[NDArray[np.float64]] = []
-    for i, frame in enumerate(frames):
-        found = detect_features(images.read(frame.name), most)
+    for done, i in enumerate(views.tolist()):
+        found = detect_features(images.read(frames[i].name), most)
         features.append(found)
-        rays.append(_ideal(frame, found.pixels))
+        rays.append(_ideal(frames[i], found.pixels))
         if progress is not None:
-            progress("finding features", i + 1, len(frames))
+            progress("finding features", done + 1, len(views))
 
-    pairs = neighbouring_views(poses)
-    focal = np.array([frame.undistorter.raw.focal for frame in frames])
+    poses = poses[views]
+    pairs = neighbouring_views(poses, neighbours)
+    focal = np.array([frames[i].undistorter.raw.focal for i in views])
     sigma = np.array([each.pixel for each in features]) / focal
     matches = []
     for done, (a, b) in enumerate(pairs):
         descriptors = features[a].descriptors, features[b].descriptors
         essential = essential_matrix(poses[a], poses[b])
-        found = match_features(*descriptors, rays[a], rays[b], essential, EPIPOLAR_BAND * sigma[b])
+        found = match_features(*descriptors, rays[a], rays[b], essential, band * sigma[b])
         matches.append((a, b, found))
         if progress is not None:
             progress("matching features", done + 1, len(pairs))
 
-    view, number, track = feature_tracks([each.pixels for each in features], matches)
+    view, number, track = feature_tracks([each.pixels for each in features], matches, ~solves[views])
     seen_rays = np.array([rays[i][j] for i, j in zip(view, number, strict=True)]).reshape(-1, 2)
-    return Observations(view, track, seen_rays, sigma[view])
+    return Observations(views[view], track, seen_rays, sigma[view])
 
 
 def _ideal(frame: PosedImage, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -147,8 +199,11 @@ def _ideal(frame: PosedImage, pixels: NDArray[np.float64]) -> NDArray[np.float64
     return (frame.undistorter.points(pixels) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
 
 
-def neighbouring_views(poses: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b, of views that may see the same, for poses (F, 4, 4) world to camera."""
+def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
+    """Pairs (a, b), a < b, of views that may see the same, for poses (F, 4, 4) world to camera.
+
+    neighbours: how many of the nearest by pose a view is paired with, besides those that are near in the order.
+    """
     count = len(poses)
     axes = poses[:, 2, :3]
     centres = -np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3])
@@ -160,134 +215,15 @@ def neighbouring_views(poses: NDArray[np.float64]) -> list[tuple[int, int]]:
         distance[a] = np.inf
         others = [int(b) for b in np.argsort(distance, kind="stable") if np.isfinite(distance[b])]
         fresh = [b for b in others if (min(a, b), max(a, b)) not in pairs and abs(a - b) > max(GAPS)]
-        pairs.update((min(a, b), max(a, b)) for b in fresh[:NEIGHBOURS])
+        pairs.update((min(a, b), max(a, b)) for b in fresh[:neighbours])
     return sorted(pairs)
 
 
-# ---------------------------------------------------------------------------------------------------- solving
-
-
-def solve_points(
-    poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], Observations]:
-    """Positions (P, 3) of the points under the poses (F, 4, 4), and the observations that agree with them.
-
-    A point is kept where at least MIN_VIEWS frames with `solves` see it before them, within MAX_ERROR, under
-    rays MIN_ANGLE apart; only these frames decide on its place. The others' observations are kept where they
-    agree. Point numbers of the result are those of the rows of the positions.
-    """
-    used = seen.where(solves[seen.frame])
-    used = used.where(np.isfinite(used.rays).all(axis=1))
-    count = int(seen.point.max()) + 1 if len(seen) else 0
-    xyz = np.zeros((count, 3))
-    for _ in range(ROUNDS):
-        used = used.where(np.bincount(used.point, minlength=count)[used.point] >= 2)
-        if len(used) == 0:
-            break
-        xyz = _refined(poses, used, _nearest_to_rays(poses, used, count))
-        error = _error(poses, used, xyz)
-        # The worst observation of a point goes first: it may be what moved the point away from the others.
-        worst = np.zeros(count)
-        np.maximum.at(worst, used.point, error)
-        good = (error <= MAX_ERROR) | (error < 0.5 * worst[used.point])
-        if good.all():
-            break
-        used = used.where(good)
-    used = used.where(_error(poses, used, xyz) <= MAX_ERROR)
-    enough = np.bincount(used.point, minlength=count) >= min(MIN_VIEWS, int(solves.sum()))
-    enough &= _widest_angle(poses, used, xyz) >= MIN_ANGLE
-    seen = seen.where(enough[seen.point] & (_error(poses, seen, xyz) <= MAX_ERROR))
-    numbers = np.cumsum(enough) - 1
-    return xyz[enough], Observations(seen.frame, numbers[seen.point], seen.rays, seen.sigma)
-
-
-def _surest(
-    poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], solves: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], Observations]:
-    """The points with rays SURE_ANGLE apart at least, and those that some frame needs to have ENOUGH of them.
-
-    Errors of the given poses turn into depth the more, the narrower the angle.
-    """
-    angle = _widest_angle(poses, seen.where(solves[seen.frame]), xyz)
-    kept = angle >= SURE_ANGLE
-    have = np.bincount(seen.frame[kept[seen.point]], minlength=len(poses))
-    unsure = seen.where(~kept[seen.point])
-    unsure = unsure.where(np.lexsort((unsure.point, -angle[unsure.point], unsure.frame)))
-    first = np.searchsorted(unsure.frame, unsure.frame)
-    kept[unsure.point[have[unsure.frame] + np.arange(len(unsure)) - first < ENOUGH]] = True
-    seen = seen.where(kept[seen.point])
-    return xyz[kept], Observations(seen.frame, (np.cumsum(kept) - 1)[seen.point], seen.rays, seen.sigma)
-
-
-def _nearest_to_rays(poses: NDArray[np.float64], seen: Observations, count: int) -> NDArray[np.float64]:
-    """Points (count, 3) with the least sum of squared distances to their rays."""
-    rotation, translation = poses[seen.frame, :3, :3], poses[seen.frame, :3, 3]
-    direction = np.einsum("mji,mj->mi", rotation, np.c_[seen.rays, np.ones(len(seen))])
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    centre = -np.einsum("mji,mj->mi", rotation, translation)
-    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    left = _summed(seen.point, across, count)
-    right = _summed(seen.point, np.einsum("mij,mj->mi", across, centre), count)
-    return _solved(left, right, 1e-9)
-
-
-def _refined(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gauss-Newton on the reprojection errors under a Cauchy loss."""
-    rotation, translation = poses[seen.frame, :3, :3], poses[seen.frame, :3, 3]
-    for _ in range(SOLVER_STEPS):
-        p = np.einsum("mij,mj->mi", rotation, xyz[seen.point]) + translation
-        z = np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
-        residual = (p[:, :2] / z[:, None] - seen.rays) / seen.sigma[:, None]
-        jacobian = (rotation[:, :2] - (p[:, :2] / z[:, None])[:, :, None] * rotation[:, 2:]) / (z * seen.sigma)[
-            :, None, None
-        ]
-        weight = 1.0 / (1.0 + (residual**2).sum(axis=1))
-        weighted = weight[:, None, None] * jacobian
-        left = _summed(seen.point, np.einsum("mki,mkj->mij", weighted, jacobian), len(xyz))
-        right = _summed(seen.point, np.einsum("mki,mk->mi", weighted, residual), len(xyz))
-        xyz = xyz - _solved(left, right, 1e-6)
-    return xyz
-
-
-def _summed(point: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Sums (count, ...) of the values (M, ...) of each point."""
-    columns = values.reshape(len(values), -1).T
-    sums = [np.bincount(point, weights=column, minlength=count) for column in columns]
-    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
-
-
-def _solved(left: NDArray[np.float64], right: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
-    """Solutions (P, 3) of small symmetric systems; zero for a point that nothing is known about."""
-    trace = np.trace(left, axis1=1, axis2=2)
-    left = left + np.eye(3) * (damping * trace + (trace == 0))[:, None, None]
-    return np.linalg.solve(left, right[..., None])[..., 0]
-
-
-def _error(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Reprojection errors (M,) in pixels of detection; infinite behind the camera."""
-    p = np.einsum("mij,mj->mi", poses[seen.frame, :3, :3], xyz[seen.point]) + poses[seen.frame, :3, 3]
-    before = p[:, 2] > 1e-9
-    z = np.where(before, p[:, 2], 1.0)
-    error = np.linalg.norm(p[:, :2] / z[:, None] - seen.rays, axis=1) / seen.sigma
-    return np.where(before & np.isfinite(error), error, np.inf)
-
-
-def _widest_angle(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle [degrees] per point (P,) between two of its rays that are nearly the farthest apart.
-
-    They are the ray farthest from the point's first one, and the one farthest from that.
-    """
-    count = len(xyz)
-    centre = -np.einsum("mji,mj->mi", poses[seen.frame, :3, :3], poses[seen.frame, :3, 3])
-    direction = xyz[seen.point] - centre
-    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
-    reference = np.zeros((count, 3))
-    reference[seen.point[::-1]] = direction[::-1]
-    cosine = np.ones(count)
-    for _ in range(2):
-        each = (direction * reference[seen.point]).sum(axis=1)
-        cosine = np.ones(count)
-        np.minimum.at(cosine, seen.point, each)
-        farthest = np.flatnonzero(each == cosine[seen.point])
-        reference[seen.point[farthest]] = direction[farthest]
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+def _views_apart(seen: Observations, solves: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Solving frames (V,), the first and each that sees less than STILL_SEEN of the one taken before."""
+    of = [seen.point[seen.frame == i] for i in range(len(solves))]
+    views: list[int] = []
+    for i in np.flatnonzero(solves).tolist():
+        if not views or np.isin(of[views[-1]], of[i]).sum() <= STILL_SEEN * len(of[views[-1]]):
+            views.append(i)
+    return np.array(views, dtype=np.int64)

@@ -124,6 +124,7 @@ def test_wrong_override_is_named_as_it_was_typed(scene, override, parts):
         ("tracker.exposure_change", "1"),
         ("tracker.drift", "0.05"),
         ("tracker.correction", "true"),
+        ("tracker.adjust", "true"),
         ("mapping.corrections.min_pixels", "-1"),
         ("tracker.kind", "orb"),
         ("tracker.path", "3"),

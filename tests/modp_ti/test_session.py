@@ -130,6 +130,9 @@ def test_the_colmap_model_has_every_frame_at_its_refined_pose(folder: Path) -> N
     assert 0.2 < metrics["reprojection_error_tracked"] < 2.0
     assert 0.2 < metrics["reprojection_error"] < 2.0
     assert metrics["reprojection_error"] != metrics["reprojection_error_tracked"]
+    # Without the points' own error what is left is the pixels'.
+    for name in ("", "_tracked"):
+        assert 0.1 < metrics[f"reprojection_error_anew{name}"] < 0.9 * metrics[f"reprojection_error{name}"]
 
 
 def test_the_trajectory_errors_are_those_of_the_written_and_of_the_tracked_poses(folder: Path) -> None:

@@ -62,3 +62,24 @@ def test_no_matches_give_no_tracks():
     for found in ([], [matches(0, 1)]):
         view, number, track = feature_tracks(places(3, 0), found)
         assert len(view) == len(number) == len(track) == 0
+
+
+def test_a_view_set_aside_joins_no_tracks_and_is_told_of_those_it_shows():
+    pixels = places(3, 3, 3)
+    found = [
+        matches(0, 2, (0, 0, 0.3), (1, 1, 0.3)),
+        matches(0, 1, (0, 0, 0.1), (1, 1, 0.1), (2, 2, 0.1)),
+        matches(1, 2, (1, 2, 0.2), (0, 0, 0.2)),
+    ]
+    expected = {frozenset({(0, 0), (2, 0), (1, 0)}), frozenset({(0, 1), (2, 1), (1, 1)})}
+    view, number, track = feature_tracks(pixels, found, np.array([False, True, False]))
+    assert {frozenset(zip(view[track == t], number[track == t], strict=True)) for t in np.unique(track)} == expected
+    # whatever it shows: the tracks of the others, and their numbers, are the same
+    for other in ([found[0]], [found[0], matches(0, 1, (0, 1, 0.1)), matches(1, 2, (1, 1, 0.1))]):
+        view2, number2, track2 = feature_tracks(pixels, other, np.array([False, True, False]))
+        for of in (0, 2):
+            assert track2[(view2 == of)].tolist() == track[view == of].tolist()
+            assert number2[(view2 == of)].tolist() == number[view == of].tolist()
+    # two such views alone make no track either
+    view, _, _ = feature_tracks(pixels, [found[1]], np.array([True, True, False]))
+    assert len(view) == 0

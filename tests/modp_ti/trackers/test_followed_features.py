@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -124,6 +125,49 @@ def test_held_out_frames_change_nothing_but_what_they_are_told(video, tmp_path, 
         assert np.array_equal(before[i].points.ids, after[i].points.ids)
     assert all(len(before[i].points) >= 80 for i in np.flatnonzero(held_out)), "the first frame too"
     assert all(len(after[i].points) < 20 for i in np.flatnonzero(held_out)), "a negative shows none of the corners"
+
+
+def off(video) -> np.ndarray:
+    """The poses, each turned by half a degree and shifted by two pixels or so."""
+    rng = np.random.default_rng(2)
+    wrong = video[1].copy()
+    for T in wrong:
+        T[:3, :3] = Rotation.from_rotvec(np.radians(0.3) * rng.standard_normal(3)).as_matrix() @ T[:3, :3]
+        T[:3, 3] += 0.01 * rng.standard_normal(3)
+    return wrong
+
+
+def next_turns(poses: np.ndarray) -> Rotation:
+    return Rotation.from_matrix((poses[1:] @ np.linalg.inv(poses[:-1]))[:, :3, :3])
+
+
+@pytest.mark.parametrize("few", [5, 60], ids=["followed", "matched"])
+def test_adjusted_poses_are_those_of_the_images_and_none_hangs_on_held_out_ones(video, tmp_path, monkeypatch, few):
+    monkeypatch.setattr(triangulation, "FEW_FRAMES", few)
+    held_out = np.arange(FRAMES) % 4 == 0
+    wrong = off(video)
+    images, frames = posed((video[0], wrong))
+    result, note = triangulation.adjusted_frames(images, frames, ~held_out)
+    before, after = (float(word) for word in re.findall(r"([\d.]+) px", note))
+    assert after < 0.5 < before
+    found = np.stack([frame.T_camera_world for frame in result])
+    truth = next_turns(video[1])
+    before, after = (np.degrees((truth.inv() * next_turns(poses)).magnitude()) for poses in (wrong, found))
+    assert np.median(before) > 0.4
+    assert np.median(after) < 0.08 and after.max() < 0.25, "held-out frames too"
+    for i, frame in enumerate(result):
+        assert len(frame.points) >= (80 if held_out[i] else 100)
+        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+        assert np.median(np.linalg.norm(CAMERA.project(p) - frame.points.pixels, axis=1)) < 0.5
+
+    for i, file in enumerate(sorted(video[0].iterdir())):
+        image = cv2.imread(str(file))
+        cv2.imwrite(str(tmp_path / file.name), 255 - image[::-1] if held_out[i] else image)
+    other, _ = posed((tmp_path, wrong))
+    again, _ = triangulation.adjusted_frames(other, frames, ~held_out)
+    for i in np.flatnonzero(~held_out):
+        assert np.array_equal(result[i].T_camera_world, again[i].T_camera_world), "bit for bit"
+        assert np.array_equal(result[i].points.xyz, again[i].points.xyz)
 
 
 def test_frames_without_overlap_are_no_video(video, tmp_path):

@@ -39,6 +39,19 @@ def test_poses_are_found_beside_the_images_or_in_a_folder_of_their_own(posed):
     assert any("those of the depth camera" in note for note in tracker.notes)
 
 
+def test_poses_are_adjusted_to_the_images_unless_told_not_to(posed):
+    given = posed.open("sevenscenes", adjust=False)
+    assert any("nothing here knows by how much" in note for note in given.notes)
+    adjusted = posed.open("sevenscenes")
+    assert any("the poses are bundle adjusted" in note for note in adjusted.notes)
+    assert not any("nothing here knows" in note for note in adjusted.notes)
+    for frame, one, other in zip(given.frames, adjusted.frames, posed.T_camera_world, strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, other, atol=1e-6)
+        # exact poses stay within what the images can tell
+        assert not np.array_equal(one.T_camera_world, frame.T_camera_world)
+        np.testing.assert_allclose(one.T_camera_world, other, atol=0.03)
+
+
 def test_frames_without_a_pose_are_skipped_and_counted(posed):
     (posed.root / "poses" / "frame-000003.pose.txt").unlink()
     tracker = posed.open("sevenscenes", points=posed.root / "points.txt")

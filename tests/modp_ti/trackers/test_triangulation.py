@@ -7,7 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from modp_ti.trackers.features import detect_features, essential_matrix, match_features
-from modp_ti.trackers.triangulation import Observations, neighbouring_views, solve_points
+from modp_ti.trackers.observations import Observations
+from modp_ti.trackers.point_solving import placed_anew, solve_points
+from modp_ti.trackers.triangulation import neighbouring_views
 
 VIEWS, POINTS = 6, 80
 SIGMA = 1 / 500
@@ -109,6 +111,22 @@ def test_views_that_do_not_solve_are_only_told_what_they_see(poses, points):
     xyz, kept = solve_points(poses, Observations(seen.frame, seen.point, rays, seen.sigma), solves)
     np.testing.assert_allclose(xyz, points, atol=1e-8)
     assert np.count_nonzero(kept.frame == 2) == 0
+
+
+def test_points_are_placed_anew_under_other_poses_by_the_frames_that_may(poses, points):
+    seen = observed(poses, points)
+    rays = seen.rays.copy()
+    rays[seen.frame == 2] += 10 * SIGMA  # held out
+    seen = Observations(seen.frame, seen.point, rays, seen.sigma)
+    solves = ALL.copy()
+    solves[2] = False
+    start = points + np.random.default_rng(2).normal(scale=0.02, size=points.shape)
+    np.testing.assert_allclose(placed_anew(poses, seen, start, solves), points, atol=1e-6)
+    few = seen.where((seen.point >= 10) | np.isin(seen.frame, [2, 4]))  # one frame that may sees the first ten
+    moved = placed_anew(poses, few, start, solves)
+    assert np.array_equal(moved[:10], start[:10])
+    np.testing.assert_allclose(moved[10:], points[10:], atol=1e-6)
+    assert np.array_equal(placed_anew(poses, seen.where(seen.frame < 0), start, solves), start)
 
 
 def test_nothing_seen_gives_nothing(poses):
