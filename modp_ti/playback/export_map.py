@@ -44,6 +44,8 @@ SPLATS = {"splat": write_web_splat, "spz": write_spz, "compressed-ply": write_co
 # Edge of the mesh's voxels in scene depths, and how far its surface reaches.
 VOXEL = 1 / 160
 FARTHEST = 4.0
+# Frames whose views are fused; of more, as many at equal steps.
+SURFACE_VIEWS = 300
 
 
 @dataclass(frozen=True)
@@ -108,13 +110,17 @@ def _farthest(run: FinishedRun) -> float:
 
 
 def _surface(run: FinishedRun, device: str, line: ProgressLine) -> Iterator[SurfaceView]:
-    """What the keyframes see of the map."""
+    """What the frames that were mapped see of the map."""
     gaussians = run.gaussians
     start_device(device)
-    cameras = [run.cameras[index] for index in run.record.keyframes]
+    mapped = run.mapped
+    chosen = [
+        mapped[i * len(mapped) // min(len(mapped), SURFACE_VIEWS)] for i in range(min(len(mapped), SURFACE_VIEWS))
+    ]
+    cameras = [run.cameras[index] for index in chosen]
     renderer = MapRenderer(gaussians, max(c.width for c in cameras), max(c.height for c in cameras), run.record.near)
-    keyframes = list(zip(cameras, run.poses[run.record.keyframes], strict=True))
-    for camera, T in line.through("fusing depth", keyframes, len(keyframes)):
+    views = list(zip(cameras, run.poses[chosen], strict=True))
+    for camera, T in line.through("fusing depth", views, len(views)):
         view = renderer.view(camera, T)
         yield SurfaceView(camera, T, surface_depth(view), eight_bits(view.colour) / 255.0)
 
