@@ -40,13 +40,12 @@ def unprojected(camera: PinholeCamera, T_camera_world: NDArray, depth: NDArray) 
     return (p - T_camera_world[:3, 3]) @ T_camera_world[:3, :3]
 
 
-def true_surface(tracker: SyntheticTracker, indices: Iterable[int]) -> NDArray[np.float64]:
-    """Points (N, 3) of the room that these frames see [m]: rays against its primitives, no map and no mesh."""
-    poses = tracker.ground_truth()
+def true_surface(camera: PinholeCamera, poses: Iterable[NDArray], depths: Iterable[NDArray]) -> NDArray[np.float64]:
+    """Points (N, 3) of the room [m] that views with true T_camera_world (4, 4) and depth (H, W) see."""
     o3d = open3d()
     seen = o3d.geometry.PointCloud()
-    for index in indices:
-        seen.points.extend(unprojected(tracker.camera, poses[index], tracker.depth(index)))
+    for T, depth in zip(poses, depths, strict=True):
+        seen.points.extend(unprojected(camera, T, depth))
         seen = seen.voxel_down_sample(SPACING)
     return np.asarray(seen.points)
 
@@ -93,7 +92,8 @@ def main() -> None:
     )
     mesh = open3d().io.read_triangle_mesh(str(arguments.mesh or run.folder / "mesh.ply"))
     vertices = in_the_room(run, tracker.ground_truth(), np.asarray(mesh.vertices))
-    surface = true_surface(tracker, range(len(run)))
+    depths = (tracker.depth(index) for index in range(len(run)))  # rays against its primitives, no map and no mesh
+    surface = true_surface(tracker.camera, tracker.ground_truth(), depths)
     for share in (TOLERANCE / 2, TOLERANCE, 2 * TOLERANCE):
         precision, recall = precision_recall(vertices, surface, share * ROOM)
         print(
