@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from modp_ti.exports.compressed_ply import write_compressed_ply
 from modp_ti.exports.spz import write_spz
 from modp_ti.exports.web_splat import write_web_splat
 from tests.modp_ti.exports.splat_readers import READERS
+from tests.pipelines.reference import sh_basis
 
 WRITERS = {"splat": write_web_splat, "spz": write_spz, "compressed-ply": write_compressed_ply}
 SIZES = {"splat": 32, "spz": 20, "compressed-ply": 16}  # bytes a Gaussian, without harmonics
@@ -104,6 +106,20 @@ def test_neighbours_share_a_chunk_of_the_compressed_ply(tmp_path: Path) -> None:
     write_compressed_ply(tmp_path / "file", state)
     chunks = READERS["compressed-ply"](tmp_path / "file")["position"].reshape(16, 256, 3)
     assert np.median(np.ptp(chunks, axis=1).prod(axis=1)) < 0.2 * 6.0**3
+
+
+def test_harmonics_of_spz_give_the_same_colours_from_the_turned_direction(tmp_path: Path) -> None:
+    """Read as stored, in axes right, up, back: against the polynomials themselves."""
+    state = splats(40, degree=3)
+    write_spz(tmp_path / "file", state)
+    data = gzip.decompress((tmp_path / "file").read_bytes())
+    stored = (np.frombuffer(data, np.uint8)[-40 * 45 :].reshape(40, 15, 3).astype(np.float64) - 128) / 128
+    directions = np.random.default_rng(0).normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    here = np.einsum("nk,nkc->nc", sh_basis(3, directions)[:, 1:], state["sh"][:, 1:])
+    there = np.einsum("nk,nkc->nc", sh_basis(3, directions * [1, -1, -1])[:, 1:], stored)
+    np.testing.assert_allclose(there, here, rtol=0, atol=0.03)
+    assert np.abs(here).max() > 0.5
 
 
 def test_what_spz_cannot_hold_is_refused(tmp_path: Path) -> None:
