@@ -5,6 +5,8 @@ from __future__ import annotations
 import typer
 
 from modp_ti.check import check
+from modp_ti.export import export
+from modp_ti.render import render
 from modp_ti.run import run
 from modp_ti.warmup import warmup
 
@@ -19,6 +21,8 @@ app = typer.Typer(
 )
 app.command("run")(run)
 app.command("check")(check)
+app.command("render")(render)
+app.command("export")(export)
 app.command("warmup")(warmup)
 
 

@@ -20,13 +20,14 @@ __all__ = ["DeliveredFrames"]
 class DeliveredFrames:
     """Name, time, camera and tracked pose of every frame in their order, and the points that it saw.
 
-    corrections: how many came, and how many of them moved the map.
+    held_out: whether a frame was only for evaluation. corrections: how many came, and how many of them moved the map.
     """
 
     index: list[int] = field(default_factory=list)
     name: list[str] = field(default_factory=list)
     timestamp: list[float] = field(default_factory=list)
     camera: list[PinholeCamera] = field(default_factory=list)
+    held_out: list[bool] = field(default_factory=list)
     T_tracked: list[NDArray[np.float64]] = field(default_factory=list)
     points: TrackedPoints = field(default_factory=TrackedPoints)
     corrections: dict[str, int] = field(default_factory=lambda: {"received": 0, "moved": 0})
@@ -40,6 +41,7 @@ class DeliveredFrames:
         self.name.append(frame.name)
         self.timestamp.append(frame.timestamp)
         self.camera.append(frame.camera)
+        self.held_out.append(frame.held_out)
         self.T_tracked.append(frame.T_camera_world)
         self.points.add(frame)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -12,6 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from pipelines.mapping import FrameReport
 
 __all__ = ["ProgressLine"]
+
+T = TypeVar("T")
 
 # Seconds between the lines of a log.
 LOG_EVERY = 30.0
@@ -39,6 +42,16 @@ class ProgressLine:
             self._begin(what, total)
         self._update(description=what, completed=done, total=total)
         if done >= total:
+            self.stop()
+
+    def through(self, what: str, items: Iterable[T], total: int) -> Iterator[T]:
+        """The items, showing how many are done."""
+        self._begin(what, total)
+        try:
+            for item in items:
+                yield item
+                self._update(advance=1)
+        finally:
             self.stop()
 
     def start_mapping(self, frames: int | None, what: str = "mapping") -> None:

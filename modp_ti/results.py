@@ -21,6 +21,7 @@ from modp_ti.errors import InputError
 from modp_ti.evaluation import FrameScore, MapVersion, summary
 from modp_ti.exports.colmap_model import image_names, write_colmap, write_image
 from modp_ti.exports.exposure import write_exposures
+from modp_ti.exports.frames_json import write_frames
 from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats, write_splats
 from modp_ti.exports.trajectory import write_trajectory
@@ -59,15 +60,19 @@ class Results:
         finally:
             shutil.rmtree(self.folder, ignore_errors=True)
 
-    def write_map(self, version: MapVersion, keyframes: set[int], with_exposure: bool) -> MapVersion:
+    def write_map(
+        self, version: MapVersion, keyframes: set[int], with_exposure: bool, near: float, scene_depth: float
+    ) -> MapVersion:
         """Write Gaussians, poses and, where they are estimated, exposures; return the map as a reader of it gets it.
 
-        keyframes: indices of the frames that are.
+        keyframes: indices of the frames that are. near, scene_depth: see `FramesRecord`.
         """
         frames = self.frames
         write_splats(self.folder / "splats.ply", version.gaussians)
         write_trajectory(self.folder / "trajectory.txt", frames.timestamp, version.trajectory)
         write_colmap(self.folder / "colmap", self._names, frames.camera, version.trajectory, frames.points)
+        held_out = [index for index, held in zip(frames.index, frames.held_out, strict=True) if held]
+        write_frames(self.folder / "frames.json", near, scene_depth, keyframes, held_out)
         if with_exposure:
             write_exposures(self.folder / "exposure.json", frames.index, frames.timestamp, version.exposures, keyframes)
         return replace(version, gaussians=read_splats(self.folder / "splats.ply"))

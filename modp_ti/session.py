@@ -95,7 +95,13 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     with results.writing():
         keyframes = {keyframe.index for keyframe in mapper.keyframes}
         # What is scored is what a reader of the file gets.
-        versions[last] = results.write_map(versions[last], keyframes, mapper.keyframes[0].exposure is not None)
+        versions[last] = results.write_map(
+            versions[last],
+            keyframes,
+            mapper.keyframes[0].exposure is not None,
+            mapper.near,
+            mapper.keyframes.scene_depth,
+        )
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
             if stage == last:

@@ -7,7 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-FILES = ["colmap", "config.yaml", "metrics.json", "renders", "scores.csv", "splats.ply", "trajectory.txt"]
+FILES = [
+    "colmap",
+    "config.yaml",
+    "frames.json",
+    "metrics.json",
+    "renders",
+    "scores.csv",
+    "splats.ply",
+    "trajectory.txt",
+]
 
 
 def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,67 @@
+"""`modp-ti export OUT --format ...`: a finished map for other programs."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from modp_ti.errors import InputError
+from modp_ti.render import Device
+from modp_ti.run import BAD_INPUT
+
+__all__ = ["export"]
+
+
+class Format(str, Enum):
+    """What a map is exported as."""
+
+    points = "points"
+    mesh = "mesh"
+    splat = "splat"
+    spz = "spz"
+    compressed_ply = "compressed-ply"
+    colmap = "colmap"
+    nerfstudio = "nerfstudio"
+    video = "video"
+
+
+def export(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")],
+    format: Annotated[
+        Format,
+        typer.Option(
+            "--format",
+            "-f",
+            help="`points`: coloured points (PLY); `mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, "
+            "`compressed-ply`: splats, small, for viewers; `colmap`, `nerfstudio`: images with poses and points, to "
+            "train on; `video`: the recorded path",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="PATH", help="file or new folder; empty: in OUT, see docs/export.md"),
+    ] = None,
+    voxel: Annotated[
+        float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
+    ] = None,
+    device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
+) -> None:
+    """Write a finished map as points, mesh, compressed splats, data set or video."""
+    try:
+        # Imported here: asking for help must not wait for the compiler and the readers.
+        from rich.console import Console
+
+        from modp_ti.playback.export_map import ExportOptions, export_map
+        from modp_ti.playback.finished_run import open_run
+        from modp_ti.progress import ProgressLine
+
+        options = ExportOptions(voxel or None, device.value)
+        line = ProgressLine(Console(stderr=True))
+        target = export_map(open_run(out), format.value, output, options, line)
+    except InputError as error:
+        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(BAD_INPUT) from None
+    typer.echo(f"written to {target}")

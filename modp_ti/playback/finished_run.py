@@ -1,0 +1,91 @@
+"""`FinishedRun`: the output folder of a run, as the commands that come after it read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.camera import PinholeCamera
+from modp_ti.errors import InputError
+from modp_ti.exports.frames_json import FramesRecord, read_frames
+from modp_ti.exports.splats_ply import read_splats
+from modp_ti.exports.trajectory import read_trajectory
+
+__all__ = ["FinishedRun", "open_run"]
+
+NEEDED = ("config.yaml", "splats.ply", "trajectory.txt", "colmap", "frames.json")
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A map, and the frames that it was made of: by position names, times [s], T_camera_world (4, 4) and cameras.
+
+    names: as the COLMAP model has them. record: near, scene depth, keyframes, held-out frames.
+    """
+
+    folder: Path
+    names: list[str]
+    timestamps: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    cameras: list[PinholeCamera]
+    record: FramesRecord
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @cached_property
+    def gaussians(self) -> dict[str, NDArray[np.float32]]:
+        """The map, as `GaussianField.load` takes it. Raises InputError for a damaged file or an empty map."""
+        state = read_splats(self.folder / "splats.ply")
+        if len(state["position"]) == 0:
+            raise InputError(f"{self.folder / 'splats.ply'}: the map holds no Gaussian")
+        return state
+
+    @property
+    def mapped(self) -> list[int]:
+        """Positions of the frames that were not held out."""
+        held_out = set(self.record.held_out)
+        return [index for index in range(len(self)) if index not in held_out]
+
+
+def open_run(folder: Path) -> FinishedRun:
+    """Read what a finished run left. Raises InputError where it is none, or not finished, or damaged."""
+    folder = folder.expanduser()
+    if not folder.is_dir():
+        what = "not a folder" if folder.exists() else "no such folder; a run makes it at its end"
+        raise InputError(f"{folder}: {what}: name the output folder of a finished run")
+    missing = [name for name in NEEDED if not (folder / name).exists()]
+    if len(missing) == len(NEEDED):
+        raise InputError(f"{folder}: no run has left anything here: name the output folder of a finished run")
+    if missing == ["frames.json"]:
+        raise InputError(
+            f"{folder}: an earlier version made it, without frames.json: run it again, "
+            f"modp-ti run {folder / 'config.yaml'}"
+        )
+    if missing:
+        raise InputError(f"{folder}: not the output of a finished run, {missing[0]} is missing")
+    timestamps, poses = read_trajectory(folder / "trajectory.txt")
+    names, cameras = _read_model(folder / "colmap")
+    if len(names) != len(poses) or not names:
+        raise InputError(f"{folder}: trajectory.txt has {len(poses)} frames, colmap/ {len(names)}: not of one run")
+    return FinishedRun(folder, names, timestamps, poses, cameras, read_frames(folder / "frames.json", len(poses)))
+
+
+def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
+    """Names and cameras of the images in their order."""
+    import pycolmap
+
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+        images = [model.images[number] for number in sorted(model.images)]
+        of_id = {
+            number: PinholeCamera(*map(float, camera.params), camera.width, camera.height)
+            for number, camera in model.cameras.items()
+        }
+    except (ValueError, TypeError, RuntimeError, IndexError) as error:
+        raise InputError(f"{folder}: cannot be read as the COLMAP model of a run: {error}") from None
+    return [image.name for image in images], [of_id[image.camera_id] for image in images]

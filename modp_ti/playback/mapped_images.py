@@ -1,0 +1,75 @@
+"""The images that a finished run mapped: those that it kept, or once more from the scene's source."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from modp_ti.config import load_scene
+from modp_ti.errors import InputError
+from modp_ti.exports.colmap_model import image_names, write_image
+from modp_ti.playback.finished_run import FinishedRun
+from modp_ti.progress import ProgressLine
+from modp_ti.trackers import close, open_tracker
+
+__all__ = ["dataset_names", "write_images"]
+
+
+def dataset_names(run: FinishedRun) -> list[str]:
+    """What the run's images are called in a data set, as PNG files, by position."""
+    return run.names if _kept(run).is_dir() else image_names(run.names, written=True)
+
+
+def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
+    """Write all images, undistorted as they were mapped, into `images` of the folder, and masks into `masks`.
+
+    A run that did not keep its images (`export.images`) has them read again from the source of its scene; the tracker
+    `klt` tracks again for that. Raises InputError where the source is gone, was live, or now gives other frames.
+    """
+    names = dataset_names(run)
+    if _kept(run).is_dir():
+        _copy(run, names, folder, line)
+        return
+    config = load_scene(run.folder / "config.yaml")
+    if config.source.stream is not None or config.tracker.kind == "socket":
+        raise InputError(f"{run.folder}: its frames were live and are gone; such a run needs `export.images: true`")
+    if config.tracker.kind == "synthetic":
+        from modp_ti.playback.map_renderer import start_device
+
+        start_device("cpu")  # its frames are rendered
+    tracker = open_tracker(config, line.prepare)
+    other = InputError(
+        f"{config.source.path or run.folder}: the source no longer gives the frames that were mapped; run the scene "
+        "again, with `export.images: true` to keep them"
+    )
+    try:
+        count = 0
+        for frame in line.through("reading images", tracker, len(run)):
+            if frame.index >= len(run) or frame.name != run.names[frame.index]:
+                raise other
+            if frame.camera != run.cameras[frame.index]:
+                raise other
+            write_image(folder, names[frame.index], frame)
+            count += 1
+        if count < len(run):
+            raise other
+    finally:
+        close(tracker)
+
+
+def _kept(run: FinishedRun) -> Path:
+    return run.folder / "colmap" / "images"
+
+
+def _copy(run: FinishedRun, names: list[str], folder: Path, line: ProgressLine) -> None:
+    masks = run.folder / "colmap" / "masks"
+    for name in line.through("copying images", names, len(names)):
+        source = _kept(run) / name
+        if not source.is_file():
+            raise InputError(f"{source}: the run's image is missing")
+        pairs = [(source, folder / "images" / name)]
+        if (masks / f"{name}.png").is_file():
+            pairs.append((masks / f"{name}.png", folder / "masks" / f"{name}.png"))
+        for old, new in pairs:
+            new.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(old, new)

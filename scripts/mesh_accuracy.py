@@ -1,0 +1,106 @@
+"""How true an exported mesh is: that of a map of the demo room against the room's own surface.
+
+    modp-ti run demo/scene.yaml
+    modp-ti export out/demo --format mesh
+    python scripts/mesh_accuracy.py out/demo
+
+prints the share of the mesh's vertices that lie within one percent of the room's size of the true surface, and the
+share of the true surface, as far as the frames saw it, that has a vertex within the same distance.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.backend import initialise
+from fields.camera import PinholeCamera
+from modp_ti.config import load_scene
+from modp_ti.exports.open3d_io import open3d
+from modp_ti.playback.finished_run import FinishedRun, open_run
+from modp_ti.synthetic import SyntheticTracker
+from modp_ti.synthetic.renderer import RoomRenderer
+from modp_ti.trackers import open_tracker
+
+# The longest side of the room inside [m], and of it the share that counts as right.
+ROOM = 4.8
+TOLERANCE = 0.01
+# Points of the true surface are thinned to one in a cube of this edge [m].
+SPACING = 0.01
+
+
+def unprojected(camera: PinholeCamera, T_camera_world: NDArray, depth: NDArray) -> NDArray[np.float64]:
+    """World points (N, 3) of the pixels of a depth image (H, W) that have one."""
+    row, column = np.nonzero(depth > 0)
+    p = camera.unproject(np.stack([column, row], axis=1) + 0.5, depth[row, column])
+    return (p - T_camera_world[:3, 3]) @ T_camera_world[:3, :3]
+
+
+def true_surface(camera: PinholeCamera, poses: Iterable[NDArray], depths: Iterable[NDArray]) -> NDArray[np.float64]:
+    """Points (N, 3) of the room [m] that views with true T_camera_world (4, 4) and depth (H, W) see."""
+    o3d = open3d()
+    seen = o3d.geometry.PointCloud()
+    for T, depth in zip(poses, depths, strict=True):
+        seen.points.extend(unprojected(camera, T, depth))
+        seen = seen.voxel_down_sample(SPACING)
+    return np.asarray(seen.points)
+
+
+def precision_recall(vertices: NDArray, surface: NDArray, tolerance: float) -> tuple[float, float]:
+    """Share of vertices (V, 3) with a surface point (N, 3) within tolerance, and the other way round."""
+    o3d = open3d()
+    mesh, true = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (vertices, surface))
+    to_surface, to_mesh = mesh.compute_point_cloud_distance(true), true.compute_point_cloud_distance(mesh)
+    return float(np.mean(np.asarray(to_surface) <= tolerance)), float(np.mean(np.asarray(to_mesh) <= tolerance))
+
+
+def in_the_room(run: FinishedRun, truth: list[NDArray], points: NDArray) -> NDArray[np.float64]:
+    """Points (N, 3) of the map's world in the room's, by the similarity that fits the cameras.
+
+    Its rotation is that of the cameras themselves: their places, nearly on a line, would leave a turn around it open.
+    """
+    turns = sum(there[:3, :3].T @ here[:3, :3] for here, there in zip(run.poses, truth, strict=True))
+    U, _, Vt = np.linalg.svd(turns)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    estimate, target = (np.array([-T[:3, :3].T @ T[:3, 3] for T in poses]) for poses in (run.poses, truth))
+    a, b = (estimate - estimate.mean(axis=0)) @ R.T, target - target.mean(axis=0)
+    s = (a * b).sum() / (a * a).sum()
+    return s * (points - estimate.mean(axis=0)) @ R.T + target.mean(axis=0)
+
+
+def main() -> None:
+    """Print the two shares."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
+    parser.add_argument("out", type=Path, help="output folder of a run of the demo")
+    parser.add_argument("--mesh", type=Path, help="empty: OUT/mesh.ply")
+    arguments = parser.parse_args()
+    run = open_run(arguments.out)
+    config = load_scene(run.folder / "config.yaml")
+    initialise("cpu")
+    tracker = open_tracker(config)
+    if not isinstance(tracker, SyntheticTracker):
+        parser.error(f"{run.folder} is not a run of the demo room: its surface is not known")
+    tracker = SyntheticTracker(
+        width=tracker.camera.width,
+        height=tracker.camera.height,
+        frames=len(run),
+        room=RoomRenderer(texel=1.0),  # nobody looks at its light
+    )
+    mesh = open3d().io.read_triangle_mesh(str(arguments.mesh or run.folder / "mesh.ply"))
+    vertices = in_the_room(run, tracker.ground_truth(), np.asarray(mesh.vertices))
+    depths = (tracker.depth(index) for index in range(len(run)))  # rays against its primitives, no map and no mesh
+    surface = true_surface(tracker.camera, tracker.ground_truth(), depths)
+    for share in (TOLERANCE / 2, TOLERANCE, 2 * TOLERANCE):
+        precision, recall = precision_recall(vertices, surface, share * ROOM)
+        print(
+            f"within {100 * share:.1f} % of the room ({1000 * share * ROOM:.0f} mm): "
+            f"{100 * precision:.1f} % of {len(vertices):,} vertices, {100 * recall:.1f} % of the surface"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""Readers of the compressed forms of splats, from their published layouts: one number after the other."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData
+
+State = dict[str, NDArray]
+SH_C0 = 0.28209479177387814
+
+
+def logit(opacity: NDArray) -> NDArray:
+    opacity = np.clip(opacity, 0.5 / 255, 254.5 / 255)
+    return np.log(opacity / (1 - opacity))
+
+
+def read_splat(path: Path) -> State:
+    data = path.read_bytes()
+    rows = [struct.unpack_from("<3f3f4B4B", data, at) for at in range(0, len(data), 32)]
+    table = np.array(rows, dtype=np.float64)
+    return {
+        "position": table[:, :3],
+        "log_scale": np.log(table[:, 3:6]),
+        "sh": (table[:, None, 6:9] / 255 - 0.5) / SH_C0,
+        "opacity_logit": logit(table[:, 9] / 255),
+        "quaternion": (table[:, 10:14] - 128) / 128,
+    }
+
+
+def read_spz(path: Path) -> State:
+    data = gzip.decompress(path.read_bytes())
+    magic, version, count, degree, fractional, flags, reserved = struct.unpack_from("<IIIBBBB", data)
+    assert (magic, version, flags, reserved) == (0x5053474E, 3, 1, 0)
+    at = 16
+
+    def take(each: int) -> NDArray:
+        nonlocal at
+        part = np.frombuffer(data, np.uint8, count * each, at).reshape(count, each).astype(np.int64)
+        at += count * each
+        return part
+
+    places = take(9).reshape(count, 3, 3)
+    fixed = places[..., 0] + (places[..., 1] << 8) + (places[..., 2] << 16)
+    fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
+    alphas, colours, scales, rotations = take(1)[:, 0], take(3), take(3), take(4)
+    coefficients = (degree + 1) ** 2 - 1
+    rest = (take(3 * coefficients).reshape(count, coefficients, 3) - 128) / 128
+    assert at == len(data)
+    quaternion = np.zeros((count, 4))
+    for row, (a, b, c, d) in zip(quaternion, rotations.tolist(), strict=True):
+        word = a | b << 8 | c << 16 | d << 24
+        largest = word >> 30
+        for place in (3, 2, 1, 0):  # x, y, z, w from the high bits down
+            if place != largest:
+                row[place] = np.sqrt(0.5) * (word & 511) / 511 * (-1 if word & 512 else 1)
+                word >>= 10
+        row[largest] = np.sqrt(1 - (row**2).sum())
+    sh = np.concatenate([((colours / 255 - 0.5) / 0.15)[:, None], rest], axis=1)
+    # Right, up, back to right, down, front: y and z change their signs, and with them what is odd in both together.
+    odd = [1, 2, 4, 7, 9, 11, 12, 14]
+    sh[:, [k for k in odd if k <= coefficients]] *= -1
+    return {
+        "position": fixed / 2.0**fractional * [1, -1, -1],
+        "log_scale": scales / 16 - 10,
+        "sh": sh,
+        "opacity_logit": logit(alphas / 255),
+        "quaternion": quaternion[:, [3, 0, 1, 2]] * [1, 1, -1, -1],
+    }
+
+
+def read_compressed_ply(path: Path) -> State:
+    ply = PlyData.read(path)
+    chunk, vertex = ply["chunk"], ply["vertex"]
+    count = len(vertex.data)
+    assert len(chunk.data) == -(-count // 256)
+    of = np.arange(count) // 256
+
+    def part(name: str, low: int, bits: int) -> NDArray:
+        return (vertex[f"packed_{name}"].astype(np.int64) >> low & (1 << bits) - 1) / ((1 << bits) - 1)
+
+    def between(name: str, share: NDArray) -> NDArray:
+        least, most = chunk[f"min_{name}"][of].astype(np.float64), chunk[f"max_{name}"][of].astype(np.float64)
+        return least + share * (most - least)
+
+    fields = (("", 21, 11), ("", 11, 10), ("", 0, 11))
+    position = [between(axis, part("position", low, bits)) for axis, (_, low, bits) in zip("xyz", fields, strict=True)]
+    scale = [between(f"scale_{a}", part("scale", low, bits)) for a, (_, low, bits) in zip("xyz", fields, strict=True)]
+    colour = [between(c, part("color", low, 8)) for c, low in (("r", 24), ("g", 16), ("b", 8))]
+    largest = vertex["packed_rotation"] >> 30
+    three = [(part("rotation", low, 10) - 0.5) * np.sqrt(2) for low in (20, 10, 0)]
+    quaternion = np.zeros((count, 4))  # w, x, y, z
+    for i in range(count):
+        others = [place for place in range(4) if place != largest[i]]
+        quaternion[i, others] = [value[i] for value in three]
+        quaternion[i, largest[i]] = np.sqrt(1 - (quaternion[i] ** 2).sum())
+    sh = ((np.stack(colour, axis=1) - 0.5) / SH_C0)[:, None]
+    if "sh" in ply:
+        names = [p.name for p in ply["sh"].properties]
+        rest = np.stack([(ply["sh"][name].astype(np.float64) + 0.5) / 256 * 8 - 4 for name in names], axis=1)
+        sh = np.concatenate([sh, rest.reshape(count, 3, -1).transpose(0, 2, 1)], axis=1)
+    return {
+        "position": np.stack(position, axis=1),
+        "log_scale": np.stack(scale, axis=1),
+        "sh": sh,
+        "opacity_logit": logit(part("color", 0, 8)),
+        "quaternion": quaternion,
+    }
+
+
+READERS = {"splat": read_splat, "spz": read_spz, "compressed-ply": read_compressed_ply}
