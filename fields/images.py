@@ -123,9 +123,7 @@ class ImageBuffers:
 
         Tensors must be contiguous, of the buffers' type, and lie where kernels run.
         """
-        arrays = [
-            a if isinstance(a, torch.Tensor) else np.ascontiguousarray(a, dtype=self.dtype) for a in gradients
-        ]
+        arrays = [a if isinstance(a, torch.Tensor) else np.ascontiguousarray(a, dtype=self.dtype) for a in gradients]
         self._set_gradients(self.width, self.height, *arrays)
 
     def read_into(self, colour: torch.Tensor, depth: torch.Tensor, opacity: torch.Tensor) -> None:
