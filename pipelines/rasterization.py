@@ -22,6 +22,8 @@ __all__ = ["RasterizedView", "rasterize"]
 REAL = {torch.float32: ti.f32, torch.float64: ti.f64}
 # What Taichi's allocator is good for (docs/method.md); on the CPU memory follows what is used.
 MAX_GAUSSIANS = 1_500_000
+# Fields that Taichi 1.7.4 holds without writing beyond its memory; a third on the CPU has ended the process.
+MAX_KEPT = 2
 # Entries by which a pose may miss being rigid: rounding and drift, but no scale and no shear.
 MAX_DRIFT = 1e-3
 
@@ -61,11 +63,12 @@ def rasterize(
 
     background (3,): seen where nothing is, black by default. near: depth [scene units] below which nothing is drawn.
 
-    The fields behind it are kept between calls, for each type and number of harmonics. `backward` renders anew where
-    another picture has been drawn since; it cannot itself be differentiated. On CUDA all happens on the default stream.
+    The fields behind it are kept between calls, a set for each type, number of harmonics, and doubling of the largest
+    image: there is room for two, so begin with the largest. `backward` renders anew where another picture has been
+    drawn since; it cannot itself be differentiated. On CUDA all happens on the default stream.
 
     Raises TypeError or ValueError, in one line, for types, shapes, devices and values that do not fit, and RuntimeError
-    before `initialise`.
+    before `initialise` and where there is no room.
     """
     program()
     if (sh is None) == (colour is None):
@@ -150,8 +153,12 @@ class _Rasterizer:
         self.owner = program()
         self.gaussians = GaussianField(degree, MAX_GAUSSIANS, REAL[kind])
         self.renderer = Renderer(self.gaussians, width, height)
-        self.width, self.height = width, height
+        self.kind, self.width, self.height = kind, width, height
         self.drawn = 0
+
+    def fits(self, degree: int, kind: torch.dtype, camera: PinholeCamera) -> bool:
+        fits = camera.width <= self.width and camera.height <= self.height
+        return fits and (degree, kind) == (self.gaussians.sh_degree, self.kind)
 
     def draw(self, tensors: list[Tensor], T: NDArray[np.float64], camera: PinholeCamera, near: float) -> None:
         self.gaussians.take(tensors)
@@ -159,25 +166,25 @@ class _Rasterizer:
         self.drawn += 1
 
 
-# By type and SH degree.
-_rasterizers: dict[tuple[torch.dtype, int], _Rasterizer] = {}
+_rasterizers: list[_Rasterizer] = []
 
 
 def _rasterizer(kind: torch.dtype, sh_count: int, camera: PinholeCamera) -> _Rasterizer:
-    """The one that is there for this, or a new one where there is none or its images are too small.
-
-    Of the sizes that image buffers have in any case.
-    """
-    if any(rasterizer.owner is not program() for rasterizer in _rasterizers.values()):
+    """The one that is there for this, or a new one, of the sizes that image buffers have in any case."""
+    if any(rasterizer.owner is not program() for rasterizer in _rasterizers):
         _rasterizers.clear()
     degree = int(np.sqrt(sh_count)) - 1
-    found = _rasterizers.get((kind, degree))
-    width, height = (0, 0) if found is None else (found.width, found.height)
-    if camera.width > width or camera.height > height:
-        width = max(width, 64, 1 << (camera.width - 1).bit_length())
-        height = max(height, -(-camera.height // 256) * 256)
-        found = _rasterizers[kind, degree] = _Rasterizer(degree, kind, width, height)
-    return found
+    for found in _rasterizers:
+        if found.fits(degree, kind, camera):
+            return found
+    if len(_rasterizers) == MAX_KEPT:
+        raise RuntimeError(
+            f"rasterize keeps fields for {MAX_KEPT} types, SH degrees or doublings of the image size, and this is "
+            "another: begin with the largest image, or call modp_ti.initialise(), which frees all fields"
+        )
+    width, height = max(64, 1 << (camera.width - 1).bit_length()), -(-camera.height // 256) * 256
+    _rasterizers.append(_Rasterizer(degree, kind, width, height))
+    return _rasterizers[-1]
 
 
 class _Rasterize(torch.autograd.Function):

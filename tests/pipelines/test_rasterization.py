@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-import taichi as ti
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -14,7 +11,7 @@ from torch.nn.functional import conv2d
 
 from fields.backend import initialise
 from fields.camera import PinholeCamera
-from fields.gaussians import SH_C0
+from fields.gaussians import SH_C0, GaussianField
 from fields.keyframes import Keyframe
 from fields.se3 import exp_se3, torch_exp_se3
 from pipelines.optimisation import MapOptimiser
@@ -28,6 +25,7 @@ from .test_optimisation import MOTION, store_of_views
 
 NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")
 BACKGROUND = (0.2, 0.5, 0.9)
+LARGE = PinholeCamera(80.0, 80.0, 50.0, 40.0, 100, 70)
 
 
 def tensors(state: dict[str, NDArray], kind: torch.dtype = torch.float32) -> dict[str, Tensor]:
@@ -67,15 +65,6 @@ def test_pictures_are_those_of_the_plain_renderer() -> None:
         np.testing.assert_allclose(output.detach(), truth, rtol=0, atol=2e-4)
 
 
-def test_a_colour_is_the_constant_harmonic(scene: dict[str, Tensor]) -> None:
-    sh = torch.zeros_like(scene["sh"])
-    sh[:, 0] = scene["sh"][:, 0].detach()
-    colour = 0.5 + SH_C0 * sh[:, 0]
-    geometry = {name: value for name, value in scene.items() if name != "sh"}
-    plain = view(geometry, colour=colour)
-    np.testing.assert_allclose(plain.image.detach(), view(geometry | {"sh": sh}).image.detach(), atol=1e-6)
-
-
 def test_no_gaussians_give_the_background() -> None:
     nothing = tensors({name: value[:0] for name, value in random_gaussians(1, seed=1, degree=1).items()})
     T = torch.from_numpy(POSE).requires_grad_()
@@ -86,23 +75,6 @@ def test_no_gaussians_give_the_background() -> None:
 
 
 # ---- gradients ------------------------------------------------------------------------------------------------
-
-
-def test_gradcheck_in_float64_by_every_input() -> None:
-    """All sixteen numbers of the pose too, the background, and each of the three outputs."""
-    camera = PinholeCamera(9.0, 8.0, 4.2, 2.8, 9, 6)
-    # Across the whole picture above the cut at 1/255, so that it is smooth in all.
-    state = random_gaussians(3, seed=3, degree=1, camera=camera, size=(4.0, 8.0), logit=(0.0, 1.5), beyond=-0.2)
-    inputs = tensors(state, torch.float64)
-    T, background = (
-        torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (POSE.tolist(), BACKGROUND)
-    )
-
-    def outputs(*values: Tensor) -> tuple[Tensor, ...]:
-        gaussians = dict(zip(NAMES, values, strict=False))
-        return tuple(view(gaussians, values[5], camera, background=values[6]))
-
-    assert torch.autograd.gradcheck(outputs, (*inputs.values(), T, background))
 
 
 def test_the_gradient_of_a_pose_is_that_of_the_tangent_it_was_made_from(scene: dict[str, Tensor]) -> None:
@@ -122,7 +94,7 @@ def test_a_gradient_does_not_mind_pictures_drawn_in_between(scene: dict[str, Ten
     expected = gradients_of(view(scene, T), inputs)
     picture = view(scene, T)
     view(tensors(random_gaussians(200, seed=9, degree=1)), exp_se3(MOTION) @ POSE)
-    view(tensors(random_gaussians(20, seed=9, degree=1)), camera=PinholeCamera(80.0, 80.0, 50.0, 40.0, 100, 70))
+    view(tensors(random_gaussians(20, seed=9, degree=1)), camera=LARGE)
     found = gradients_of(picture, inputs)
     for name, value in expected.items():
         assert np.abs(value).max() > 0
@@ -169,6 +141,25 @@ def test_what_does_not_fit_is_told_in_one_line(
     assert "\n" not in str(told.value)
 
 
+# ---- room, and Taichi started anew: from here on, tests follow one another ------------------------------------
+
+
+def test_a_third_set_of_fields_is_refused_with_the_way_out(scene: dict[str, Tensor]) -> None:
+    view(scene)
+    view(scene, camera=LARGE)
+    with pytest.raises(RuntimeError, match=r"begin with the largest image, or call modp_ti\.initialise"):
+        view(scene | {"sh": scene["sh"][:, :1]})
+
+
+def test_a_gradient_outlives_a_new_start_of_taichi(scene: dict[str, Tensor]) -> None:
+    expected = gradients_of(view(scene), scene)
+    picture = view(scene)
+    initialise("cpu", threads=1)
+    for found in (gradients_of(picture, scene), gradients_of(view(scene), scene)):
+        for name, value in expected.items():
+            np.testing.assert_array_equal(found[name], value)
+
+
 # ---- training -------------------------------------------------------------------------------------------------
 
 STEPS = 500
@@ -189,7 +180,7 @@ def loss_in_torch(render: Tensor, keyframe: Keyframe) -> Tensor:
     return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim[:, 0][:, valid].mean())
 
 
-def test_a_plain_torch_loop_trains_as_our_own_does(renderers: Callable[..., Renderer]) -> None:
+def test_a_plain_torch_loop_trains_as_our_own_does() -> None:
     """The same start, views, loss and rates: the curves lie on one another, though rounding parts the paths."""
     store = store_of_views([POSE, exp_se3(MOTION) @ POSE, exp_se3(-np.array(MOTION)) @ POSE])
     start = random_gaussians(200, seed=32, degree=1, size=(1.5, 5.0))
@@ -218,7 +209,7 @@ def test_a_plain_torch_loop_trains_as_our_own_does(renderers: Callable[..., Rend
         adam.step()
         torch_curve.append(loss.item())
 
-    renderer = renderers(1, ti.f32)
+    renderer = Renderer(GaussianField(1, max_gaussians=1 << 16), 64, 64)
     renderer.gaussians.load(start)
     optimiser = MapOptimiser(renderer.gaussians, renderer, settings)
     our_curve = []
@@ -236,13 +227,31 @@ def test_a_plain_torch_loop_trains_as_our_own_does(renderers: Callable[..., Rend
     assert ends[0] == pytest.approx(ends[1], rel=0.02)
 
 
-# ---- Taichi started anew: the last test here, as it frees the fields of the others ----------------------------
+# ---- in float64 ----------------------------------------------------------------------------------------------
 
 
-def test_a_gradient_outlives_a_new_start_of_taichi(scene: dict[str, Tensor]) -> None:
-    expected = gradients_of(view(scene), scene)
-    picture = view(scene)
-    initialise("cpu")
-    for found in (gradients_of(picture, scene), gradients_of(view(scene), scene)):
-        for name, value in expected.items():
-            np.testing.assert_array_equal(found[name], value)
+def test_gradcheck_in_float64_by_every_input() -> None:
+    """All sixteen numbers of the pose too, the background, and each of the three outputs."""
+    initialise("cpu", threads=1)
+    camera = PinholeCamera(9.0, 8.0, 4.2, 2.8, 9, 6)
+    # Across the whole picture above the cut at 1/255, so that it is smooth in all.
+    state = random_gaussians(3, seed=3, degree=1, camera=camera, size=(4.0, 8.0), logit=(0.0, 1.5), beyond=-0.2)
+    inputs = tensors(state, torch.float64)
+    T, background = (
+        torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (POSE.tolist(), BACKGROUND)
+    )
+
+    def outputs(*values: Tensor) -> tuple[Tensor, ...]:
+        gaussians = dict(zip(NAMES, values, strict=False))
+        return tuple(view(gaussians, values[5], camera, background=values[6]))
+
+    assert torch.autograd.gradcheck(outputs, (*inputs.values(), T, background))
+
+
+def test_a_colour_is_the_constant_harmonic(scene: dict[str, Tensor]) -> None:
+    sh = torch.zeros_like(scene["sh"])
+    sh[:, 0] = scene["sh"][:, 0].detach()
+    colour = 0.5 + SH_C0 * sh[:, 0]
+    geometry = {name: value for name, value in scene.items() if name != "sh"}
+    plain = view(geometry, colour=colour)
+    np.testing.assert_allclose(plain.image.detach(), view(geometry | {"sh": sh}).image.detach(), atol=1e-6)
