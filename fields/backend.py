@@ -10,7 +10,16 @@ import numpy as np
 import taichi as ti
 import torch
 
-__all__ = ["describe", "growing", "initialise", "on_gpu", "refuse_too_many_fields", "torch_device", "without_waiting"]
+__all__ = [
+    "describe",
+    "growing",
+    "initialise",
+    "on_gpu",
+    "program",
+    "refuse_too_many_fields",
+    "torch_device",
+    "without_waiting",
+]
 
 # Arrays of Taichi's runtime have this many entries, and it does not look.
 MAX_SNODES = 1024
@@ -73,6 +82,17 @@ def describe(backend: str) -> str:
     if backend == "cpu" and _has_cuda_driver() and not torch.cuda.is_available():
         return "CPU (there is a CUDA driver, but this PyTorch cannot use it)"
     return backend.upper() if backend == "cpu" else backend.capitalize()
+
+
+def program() -> object:
+    """What owns all fields at present; `initialise` puts another in its place, and fields made before are gone.
+
+    Raises RuntimeError before the first.
+    """
+    running = ti.lang.impl.get_runtime().prog
+    if running is None:
+        raise RuntimeError('Taichi does not run yet: call modp_ti.initialise("cpu") (or "cuda", "auto") first')
+    return running
 
 
 def on_gpu() -> bool:

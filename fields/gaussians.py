@@ -1,7 +1,10 @@
 """`GaussianField`: the map's Gaussians, a pool that grows without recompiling the kernels that use it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import taichi as ti
+import torch
 from numpy.typing import NDArray
 
 from fields.backend import growing, refuse_too_many_fields
@@ -158,6 +161,24 @@ class GaussianField:
         except ValueError:
             self.count = before
             raise
+
+    def take(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Replace the content by tensors in the order and shapes of `append`, without a way over the host.
+
+        They must be contiguous, of the field's type, lie where kernels run and hold what `append` does not refuse,
+        which is not looked at again. Raises ValueError where the pool is too small.
+        """
+        count = len(tensors[0])
+        if count > self.capacity:
+            raise ValueError(f"{count} Gaussians exceed the pool of {self.capacity}")
+        self.count = count
+        if count:
+            self._write(0, NO_ANCHOR, *tensors)
+
+    def gradients_into(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Write the gradients of all Gaussians into tensors as `take` has them."""
+        if self.count:
+            self._read(self.count, *(getattr(self, name).grad for name in _NAMES), *tensors)
 
     def clear_gradients(self) -> None:
         """Drop what the views rendered since the last Adam step have added to the gradients."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 import taichi as ti
+import torch
 
 from fields.backend import on_gpu
 from fields.device_images import DeviceImages
@@ -120,10 +121,20 @@ class ImageBuffers:
         pixels = np.ascontiguousarray(image) if self._references is None else self._references.of(image)
         self._take_reference(self.width * self.height, self.width, self.height, pixels)
 
-    def set_gradients(self, colour: np.ndarray, depth: np.ndarray, opacity: np.ndarray) -> None:
-        """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W)."""
-        arrays = [np.ascontiguousarray(a, dtype=self.dtype) for a in (colour, depth, opacity)]
+    def set_gradients(self, *gradients: np.ndarray | torch.Tensor) -> None:
+        """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W).
+
+        Tensors must be contiguous, of the buffers' type, and lie where kernels run.
+        """
+        arrays = [a if isinstance(a, torch.Tensor) else np.ascontiguousarray(a, dtype=self.dtype) for a in gradients]
         self._set_gradients(self.width, self.height, *arrays)
+
+    def read_into(self, colour: torch.Tensor, depth: torch.Tensor, opacity: torch.Tensor) -> None:
+        """Write the rendered picture into tensors: colour (H, W, 3), depth (H, W), opacity (H, W).
+
+        They must be contiguous, of the buffers' type, and lie where kernels run.
+        """
+        self._read_picture(self.width, self.height, colour, depth, opacity)
 
     def colour_to_numpy(self) -> np.ndarray:
         """The rendered image (H, W, 3), not clipped."""
@@ -194,13 +205,30 @@ class ImageBuffers:
         depth: ti.types.ndarray(),
         opacity: ti.types.ndarray(),
     ):
-        for y in range(height):
-            row = (y + PAD) * self.stride + PAD
-            for x in range(width):
-                for c in ti.static(range(3)):
-                    self.colour_grad[c * self.plane + row + x] = colour[y, x, c]
-                self.depth_grad[row + x] = depth[y, x]
-                self.opacity_grad[row + x] = opacity[y, x]
+        for i in range(width * height):
+            x, y = i % width, i // width
+            at = (y + PAD) * self.stride + PAD + x
+            for c in ti.static(range(3)):
+                self.colour_grad[c * self.plane + at] = colour[y, x, c]
+            self.depth_grad[at] = depth[y, x]
+            self.opacity_grad[at] = opacity[y, x]
+
+    @ti.kernel
+    def _read_picture(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        colour: ti.types.ndarray(),
+        depth: ti.types.ndarray(),
+        opacity: ti.types.ndarray(),
+    ):
+        for i in range(width * height):
+            x, y = i % width, i // width
+            at = (y + PAD) * self.stride + PAD + x
+            for c in ti.static(range(3)):
+                colour[y, x, c] = self.colour[c * self.plane + at]
+            depth[y, x] = self.depth[at]
+            opacity[y, x] = self.opacity[at]
 
     @ti.kernel
     def _read_planes(self, width: ti.i32, height: ti.i32, buffer: ti.template(), out: ti.types.ndarray()):

@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from fields.backend import on_gpu, refuse_too_many_fields
+from fields.backend import on_gpu, program, refuse_too_many_fields
 from fields.parallel import HANDED_OUT
 
 __all__ = ["OccupancyVoxels"]
@@ -60,6 +60,7 @@ class OccupancyVoxels:
                 f"voxels need 1 to {MAX_LEVELS} levels and resolution * 2^(levels - 1) <= {SIDE}; "
                 f"got {levels=}, {resolution=}"
             )
+        program()
         self.levels = levels
         self.resolution = resolution
         self.settle(coarsest, origin)
@@ -153,7 +154,12 @@ class OccupancyVoxels:
 
         Here and not in a kernel, where the compiler may replace the division by a product that rounds otherwise.
         """
-        cells = np.asarray(position, dtype=np.float64).reshape(-1, 3) - self.origin
+        position = np.asarray(position, dtype=np.float64)
+        if position.ndim != 2 or position.shape[1] != 3:
+            raise ValueError(f"positions have shape {position.shape}, expected (N, 3)")
+        if np.shape(size) not in ((), (len(position),)):
+            raise ValueError(f"target sizes have shape {np.shape(size)}, expected one number or ({len(position)},)")
+        cells = position - self.origin
         cells /= self.coarsest / 2 ** (self.levels - 1)
         np.floor(cells, out=cells)
         # fmax and not clip: a NaN becomes a place beyond reach.

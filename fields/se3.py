@@ -1,4 +1,4 @@
-"""SE(3): rigid motions and their tangents, as NumPy functions and as Taichi functions of the same names.
+"""SE(3): rigid motions and their tangents, as NumPy functions and as Taichi and PyTorch functions of the same names.
 
 The tangent is xi = (rho, omega): translation first, then rotation. Increments act on the left,
 T <- exp(xi) T, so that xi of a `T_camera_world` is expressed in the camera frame.
@@ -6,6 +6,7 @@ T <- exp(xi) T, so that xi of a `T_camera_world` is expressed in the camera fram
 
 import numpy as np
 import taichi as ti
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "orthonormalised",
     "quaternion_from_matrix",
     "ti_rotation_from_quaternion",
+    "torch_exp_se3",
 ]
 
 # Below this angle [rad] the closed forms lose digits and their series are exact to rounding.
@@ -120,6 +122,14 @@ def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
         q = [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], squares[3]]
     q = np.array(q) / (2.0 * np.sqrt(squares[k]))
     return q / np.linalg.norm(q)
+
+
+def torch_exp_se3(xi: torch.Tensor) -> torch.Tensor:
+    """Differentiable twin of `exp_se3`, for a tangent (..., 6)."""
+    zero = torch.zeros_like(xi[..., 0])
+    a, b, c, x, y, z = xi.unbind(-1)
+    rows = [(zero, -z, y, a), (z, zero, -x, b), (-y, x, zero, c), (zero, zero, zero, zero)]
+    return torch.linalg.matrix_exp(torch.stack([torch.stack(row, -1) for row in rows], -2))
 
 
 @ti.func

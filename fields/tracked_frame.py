@@ -6,12 +6,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fields.camera import PinholeCamera
 from fields.pyramid import ImageLevel, build_pyramid
 
 __all__ = ["SparsePoints", "TrackedFrame"]
+
+# Entries by which a pose may miss being rigid.
+MAX_DRIFT = 1e-3
+# Numbers for the points of a frame that come without: those of another frame are others.
+IDS_PER_FRAME = 1 << 32
 
 
 def _empty(*shape: int) -> NDArray[np.float64]:
@@ -87,6 +92,75 @@ class TrackedFrame:
         if self.T_camera_world.shape != (4, 4) or not np.isfinite(self.T_camera_world).all():
             raise ValueError(f"{self.name}: T_camera_world must be a finite 4x4 matrix")
 
+    @classmethod
+    def from_arrays(
+        cls,
+        index: int,
+        image: NDArray,
+        T_camera_world: ArrayLike,
+        intrinsics: ArrayLike,
+        xyz: ArrayLike,
+        pixels: ArrayLike,
+        ids: ArrayLike | None = None,
+        *,
+        timestamp: float | None = None,
+        name: str | None = None,
+        mask: NDArray[np.bool_] | None = None,
+        held_out: bool = False,
+    ) -> TrackedFrame:
+        """A frame of what one's own loop has, looked over: most mistakes in conventions are found here.
+
+        index: 0, 1, 2, ... in the order of the frames. image: (H, W, 3) RGB without distortion, uint8, or float32 in
+        [0, 1]. T_camera_world: (4, 4), world to camera, OpenCV axes. intrinsics: fx, fy, cx, cy [px], the centre of the
+        first pixel being (0.5, 0.5). xyz (N, 3): tracked points in the world, pixels (N, 2): where the image shows
+        them, as (x, y). ids (N,): the same integer for the same point in every frame; without, all are new ones.
+        timestamp: seconds, the index where it is not given. mask, held_out: as in the class.
+
+        Raises TypeError or ValueError in one line, naming the frame.
+        """
+        name = f"frame {index}" if name is None else name
+        image = np.asarray(image)
+        if image.dtype not in (np.uint8, np.float32):
+            raise TypeError(f"{name}: image is {image.dtype}, expected uint8, or float32 in [0, 1]")
+        if image.ndim != 3 or image.shape[2] != 3:
+            raise ValueError(f"{name}: image has shape {image.shape}, expected (H, W, 3)")
+        if image.dtype == np.uint8:
+            image = image.astype(np.float32) / np.float32(255.0)
+        elif not (image.min() >= 0.0 and image.max() <= 1.0):
+            raise ValueError(f"{name}: a float32 image holds 0 to 1, this one {image.min():g} to {image.max():g}")
+        T = np.array(T_camera_world, dtype=np.float64)
+        if T.shape != (4, 4) or not _is_rigid(T):
+            raise ValueError(f"{name}: T_camera_world must be a rigid 4x4 matrix: [R t; 0 0 0 1], R a rotation")
+        intrinsics = np.asarray(intrinsics, dtype=np.float64)
+        if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all():
+            raise ValueError(f"{name}: intrinsics must be four numbers: fx, fy, cx, cy")
+        if mask is not None and mask.dtype != np.bool_:
+            raise TypeError(f"{name}: mask is {mask.dtype}, expected bool, True where the pixel is valid")
+        height, width = image.shape[:2]
+        xyz, pixels = (np.array(array, dtype=np.float64) for array in (xyz, pixels))
+        if xyz.ndim != 2 or xyz.shape[1] != 3 or pixels.shape != (len(xyz), 2):
+            raise ValueError(f"{name}: xyz has shape {xyz.shape}, pixels {pixels.shape}, expected (N, 3) and (N, 2)")
+        numbers = index * IDS_PER_FRAME + np.arange(len(xyz)) if ids is None else np.asarray(ids)
+        if numbers.shape != (len(xyz),) or numbers.dtype.kind not in "iu":
+            raise ValueError(f"{name}: ids are {numbers.shape} {numbers.dtype}, expected ({len(xyz)},) integers")
+        try:
+            camera = PinholeCamera(*intrinsics.tolist(), width, height)
+            points = SparsePoints(xyz, pixels, numbers.astype(np.int64))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        outside = ~camera.contains(pixels)
+        if outside.any():
+            at = int(np.argmax(outside))
+            raise ValueError(f"{name}: pixel {at}, {tuple(pixels[at].tolist())}, is not in the {width}x{height} image")
+        behind = int(np.count_nonzero(points.depths(T) <= 0))
+        if 2 * behind > len(points):
+            raise ValueError(
+                f"{name}: {behind} of {len(points)} points lie behind the camera: T_camera_world takes the world to "
+                "the camera (x right, y down, z forward); is it the inverse, or OpenGL's?"
+            )
+        timestamp = float(index) if timestamp is None else timestamp
+        return cls(index, timestamp, name, image, camera, T, points, mask, held_out=held_out)
+
     @cached_property
     def rgba(self) -> NDArray[np.uint8]:
         """The image with 8 bits a channel (H, W, 4), 255 in the last where the pixel is valid and all 0 where not."""
@@ -100,3 +174,10 @@ class TrackedFrame:
     def pyramid(self) -> tuple[ImageLevel, ...]:
         """`rgba` and its halved sizes, as many levels as `build_pyramid` makes."""
         return build_pyramid(self.rgba, self.camera)
+
+
+def _is_rigid(T: NDArray[np.float64]) -> bool:
+    """Whether T (4, 4) is a rotation and a translation."""
+    R = T[:3, :3]
+    off = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
+    return bool(np.isfinite(T).all() and off < MAX_DRIFT and np.linalg.det(R) > 0)

@@ -18,9 +18,9 @@ from pipelines.losses import PhotometricLoss
 from pipelines.rendering import Renderer
 
 __all__ = [
+    "EvaluatedMap",
     "FrameScore",
     "MapVersion",
-    "Mapper",
     "absolute_trajectory_error",
     "evaluate",
     "score_frame",
@@ -33,7 +33,7 @@ __all__ = [
 EVALUATED_TOGETHER = 32
 
 
-class Mapper(Protocol):
+class EvaluatedMap(Protocol):
     """What evaluation needs of a mapper: where a map is loaded, and how it is seen and compared."""
 
     gaussians: GaussianField
@@ -115,7 +115,7 @@ def score_frame(
 
 
 def evaluate(
-    mapper: Mapper,
+    mapper: EvaluatedMap,
     frames: Iterable[TrackedFrame],
     versions: Mapping[str, MapVersion],
     lpips: Lpips | None,

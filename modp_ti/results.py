@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,17 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.keyframes import KeyframeStore
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import dump_scene
 from modp_ti.delivered_frames import DeliveredFrames
-from modp_ti.errors import InputError
 from modp_ti.evaluation import FrameScore, MapVersion, summary
-from modp_ti.exports.colmap_model import image_names, write_colmap, write_image
-from modp_ti.exports.exposure import write_exposures
-from modp_ti.exports.frames_json import write_frames
+from modp_ti.exports.colmap_model import image_names, write_image
+from modp_ti.exports.map_folder import appearing, write_map
 from modp_ti.exports.scores_csv import write_scores
-from modp_ti.exports.splats_ply import read_splats, write_splats
-from modp_ti.exports.trajectory import write_trajectory
+from modp_ti.exports.splats_ply import read_splats
 from modp_ti.settings import SceneConfig
 
 __all__ = ["Results", "metrics_of"]
@@ -35,12 +31,11 @@ MAPS = ("online", "refined", "offline")
 
 
 class Results:
-    """The files of a run's last map, in a folder beside `config.output` until `writing` ends."""
+    """The files of a run's last map, in `folder` beside `config.output` until `writing` ends."""
 
     def __init__(self, config: SceneConfig, frames: DeliveredFrames) -> None:
         self.config = config
         self.frames = frames
-        self.folder = config.output.with_name(config.output.name + ".partial")
         self._names = image_names(frames.name, config.export.images)
 
     @contextmanager
@@ -49,32 +44,14 @@ class Results:
 
         Raises InputError where they cannot be written.
         """
-        shutil.rmtree(self.folder, ignore_errors=True)
-        try:
-            (self.folder / "renders").mkdir(parents=True)
+        with appearing(self.config.output) as self.folder:
+            (self.folder / "renders").mkdir()
             yield
             dump_scene(self.config, self.folder / "config.yaml")
-            _publish(self.folder, self.config.output)
-        except OSError as error:
-            raise InputError(f"{self.config.output}: cannot be written: {error.strerror}") from None
-        finally:
-            shutil.rmtree(self.folder, ignore_errors=True)
 
-    def write_map(
-        self, version: MapVersion, keyframes: set[int], with_exposure: bool, near: float, scene_depth: float
-    ) -> MapVersion:
-        """Write Gaussians, poses and, where they are estimated, exposures; return the map as a reader of it gets it.
-
-        keyframes: indices of the frames that are. near, scene_depth: see `FramesRecord`.
-        """
-        frames = self.frames
-        write_splats(self.folder / "splats.ply", version.gaussians)
-        write_trajectory(self.folder / "trajectory.txt", frames.timestamp, version.trajectory)
-        write_colmap(self.folder / "colmap", self._names, frames.camera, version.trajectory, frames.points)
-        held_out = [index for index, held in zip(frames.index, frames.held_out, strict=True) if held]
-        write_frames(self.folder / "frames.json", near, scene_depth, keyframes, held_out)
-        if with_exposure:
-            write_exposures(self.folder / "exposure.json", frames.index, frames.timestamp, version.exposures, keyframes)
+    def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> MapVersion:
+        """Write what `exports.map_folder.write_map` does; return the map as a reader of it gets it."""
+        write_map(self.folder, version, self.frames, self._names, keyframes, near)
         return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
 
     def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
@@ -140,12 +117,3 @@ def _seconds(stages: dict[str, float]) -> dict[str, float]:
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 4)
-
-
-def _publish(staging: Path, output: Path) -> None:
-    """Move the finished files into the output folder, over those of an earlier run."""
-    output.mkdir(parents=True, exist_ok=True)
-    for folder in ("renders", "colmap"):
-        shutil.rmtree(output / folder, ignore_errors=True)
-    for item in staging.iterdir():
-        os.replace(item, output / item.name)

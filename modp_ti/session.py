@@ -17,18 +17,15 @@ from fields.backend import describe, initialise
 from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
-from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.errors import InputError
-from modp_ti.evaluation import MapVersion, evaluate, trajectory_errors
+from modp_ti.evaluation import evaluate, trajectory_errors
 from modp_ti.lpips import open_lpips
+from modp_ti.mapper import Mapper
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
 from modp_ti.results import Results, metrics_of
 from modp_ti.settings import SceneConfig
 from modp_ti.trackers import close, events, frame_count, may_read_ahead, open_tracker
-from pipelines.mapping import OnlineMapper
-from pipelines.offline import OfflineMapper
-from pipelines.refinement import refine
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
@@ -69,39 +66,33 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         _say(notes, console)
 
         mapper = build_mapper(config, first.camera)
-        watch = mapper.stopwatch
+        watch = mapper.pipeline.stopwatch
         watch.seconds["track"] = prepared
         with line.working("compiling kernels (the first time on this machine takes longest)"):
-            mapper.compile()
+            mapper.pipeline.compile()
         tick = time.perf_counter()
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
-        frames = _map(mapper, chain([first], _timed(arriving, watch)), line)
+        _map(mapper, chain([first], _timed(arriving, watch)), config, line)
         mapping_seconds = time.perf_counter() - tick
     _say([note for note in tracker.notes if note not in notes], console)  # how a live tracker's frames ended
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
-    if len(mapper.keyframes) == 0:
+    frames, keyframes = mapper.frames, mapper.pipeline.keyframes
+    if len(keyframes) == 0:
         raise InputError(
             f"no frame became a keyframe: none has {config.mapping.keyframes.min_points} tracked points; "
             "give a tracker with points or lower mapping.keyframes.min_points"
         )
-    versions = {config.mode: _version(mapper, frames)}
-    if config.refine.steps and isinstance(mapper, OnlineMapper):
+    versions = {config.mode: mapper.version()}
+    if config.refine.steps and config.mode != "offline":
         line.start_refining(config.refine.steps)
-        refine(mapper, config.refine, line.refined)
+        mapper.refine(config.refine.steps, config.refine, line.refined)
         line.stop()
-        versions["refined"] = _version(mapper, frames)
+        versions["refined"] = mapper.version()
     last = list(versions)[-1]
     results = Results(config, frames)
     with results.writing():
-        keyframes = {keyframe.index for keyframe in mapper.keyframes}
         # What is scored is what a reader of the file gets.
-        versions[last] = results.write_map(
-            versions[last],
-            keyframes,
-            mapper.keyframes[0].exposure is not None,
-            mapper.near,
-            mapper.keyframes.scene_depth,
-        )
+        versions[last] = results.write_map(versions[last], keyframes, mapper.pipeline.near)
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
             if stage == last:
@@ -109,11 +100,11 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
 
         with watch.measure("evaluate"), line.working("evaluating the saved map"):
             with FramesAhead(tracker, ahead) as again:
-                scores = evaluate(mapper, again, versions, lpips, keep)
+                scores = evaluate(mapper.pipeline, again, versions, lpips, keep)
         ground_truth = getattr(tracker, "ground_truth", list)()
         metrics = {
-            "keyframes": len(mapper.keyframes),
-            "gaussians": len(mapper.gaussians),
+            "keyframes": len(keyframes),
+            "gaussians": len(mapper.pipeline.gaussians),
             "backend": backend,
             "seed": config.seed,
             "frames_per_second": round(len(frames) / mapping_seconds, 4),
@@ -133,25 +124,24 @@ def _say(notes: Iterable[str], console: Console) -> None:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
 
-def build_mapper(config: SceneConfig, camera: PinholeCamera) -> OnlineMapper | OfflineMapper:
+def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
     """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
+    settings = config.offline if config.mode == "offline" else config.mapping
     try:
-        if config.mode == "offline":
-            return OfflineMapper(config.offline, camera.width, camera.height, config.seed)
-        return OnlineMapper(config.mapping, camera.width, camera.height, config.seed)
+        return Mapper(camera.width, camera.height, settings, config.seed)
     except ValueError as error:
         raise InputError(str(error)) from None
 
 
 def _map(
-    mapper: OnlineMapper | OfflineMapper, arriving: Iterable[TrackedFrame | PoseCorrection], line: ProgressLine
-) -> DeliveredFrames:
-    """Take all frames and corrections in, in their order, and finish the map; what is kept of the frames."""
-    frames, size = DeliveredFrames(), None
+    mapper: Mapper, arriving: Iterable[TrackedFrame | PoseCorrection], config: SceneConfig, line: ProgressLine
+) -> None:
+    """Take all frames and corrections in, in their order, and finish the map."""
+    size = None
     try:
         for frame in arriving:
             if isinstance(frame, PoseCorrection):
-                _correct(mapper, frame, frames)
+                mapper.correct(frame)
                 continue
             size = size or (frame.camera.width, frame.camera.height)
             if (frame.camera.width, frame.camera.height) != size:
@@ -159,45 +149,14 @@ def _map(
                     f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
                     "all images of a scene must have one size"
                 )
-            frames.add(frame)
-            line.frame(None if frame.held_out else mapper.process(frame))
-        if isinstance(mapper, OfflineMapper):
-            _optimise_offline(mapper, line)
+            line.frame(mapper.add(frame))
+        if config.mode == "offline":
+            line.start_offline(config.offline.steps)
+            mapper.finish(line.optimised)
         else:
             mapper.finish()
     finally:
         line.stop()
-    return frames
-
-
-def _correct(mapper: OnlineMapper | OfflineMapper, correction: PoseCorrection, frames: DeliveredFrames) -> None:
-    """Revise poses and map."""
-    if correction.index[-1] > frames.index[-1]:
-        raise InputError(
-            f"the tracker corrects frame {correction.index[-1]} after frame {frames.index[-1]}, before it has come"
-        )
-    report = mapper.correct(correction)
-    frames.correct(correction, report.motion, report.moved)
-
-
-def _version(mapper: OnlineMapper | OfflineMapper, frames: DeliveredFrames) -> MapVersion:
-    """The map as it stands."""
-    store = mapper.keyframes
-    return MapVersion(
-        mapper.gaussians.to_numpy(),
-        [store.corrected(i, T) for i, T in zip(frames.index, frames.T_tracked, strict=True)],
-        [store.exposure_at(i) for i in frames.index],
-        mapper.renderer.view_renders,
-    )
-
-
-def _optimise_offline(mapper: OfflineMapper, line: ProgressLine) -> None:
-    try:
-        mapper.initialise()
-    except ValueError as error:
-        raise InputError(f"`mode: offline` starts from tracked points: {error}") from None
-    line.start_offline(mapper.settings.steps)
-    mapper.optimise(line.optimised)
 
 
 def _timed(

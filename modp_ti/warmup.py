@@ -93,7 +93,7 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     else:
         width, height = size
         camera = PinholeCamera(float(width), float(width), width / 2, height / 2, width, height)
-    build_mapper(config, camera).compile()
+    build_mapper(config, camera).pipeline.compile()
     return backend, camera.width, camera.height
 
 

@@ -184,3 +184,20 @@ def test_cleared_voxels_are_as_good_as_fresh_ones(voxels: Callable[..., Occupanc
 def test_impossible_voxels_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="voxels need"):
         OccupancyVoxels(**({"coarsest": 1.0} | wrong))
+
+
+@pytest.mark.parametrize(
+    ("points", "size", "complaint"),
+    [
+        (np.zeros((3, 4)), 0.1, r"positions have shape \(3, 4\), expected \(N, 3\)"),
+        (np.zeros(3), 0.1, r"positions have shape \(3,\), expected \(N, 3\)"),
+        (np.zeros((4, 3)), np.ones(3), r"target sizes have shape \(3,\), expected one number or \(4,\)"),
+    ],
+)
+def test_points_of_another_shape_are_refused(
+    voxels: Callable[..., OccupancyVoxels], points: NDArray, size: float | NDArray, complaint: str
+) -> None:
+    ours = voxels()
+    for ask in (ours.query, ours.admit, ours.update):
+        with pytest.raises(ValueError, match=complaint):
+            ask(points, size)

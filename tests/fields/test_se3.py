@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -15,6 +16,7 @@ from fields.se3 import (
     matrix_from_quaternion,
     orthonormalised,
     quaternion_from_matrix,
+    torch_exp_se3,
 )
 
 
@@ -76,3 +78,9 @@ def test_the_nearest_motion_of_a_motion_with_noise_is_a_motion() -> None:
     np.testing.assert_allclose(near[:3, :3] @ near[:3, :3].T, np.eye(3), atol=1e-14)
     assert np.linalg.det(near[:3, :3]) == pytest.approx(1.0)
     np.testing.assert_allclose(near, T, atol=5e-4)
+
+
+def test_the_torch_twin_is_the_same_and_differentiable() -> None:
+    xi = torch.tensor(np.array(tangents()), requires_grad=True)
+    np.testing.assert_allclose(torch_exp_se3(xi).detach(), [exp_se3(x) for x in tangents()], atol=1e-12)
+    assert torch.autograd.gradcheck(torch_exp_se3, xi)

@@ -229,15 +229,22 @@ class LiveTracker:
         self.closed = True
 
 
-class DeafMapper:
-    """A mapper that takes no keyframe."""
+class DeafPipeline:
+    """Takes no keyframe."""
 
     keyframes = ()
     stopwatch = Stopwatch()
 
     def compile(self) -> None: ...
 
-    def process(self, frame) -> None: ...
+
+class DeafMapper:
+    """Hears no frame."""
+
+    pipeline = DeafPipeline()
+    frames = ()
+
+    def add(self, frame) -> None: ...
 
     def finish(self) -> None: ...
 
