@@ -50,7 +50,7 @@ def test_a_slanted_plane_is_fused_where_it_is() -> None:
         assert np.abs(error).mean() < 0.004
     # But for the rim, where a vertex lies beside voxels that nobody saw.
     coloured = np.abs(np.asarray(mesh.vertex_colors) - COLOUR).max(axis=1) < 2e-3
-    assert coloured.mean() > 0.999
+    assert coloured.mean() > 0.995
 
 
 def test_the_room_is_fused_to_its_true_surface() -> None:
