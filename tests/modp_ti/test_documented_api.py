@@ -47,15 +47,16 @@ def test_the_loop_leaves_a_map_of_the_wall(ran: dict[str, dict]) -> None:
     render, truth = np.clip(names["picture"].colour, 0, 1), frame(3).image
     assert -10 * np.log10(((render - truth) ** 2).mean()) > 24
     assert sorted(p.name for p in (names["folder"] / "out" / "room").iterdir()) == [
-        *("colmap", "splats.ply", "trajectory.txt"),
+        *("colmap", "frames.json", "splats.ply", "trajectory.txt"),
     ]
     assert len(read_splats(names["folder"] / "out" / "room" / "splats.ply")["position"]) > 300
 
 
 def test_the_torch_loop_finds_colours_and_pose_again(ran: dict[str, dict]) -> None:
     names = ran["The renderer as a PyTorch function"]
-    assert names["losses"][-1] < 0.5 * names["losses"][0]
-    assert names["xi"].detach().abs().max() < 0.01
+    assert names["losses"][-1] < 0.1 * names["losses"][0]
+    # Where the camera looks, that is: before a wall it may stand a little nearer or to the side.
+    assert names["xi"].detach()[3:].abs().max() < 0.01
 
 
 def test_the_voxels_thin_the_points(ran: dict[str, dict]) -> None:
