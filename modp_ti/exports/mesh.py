@@ -83,6 +83,8 @@ def fuse(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object:
     mesh = grid.extract_triangle_mesh(LEAST_VIEWS).to_legacy()
     if len(mesh.triangles) == 0:
         raise InputError(f"no {LEAST_VIEWS:.0f} frames agree on a surface; try larger voxels (--voxel)")
+    # Means of colours, off by rounding: writers complain of those beyond 1.
+    mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0.0, 1.0))
     return mesh
 
 
