@@ -8,9 +8,7 @@ from typing import Annotated
 
 import typer
 
-from modp_ti.errors import InputError
-from modp_ti.render import Device
-from modp_ti.run import BAD_INPUT
+from modp_ti.command_line import Device, in_one_line
 
 __all__ = ["export"]
 
@@ -50,7 +48,7 @@ def export(
     device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
 ) -> None:
     """Write a finished map as points, mesh, compressed splats, data set or video."""
-    try:
+    with in_one_line():
         # Imported here: asking for help must not wait for the compiler and the readers.
         from rich.console import Console
 
@@ -61,7 +59,4 @@ def export(
         options = ExportOptions(voxel or None, device.value)
         line = ProgressLine(Console(stderr=True))
         target = export_map(open_run(out), format.value, output, options, line)
-    except InputError as error:
-        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
-        raise typer.Exit(BAD_INPUT) from None
     typer.echo(f"written to {target}")

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from modp_ti.errors import InputError
-from modp_ti.run import BAD_INPUT
+from modp_ti.command_line import Device, in_one_line, picture_size
 
-__all__ = ["picture_size", "render"]
+__all__ = ["render"]
 
 
 class Shown(str, Enum):
@@ -20,14 +18,6 @@ class Shown(str, Enum):
 
     colour = "colour"
     depth = "depth"
-
-
-class Device(str, Enum):
-    """Where it is computed."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
 
 
 def render(
@@ -63,7 +53,7 @@ def render(
     device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
 ) -> None:
     """Render a finished map along the recorded path, a smoothed one, an orbit, or any path of your own."""
-    try:
+    with in_one_line():
         # Imported here: asking for help must not wait for the compiler and the readers.
         from rich.console import Console
 
@@ -72,21 +62,8 @@ def render(
         from modp_ti.progress import ProgressLine
 
         run = open_run(out)
-        flight = plan_flight(run, path, picture_size(size), fov, frames, fps, smooth)
+        flight = plan_flight(run, path, picture_size(size) if size is not None else None, fov, frames, fps, smooth)
         depth = show is Shown.depth
         target = output or run.folder / f"{Path(path).stem}{'-depth' if depth else ''}.mp4"
         film(run, flight, target, depth, device.value, ProgressLine(Console(stderr=True)))
-    except InputError as error:
-        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
-        raise typer.Exit(BAD_INPUT) from None
     typer.echo(f"written to {target}")
-
-
-def picture_size(text: str | None) -> tuple[int, int] | None:
-    """(width, height) of `WIDTHxHEIGHT`, None of None. Raises InputError for anything else."""
-    if text is None:
-        return None
-    found = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
-    if found is None:
-        raise InputError(f"--size {text}: write it as WIDTHxHEIGHT, for example 1280x720")
-    return int(found[1]), int(found[2])

@@ -7,11 +7,10 @@ from typing import Annotated
 
 import typer
 
+from modp_ti.command_line import in_one_line
 from modp_ti.errors import InputError
 
 __all__ = ["run"]
-
-BAD_INPUT = 2
 
 
 def run(
@@ -23,11 +22,8 @@ def run(
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
     """Map a posed sequence while its frames arrive, and write splats, poses, metrics and pictures."""
-    try:
+    with in_one_line():
         folder = _run(scene, [*(set_ or []), *(more or [])])
-    except InputError as error:
-        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
-        raise typer.Exit(BAD_INPUT) from None
     typer.echo(f"written to {folder}")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from modp_ti.command_line import in_one_line, picture_size
 from modp_ti.errors import InputError
-from modp_ti.run import BAD_INPUT
 
 if TYPE_CHECKING:
     from modp_ti.settings import SceneConfig
@@ -32,11 +31,8 @@ def warmup(
     ] = None,
 ) -> None:
     """Compile all kernels of a run now, so that the first run starts as fast as the later ones."""
-    try:
+    with in_one_line():
         _warmup(scene, size or [], set_ or [], typer.echo)
-    except InputError as error:
-        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
-        raise typer.Exit(BAD_INPUT) from None
 
 
 def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], say: Callable[[str], None]) -> None:
@@ -44,7 +40,7 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], say: Cal
         raise InputError("--set changes keys of a scene file: name one")
     if scene is None and not sizes:
         raise InputError("nothing to compile for: name a scene file, or give --size 640x480")
-    wanted = [_size(text) for text in sizes] or [None]
+    wanted = [picture_size(text) for text in sizes] or [None]
     # Imported here: asking for help must not wait for the compiler and the readers.
     from modp_ti.config import load_scene
     from modp_ti.settings import SceneConfig, TrackerSettings
@@ -58,13 +54,6 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], say: Cal
         start = time.perf_counter()
         backend, width, height = compile_size(config, size)
         say(f"{width}x{height} on {backend}: {time.perf_counter() - start:.1f} s")
-
-
-def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
-    if found is None:
-        raise InputError(f"--size {text}: write it as WIDTHxHEIGHT, for example 640x480")
-    return int(found[1]), int(found[2])
 
 
 def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str, int, int]:
