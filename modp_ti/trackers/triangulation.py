@@ -14,7 +14,6 @@ from modp_ti.trackers.features import MAX_FEATURES, Features, detect_features, e
 from modp_ti.trackers.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
 from modp_ti.trackers.observations import Observations
 from modp_ti.trackers.point_solving import point_errors, solve_points, surest_points
-from modp_ti.trackers.pose_adjustment import adjusted_poses
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import PosedImage, points_inside
 
@@ -71,6 +70,9 @@ def adjusted_frames(
 
     A frame that does not solve takes no part in the others' poses and gets its own by the points that it sees.
     """
+    # Imported here: readers need no compiler.
+    from modp_ti.trackers.pose_adjustment import adjusted_poses
+
     follows = _are_followed(images, frames, solves)
     seen = _seen(images, frames, solves, follows, WIDE_BAND, progress)
     given = poses = np.stack([frame.T_camera_world for frame in frames])
