@@ -10,12 +10,13 @@ from fields.launch import LoopLaunch
 from fields.parallel import HANDED_OUT
 from fields.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 
-__all__ = ["PAD", "STRIPS", "ImageBuffers"]
+__all__ = ["PAD", "SCRATCH_ROWS", "STRIPS", "ImageBuffers"]
 
 # Border of zeros around every plane [px]: an 11x11 window reads 5 beyond the image without a branch.
 PAD = 8
-# Strips of rows that the loss works on in parallel, each channel of each with scratch rows of its own.
+# Strips of rows that the loss works on in parallel, each channel of each with this many scratch rows of its own.
 STRIPS = 32
+SCRATCH_ROWS = 8
 # A thread takes eight rows at a time.
 SPREAD = HANDED_OUT // 8
 
@@ -77,7 +78,7 @@ class ImageBuffers:
         for buffer in (self.colour, self.colour_grad, self.reference, self.ssim):
             builder.dense(ti.i, 3 * self.plane).place(buffer)
         builder.dense(ti.i, 9 * self.plane).place(self.ssim_partial)
-        builder.dense(ti.i, 3 * STRIPS * 10 * self.stride).place(self.rows)
+        builder.dense(ti.i, 3 * STRIPS * SCRATCH_ROWS * self.stride).place(self.rows)
         builder.place(self.background)
 
     def resize(self, width: int, height: int) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import taichi as ti
 
 from fields.gaussians import GaussianField
-from fields.images import PAD, STRIPS, ImageBuffers
+from fields.images import PAD, SCRATCH_ROWS, STRIPS, ImageBuffers
 from fields.launch import Launch, LoopLaunch
 from fields.parallel import HANDED_OUT
 
@@ -24,6 +24,22 @@ C1 = 0.01**2
 C2 = 0.03**2
 # A thread takes four strips of a channel at a time, or rows.
 SPREAD = HANDED_OUT // 4
+
+
+@ti.func
+def place(index):
+    """An index into a field, said to lie in [0, 2^30).
+
+    With that and `extent` LLVM knows that 32 bits do not overflow, and has the constant offsets of a window added by
+    the loads themselves. Else it computes each of their addresses with two instructions.
+    """
+    return index & 0x3FFFFFFF
+
+
+@ti.func
+def extent(pixels):
+    """The length of a row, said to be below 2^16."""
+    return pixels & 0xFFFF
 
 
 def window_weights() -> tuple[float, ...]:
@@ -103,15 +119,15 @@ class PhotometricLoss:
                         self.images.colour[c * self.images.plane + x] = r + d * self.images.valid[x]
 
     @ti.func
-    def _smooth_rows(self, scratch, rows, width):
-        """Horizontal window over `rows` scratch rows, into the five behind them.
+    def _smooth_rows(self, first, smooth, rows, width):
+        """Horizontal window over the `rows` scratch rows from `first` on, into those from `smooth` on.
 
         One row at a time: beyond some 25 addresses in a loop LLVM no longer vectorises it.
         """
         for q in range(rows):
-            source = scratch + q * self.images.stride + PAD - RADIUS
-            target = scratch + (q + 5) * self.images.stride
-            for x in range(width):
+            source = place(first + q * self.images.stride + PAD - RADIUS)
+            target = place(smooth + q * self.images.stride)
+            for x in range(extent(width)):
                 total = ti.cast(0.0, self.real)
                 for k in ti.static(range(2 * RADIUS + 1)):
                     total += self.weights[k] * self.images.rows[source + x + k]
@@ -129,29 +145,17 @@ class PhotometricLoss:
         channel = unit // STRIPS * plane
         partial = unit // STRIPS * 3 * plane
         strip = unit % STRIPS
-        scratch = unit * 10 * stride
+        scratch = unit * SCRATCH_ROWS * stride
         # A first access out here makes Taichi fetch the tree's root once, not at every pixel.
         self.images.rows[scratch] = 0.0
         zero = ti.cast(0.0, self.real)
         l1, ssim, square, count = zero, zero, zero, zero
         for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
-            top = channel + (y + PAD - RADIUS) * stride
-            for x in range(width + 2 * PAD):
-                mu_x, mu_y, squares, xy = zero, zero, zero, zero
-                for k in ti.static(range(2 * RADIUS + 1)):
-                    a = self.images.colour[top + k * stride + x]
-                    b = self.images.reference[top + k * stride + x]
-                    wa, wb = self.weights[k] * a, self.weights[k] * b
-                    mu_x, mu_y = mu_x + wa, mu_y + wb
-                    squares, xy = squares + (wa * a + wb * b), xy + wa * b
-                self.images.rows[scratch + x] = mu_x
-                self.images.rows[scratch + stride + x] = mu_y
-                self.images.rows[scratch + 2 * stride + x] = squares
-                self.images.rows[scratch + 3 * stride + x] = xy
-            self._smooth_rows(scratch, 4, width)
-            row = (y + PAD) * stride + PAD
-            smooth = scratch + 5 * stride
-            for x in range(width):
+            self._moments_of_row(channel + (y + PAD - RADIUS) * stride, scratch, width)
+            smooth = place(scratch + 4 * stride)
+            self._smooth_rows(scratch, smooth, 4, width)
+            row = place((y + PAD) * stride + PAD)
+            for x in range(extent(width)):
                 mu_x, mu_y = self.images.rows[smooth + x], self.images.rows[smooth + stride + x]
                 mean_square = mu_x * mu_x + mu_y * mu_y
                 variances = self.images.rows[smooth + 2 * stride + x] - mean_square
@@ -177,6 +181,21 @@ class PhotometricLoss:
         sums[unit, 2] = square
         sums[unit, 3] = count
 
+    @ti.func
+    def _moments_of_row(self, first, scratch, width):
+        """Vertical window of x, y, xx + yy and xy over the rows from `first` on."""
+        stride = ti.static(self.images.stride)
+        top, target = place(first), place(scratch)
+        for x in range(extent(width + 2 * PAD)):
+            total = ti.Vector.zero(self.real, 4)
+            for k in ti.static(range(2 * RADIUS + 1)):
+                a = self.images.colour[top + k * stride + x]
+                b = self.images.reference[top + k * stride + x]
+                wa, wb = self.weights[k] * a, self.weights[k] * b
+                total += ti.Vector([wa, wb, wa * a + wb * b, wa * b])
+            for q in ti.static(range(4)):
+                self.images.rows[target + q * stride + x] = total[q]
+
     @ti.kernel
     def _differentiate_strips(
         self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64, partials: ti.i32
@@ -193,22 +212,22 @@ class PhotometricLoss:
         channel = unit // STRIPS * plane
         partial = unit // STRIPS * 3 * plane
         strip = unit % STRIPS
-        scratch = unit * 10 * stride
+        scratch = place(unit * SCRATCH_ROWS * stride)
         self.images.rows[scratch] = 0.0
         by_l1, by_ssim = ti.cast(l1_scale, self.real), ti.cast(ssim_scale, self.real)
         for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
             for q in range(partials):
-                top = partial + q * plane + (y + PAD - RADIUS) * stride
-                target = scratch + q * stride
-                for x in range(width + 2 * PAD):
+                top = place(partial + q * plane + (y + PAD - RADIUS) * stride)
+                target = place(scratch + q * stride)
+                for x in range(extent(width + 2 * PAD)):
                     total = ti.cast(0.0, self.real)
                     for k in ti.static(range(2 * RADIUS + 1)):
                         total += self.weights[k] * self.images.ssim_partial[top + k * stride + x]
                     self.images.rows[target + x] = total
-            self._smooth_rows(scratch, partials, width)
-            row = (y + PAD) * stride + PAD
-            smooth = scratch + 5 * stride
-            for x in range(width):
+            smooth = place(scratch + 3 * stride)
+            self._smooth_rows(scratch, smooth, partials, width)
+            row = place((y + PAD) * stride + PAD)
+            for x in range(extent(width)):
                 a = self.images.colour[channel + row + x]
                 b = self.images.reference[channel + row + x]
                 by_mean = self.images.rows[smooth + x]
