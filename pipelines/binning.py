@@ -24,20 +24,19 @@ SLACK = 0.01
 
 
 @ti.func
-def ellipse_span(a, b, c, det, limit, low, high):
+def ellipse_span(b, c, per_c, det, limit, reach, top_at, low, high):
     """Lowest and highest v on the ellipse a u^2 + 2 b u v + c v^2 <= limit with u in [low, high]; det = a c - b^2.
 
-    An empty range comes back with lowest > highest.
+    per_c: 1 / c. reach: the largest u. top_at: the u at which v is largest; it is smallest at its mirror image. They
+    are one Gaussian's, and known to its every tile. An empty range comes back with lowest > highest.
     """
-    u_reach = ti.sqrt(limit * c / det)
-    v_reach = ti.sqrt(limit * a / det)
-    low = ti.max(low, -u_reach)
-    high = ti.min(high, u_reach)
-    # v is largest at u = -b / a * v_reach, smallest at its mirror image; elsewhere at the nearer end of the range.
-    u_top = ti.min(ti.max(-b / a * v_reach, low), high)
-    u_bottom = ti.min(ti.max(b / a * v_reach, low), high)
-    top = (-b * u_top + ti.sqrt(ti.max(limit * c - det * u_top * u_top, 0.0))) / c
-    bottom = (-b * u_bottom - ti.sqrt(ti.max(limit * c - det * u_bottom * u_bottom, 0.0))) / c
+    low = ti.max(low, -reach)
+    high = ti.min(high, reach)
+    # Where the extreme lies outside the range, the nearer end of the range.
+    u_top = ti.min(ti.max(top_at, low), high)
+    u_bottom = ti.min(ti.max(-top_at, low), high)
+    top = (-b * u_top + ti.sqrt(ti.max(limit * c - det * u_top * u_top, 0.0))) * per_c
+    bottom = (-b * u_bottom - ti.sqrt(ti.max(limit * c - det * u_bottom * u_bottom, 0.0))) * per_c
     return ti.select(low > high, ti.Vector([1.0, -1.0]), ti.Vector([bottom - SLACK, top + SLACK]))
 
 
@@ -83,18 +82,20 @@ class Binning:
 
     @ti.func
     def _ellipse(self, s):
-        """Of slot s: conic, its determinant (float64 inside: a needle's would be all rounding), squared reach."""
+        """Of slot s: a, b, c of its conic, their determinant, squared reach, reach in x and y, 1 / a, 1 / c."""
         conic = self.projected.conic[s]
+        # In float64: a needle's determinant would be all rounding.
         a, b, c = ti.cast(conic[0], ti.f64), ti.cast(conic[1], ti.f64), ti.cast(conic[2], ti.f64)
         det = ti.cast(a * c - b * b, self.projected.real)
         opacity = self.projected.opacity[s]
         limit = 2.0 * ti.log(ti.max(opacity, ALPHA_MIN) / ALPHA_MIN)
-        return ti.Vector([conic[0], conic[1], conic[2], det, limit])
+        reach_x, reach_y = ti.sqrt(limit * conic[2] / det), ti.sqrt(limit * conic[0] / det)
+        return ti.Vector([conic[0], conic[1], conic[2], det, limit, reach_x, reach_y, 1.0 / conic[0], 1.0 / conic[2]])
 
     @ti.func
     def _tile_rows(self, s, e, tiles_y):
         """First tile row and the one behind the last that slot s reaches."""
-        reach = ti.sqrt(e[4] * e[0] / e[3]) + SLACK
+        reach = e[6] + SLACK
         y = self.projected.mean[s][1]
         first = ti.max(first_centre(y - reach), 0) // self.tile_height
         last = ti.min(last_centre(y + reach), tiles_y * self.tile_height - 1)
@@ -105,7 +106,8 @@ class Binning:
         """First tile column and the one behind the last that slot s reaches in a tile row."""
         mean = self.projected.mean[s]
         top = tile_y * self.tile_height + 0.5 - mean[1]
-        span = ellipse_span(e[2], e[1], e[0], e[3], e[4], top, top + (self.tile_height - 1))
+        bottom = top + (self.tile_height - 1)
+        span = ellipse_span(e[1], e[0], e[7], e[3], e[4], e[6], -e[1] * e[8] * e[5], top, bottom)
         first = ti.max(first_centre(mean[0] + span[0]), 0)
         last = ti.min(last_centre(mean[0] + span[1]), tiles_x * self.tile_width - 1)
         return ti.select(
@@ -119,7 +121,8 @@ class Binning:
         """Rows of a tile that slot s reaches, packed as first | behind last << 16."""
         mean = self.projected.mean[s]
         left = tile_x * self.tile_width + 0.5 - mean[0]
-        span = ellipse_span(e[0], e[1], e[2], e[3], e[4], left, left + (self.tile_width - 1))
+        right = left + (self.tile_width - 1)
+        span = ellipse_span(e[1], e[2], e[8], e[3], e[4], e[5], -e[1] * e[7] * e[6], left, right)
         first = ti.max(first_centre(mean[1] + span[0]) - tile_y * self.tile_height, 0)
         last = ti.min(last_centre(mean[1] + span[1]) - tile_y * self.tile_height, self.tile_height - 1)
         return ti.select((last < first) | (span[0] > span[1]), 0, first | ((last + 1) << 16))
