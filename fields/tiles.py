@@ -3,13 +3,15 @@
 import numpy as np
 import taichi as ti
 
-__all__ = ["TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
+__all__ = ["GROUP", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
 
 # Powers of two. A row of a tile is one vector of eight float32, as LLVM makes them even where there are wider ones:
 # what an ellipse does not reach of a row is wasted work. A tall tile wastes none, and keeps the pairs few.
 TILE_WIDTH = 8
 TILE_HEIGHT = 32
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+# Pairs that a tile composites between two looks at what is left to do.
+GROUP = 16
 BLOCK = 4096
 
 
@@ -21,6 +23,7 @@ class TilePairs:
     Per pair, in the order of depth, chunk by chunk: `emitted_tile` and `emitted_rows`, before they are sorted.
     Per sorted pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse
     reaches in the tile (first | last << 16), `gradient`: ten sums over the tile's pixels (see `compositing.py`).
+    `staged`, GROUP of a tile: what compositing needs of the Gaussians of the pairs that it is at, close together.
     `position[e]` for e from slot s's `first_pair` to its `end_pair` are the places of its pairs.
     """
 
@@ -43,8 +46,10 @@ class TilePairs:
         self.rows = ti.field(ti.i32)
         self.position = ti.field(ti.i32)
         self.gradient = ti.Vector.field(10, real)
+        self.staged = ti.Vector.field(10, real)
         builder.dense(ti.i, max_tiles).place(self.first, self.tile_count, self.reached)
         builder.dense(ti.ij, (chunks, max_tiles)).place(self.histogram)
+        builder.dense(ti.i, max_tiles * GROUP).place(self.staged)
         builder.dense(ti.i, chunks + 1).place(self.chunk_pairs)
         blocks = builder.pointer(ti.i, max_pairs // BLOCK)
         blocks.dense(ti.i, BLOCK).place(self.slot, self.rows)
