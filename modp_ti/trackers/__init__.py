@@ -15,8 +15,7 @@ __all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ah
 def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:
     """The tracker that the configuration asks for, its input checked as far as possible without decoding.
 
-    progress: called while a tracker prepares (triangulates). Raises InputError for bad
-    input.
+    progress: called while a tracker prepares (triangulates). Raises InputError for bad input.
     """
     if config.tracker.kind == "colmap":
         from modp_ti.trackers.colmap import open_colmap
