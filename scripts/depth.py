@@ -123,10 +123,10 @@ def main() -> None:
     for name in names:
         e, known = np.concatenate(error[name]), np.concatenate(deviation[name])
         own, both = known < limit, sure & np.isfinite(known)
-        print(
-            f"| {name} | {100 * own.mean():.0f} % | {100 * np.median(e[own]):.2f} % | "
-            f"{100 * np.percentile(e[own], 90):.1f} % | {100 * np.median(e[both]):.2f} % |"
-        )
+        # Early in a run the map, for one, is sure of nothing.
+        below = f"{100 * np.median(e[own]):.2f} % | {100 * np.percentile(e[own], 90):.1f} %" if own.any() else "– | –"
+        where_fused = f"{100 * np.median(e[both]):.2f} %" if both.any() else "–"
+        print(f"| {name} | {100 * own.mean():.0f} % | {below} | {where_fused} |")
 
 
 if __name__ == "__main__":
