@@ -80,6 +80,13 @@ class ProgressLine:
         """Show a step of offline optimisation that is done."""
         self._update(completed=step, state=f"{gaussians:,} Gaussians  {psnr:.2f} dB")
 
+    def start_evaluating(self, renders: int) -> None:
+        self._begin("evaluating the saved map", renders)
+
+    def evaluated(self) -> None:
+        """Show that one more frame has been compared with a map."""
+        self._update(advance=1)
+
     def stop(self) -> None:
         """End the line, leaving its last state on the screen."""
         if self._progress is not None:

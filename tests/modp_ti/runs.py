@@ -13,6 +13,7 @@ FILES = [
     "frames.json",
     "metrics.json",
     "renders",
+    "report.html",
     "scores.csv",
     "splats.ply",
     "trajectory.txt",
