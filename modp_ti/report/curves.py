@@ -16,11 +16,15 @@ MOST_POINTS = 400
 
 
 def frame_rate(frames: Sequence[FrameNote], window: int) -> NDArray[np.float64]:
-    """Frames per second (N,) over the `window` frames that end at each; over fewer at the beginning."""
+    """Frames per second (N,) over the `window` frames that end at each; NaN where there are not yet as many.
+
+    Of fewer frames than that the last one has the rate over all.
+    """
     done = np.array([0.0, *(note.done for note in frames)])
-    last = np.arange(1, len(done))
-    first = np.maximum(last - window, 0)
-    return (last - first) / np.maximum(done[last] - done[first], 1e-9)
+    window = min(window, len(frames))
+    rate = np.full(len(frames), np.nan)
+    rate[window - 1 :] = window / np.maximum(done[window:] - done[:-window], 1e-9)
+    return rate
 
 
 def binned(

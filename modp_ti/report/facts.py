@@ -47,13 +47,13 @@ STAGES = {
 OTHERS = {
     "frames_per_second": ("frames per second while mapping", ".2f", ""),
     "peak_memory_mb": ("most memory held", ",.0f", " MB"),
-    "ate_rmse": ("trajectory error, refined (RMSE after alignment)", ".4g", ""),
-    "ate_rmse_rigid": ("the same, aligned without scale", ".4g", ""),
-    "ate_rmse_tracked": ("trajectory error of the tracker", ".4g", ""),
-    "reprojection_error": ("points to pixels, refined poses", ".3f", " px"),
-    "reprojection_error_tracked": ("points to pixels, tracker's poses", ".3f", " px"),
-    "reprojection_error_anew": ("the same with points placed anew, refined poses", ".3f", " px"),
-    "reprojection_error_anew_tracked": ("the same, tracker's poses", ".3f", " px"),
+    "ate_rmse_tracked": ("trajectory error of the tracker [units of the ground truth]", ".4g", ""),
+    "ate_rmse": ("trajectory error after mapping", ".4g", ""),
+    "ate_rmse_rigid": ("trajectory error after mapping, aligned without scale", ".4g", ""),
+    "reprojection_error_tracked": ("tracked points from their pixels, tracker's poses", ".3f", " px"),
+    "reprojection_error": ("tracked points from their pixels, poses after mapping", ".3f", " px"),
+    "reprojection_error_anew_tracked": ("points placed anew from their pixels, tracker's poses", ".3f", " px"),
+    "reprojection_error_anew": ("points placed anew from their pixels, poses after mapping", ".3f", " px"),
 }
 
 

@@ -87,7 +87,7 @@ def psnr_of_frames(scores: Sequence[FrameScore]) -> Figure:
 
 @_drawn
 def growth(frames: Sequence[FrameNote]) -> Figure:
-    """Gaussians, frames per second and PSNR of the views in work, over the frames as they were taken in."""
+    """Gaussians, frames per second and PSNR of the views being optimised, over the frames as they were taken in."""
     mapped = [note for note in frames if note.psnr is not None]
     panels = 3 if mapped else 2
     window = max(5, len(frames) // 20)
@@ -110,7 +110,7 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
     if mapped:
         y = np.array([note.psnr for note in mapped], float)
         _line(axes[2], np.array([note.index for note in mapped], float), y, "view-psnr", color=ORANGE)
-        _label(axes[2], "frame", "PSNR of the views\nin work [dB]")
+        _label(axes[2], "frame", "PSNR of the views\nbeing optimised [dB]")
     return figure
 
 
@@ -123,7 +123,7 @@ def steps(notes: Sequence[StepNote]) -> Figure:
     figure = _figure(2.1 * panels)
     axes = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
     _line(axes[-1], *binned(x, np.array([note.psnr for note in notes], float), 100), "step-psnr", color=ORANGE)
-    _label(axes[-1], "step", "PSNR of the views\nin work [dB]")
+    _label(axes[-1], "step", "PSNR of the views\nbeing optimised [dB]")
     if gaussians:
         _line(axes[0], *binned(x, np.array(gaussians, float)), "step-gaussians", color=BLUE)
         axes[0].set_ylim(bottom=0)
@@ -146,28 +146,32 @@ def trajectory(
     keyframes: positions among the frames. floor: places (N, 2) and colours (N, 3) of Gaussians. truth: true centres
     (M, 3) in the map's world.
     """
-    places = {"after": plan.on_page(_centres(after)), "before": plan.on_page(_centres(before))}
+    ways = {"after": plan.on_page(_centres(after)), "before": plan.on_page(_centres(before))}
     if truth is not None:
-        places["truth"] = plan.on_page(truth)
-    low, high = _extent(np.concatenate(list(places.values())), floor[0])
-    aspect = (high[1] - low[1]) / (high[0] - low[0])
-    figure = _figure(float(np.clip(WIDTH * aspect + 0.6, 3.0, 8.0)))
-    axes = figure.add_subplot()
+        ways["truth"] = plan.on_page(truth)
+    around = np.concatenate(list(ways.values()))
+    figure = _figure(4.4)
+    whole, close = figure.subplots(1, 2)
     if len(floor[0]):
-        axes.scatter(*floor[0].T, s=1.2, c=floor[1], alpha=0.45, linewidths=0, rasterized=True)
-    if "truth" in places:
-        _line(axes, *places["truth"].T, "way-truth", color=GREEN, lw=2.6, alpha=0.7, label="ground truth")
-    _line(axes, *places["before"].T, "way-before", color=GREY, ls="--", label="tracker")
-    _line(axes, *places["after"].T, "way-after", color=ORANGE, label="refined")
-    shown = places["after"][list(keyframes)]
-    if len(shown):
-        axes.plot(*shown.T, ".", ms=3.5, color=ORANGE, label="keyframes")
-    axes.plot(*places["after"][0], "o", ms=7, mfc="none", color="black", label="first frame")
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_aspect("equal")
-    _label(axes, "scene units", "scene units")
-    axes.legend(ncols=5, loc="lower left", bbox_to_anchor=(0, 1))
+        size = float(np.clip(30_000 / len(floor[0]), 1.0, 14.0))
+        whole.scatter(*floor[0].T, s=size, c=floor[1], alpha=0.6, linewidths=0, rasterized=True)
+    for axes, name, (low, high) in (
+        (whole, "in the map", _extent(around, floor[0])),
+        (close, "closer", _extent(around, around[:0])),
+    ):
+        if "truth" in ways:
+            _line(axes, *ways["truth"].T, "way-truth", color=GREEN, lw=2.8, alpha=0.6, label="ground truth")
+        _line(axes, *ways["before"].T, "way-before", color=GREY, ls="--", label="tracker")
+        _line(axes, *ways["after"].T, "way-after", color=ORANGE, label="after mapping")
+        if len(keyframes):
+            axes.plot(*ways["after"][list(keyframes)].T, ".", ms=3.5, color=ORANGE, label="keyframes")
+        axes.plot(*ways["after"][0], "o", ms=7, mfc="none", color="black", label="first frame")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_title(name, fontsize=9)
+        _label(axes, "scene units", "")
+    figure.legend(*close.get_legend_handles_labels(), ncols=5, loc="outside upper center")
     return figure
 
 
