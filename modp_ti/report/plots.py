@@ -25,6 +25,7 @@ __all__ = ["growth", "pose_changes", "psnr_of_frames", "steps", "trajectory"]
 Arguments = ParamSpec("Arguments")
 
 WIDTH = 9.2  # inches; the page scales it
+PANEL = 1.15  # width over height of a view from above
 # Colours that differ in print and for the colour-blind too (Okabe and Ito).
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 OF_STAGE = {"online": BLUE, "refined": ORANGE, "offline": ORANGE}
@@ -168,7 +169,7 @@ def trajectory(
         axes.plot(*ways["after"][0], "o", ms=7, mfc="none", color="black", label="first frame")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_aspect("equal")
         axes.set_title(name, fontsize=9)
         _label(axes, "scene units", "")
     figure.legend(*close.get_legend_handles_labels(), ncols=5, loc="outside upper center")
@@ -216,10 +217,11 @@ def _centres(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
 
 
 def _extent(ways: NDArray[np.float64], floor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of what is shown: all of the ways, and the floor but for its outliers."""
+    """Corners of what is shown, of one shape: all of the ways, and the floor but for its outliers."""
     low, high = ways.min(axis=0), ways.max(axis=0)
     if len(floor):
         low = np.minimum(low, np.quantile(floor, 0.02, axis=0))
         high = np.maximum(high, np.quantile(floor, 0.98, axis=0))
-    margin = 0.05 * max(float((high - low).max()), 1e-3)
-    return low - margin, high + margin
+    size = np.maximum(1.1 * (high - low), 1e-3)
+    size = np.maximum(size, [PANEL * size[1], size[0] / PANEL])
+    return (low + high - size) / 2, (low + high + size) / 2
