@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
@@ -89,7 +89,12 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     versions = {config.mode: mapper.version()}
     if config.refine.steps and config.mode != "offline":
         line.start_refining(config.refine.steps)
-        mapper.refine(config.refine.steps, config.refine, _both(line.refined, record.refined))
+
+        def refined(step: int, psnr: float) -> None:
+            line.refined(step, psnr)
+            record.refined(step, psnr)
+
+        mapper.refine(config.refine.steps, config.refine, refined)
         line.stop()
         versions["refined"] = mapper.version()
     last = list(versions)[-1]
@@ -138,16 +143,6 @@ def _say(notes: Iterable[str], console: Console, record: RunRecord) -> None:
         record.notes.append(note)
 
 
-def _both(first: Callable[..., None], second: Callable[..., None]) -> Callable[..., None]:
-    """Calls one after the other with the same arguments."""
-
-    def call(*arguments: object) -> None:
-        first(*arguments)
-        second(*arguments)
-
-    return call
-
-
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
     """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
     settings = config.offline if config.mode == "offline" else config.mapping
@@ -183,7 +178,12 @@ def _map(
             line.frame(report)
         if config.mode == "offline":
             line.start_offline(config.offline.steps)
-            mapper.finish(_both(line.optimised, record.optimised))
+
+            def optimised(step: int, gaussians: int, psnr: float) -> None:
+                line.optimised(step, gaussians, psnr)
+                record.optimised(step, gaussians, psnr)
+
+            mapper.finish(optimised)
         else:
             mapper.finish()
     finally:
