@@ -10,6 +10,7 @@ import pytest
 
 from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory
+from tests.modp_ti.report.made_up_run import Page
 from tests.modp_ti.runs import FILES, finished_run, run
 
 SCENE = """
@@ -44,6 +45,12 @@ def test_the_metrics_say_what_happened(folder: Path) -> None:
     assert metrics["offline"]["all"]["psnr"] > 12
     assert metrics["seconds"]["optimise"] > 0
     assert metrics["seconds"]["refine"] == metrics["seconds"]["depth"] == 0
+
+
+def test_the_report_shows_how_the_map_was_optimised(folder: Path) -> None:
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    assert len(page.curves()["step-gaussians"][0]) == 90
+    assert "Offline optimisation" in page.text and "Post refinement" not in page.text
 
 
 def test_the_splats_have_the_harmonics_of_degree_three(folder: Path) -> None:
