@@ -69,7 +69,7 @@ def test_the_written_configuration_gives_the_same_map_byte_for_byte(folder: Path
 def test_frames_without_points_are_an_error_of_one_line(tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(SCENE.replace("stop: 9", "stop: 1"))  # only a frame that is held out
-    result = run(scene, "--set", "offline.sh_degree=0")
+    result = run(scene, "--quiet", "--set", "offline.sh_degree=0")
     assert result.returncode == 2
     assert result.stderr.startswith("error: `mode: offline` starts from tracked points: ")
     assert result.stderr.count("\n") == 1

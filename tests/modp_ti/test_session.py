@@ -210,7 +210,7 @@ def test_lpips_is_that_of_the_pictures(again: Path, lpips_weights: Path) -> None
 def test_bad_input_writes_nothing(tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(SCENE.replace("stop: 9", "start: 900"))
-    result = run(scene)
+    result = run(scene, "--quiet")
     assert result.returncode == 2
     assert result.stderr.startswith("error: ")
     assert result.stderr.count("\n") == 1
