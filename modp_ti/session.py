@@ -101,7 +101,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     results = Results(config, frames)
     with results.writing():
         # What is scored is what a reader of the file gets.
-        versions[last] = results.write_map(versions[last], keyframes, mapper.pipeline.near)
+        with line.working("writing the map"):
+            versions[last] = results.write_map(versions[last], keyframes, mapper.pipeline.near)
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
             line.evaluated()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -87,10 +88,14 @@ def run_record(frames: int, holdout: int, mode: str, refine: int, keyframe_every
 def delivered(poses: list[NDArray[np.float64]], held_out: list[bool]) -> DeliveredFrames:
     """Black frames at T_camera_world, without points."""
     frames = DeliveredFrames()
-    camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
     for i, (T, held) in enumerate(zip(poses, held_out, strict=True)):
-        frames.add(TrackedFrame(i, i / 10, str(i), np.zeros((16, 16, 3), np.float32), camera, T, held_out=held))
+        frames.add(dataclasses.replace(black_frame(i), T_camera_world=T, held_out=held))
     return frames
+
+
+def black_frame(index: int) -> TrackedFrame:
+    camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
+    return TrackedFrame(index, index / 10, str(index), np.zeros((16, 16, 3), np.float32), camera, np.eye(4))
 
 
 def made_up_run(

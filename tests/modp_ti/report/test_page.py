@@ -10,7 +10,8 @@ import pytest
 
 from modp_ti.report.curves import frame_rate
 from modp_ti.report.page import ReportedRun, write_report
-from tests.modp_ti.report.made_up_run import Page, made_up_run
+from modp_ti.results import Results
+from tests.modp_ti.report.made_up_run import Page, black_frame, delivered, made_up_run, picture
 
 EVIL = "</td><script>alert('x')</script><img src=http://evil.example/a.png> & \"{{ 7 * 7 }}\""
 
@@ -221,3 +222,30 @@ def test_a_long_run_of_large_pictures_stays_small(tmp_path) -> None:
     run = made_up_run(tmp_path, frames=1000, holdout=50, refine=5000, size=(480, 640))
     _, html = written(tmp_path, run)
     assert len(html) < 3_000_000
+
+
+class Keyframes(list):
+    """Of a `KeyframeStore` what a report needs."""
+
+    scene_depth = 2.0
+
+
+@pytest.mark.parametrize("stages", ["all", "none"])
+def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path, stages) -> None:
+    run = made_up_run(tmp_path, frames=6, refine=0, holdout=0)
+    results = Results(run.config, delivered(list(run.tracked), [False] * 6))
+    scores = list(run.scores) if stages == "all" else []
+    with results.writing():
+        for i in range(6):
+            image, render = picture(i, (16, 16)), picture(i + 1, (16, 16))
+            results.write_frame(dataclasses.replace(black_frame(i), image=image), render)
+        versions = dict(run.versions) if stages == "all" else {}
+        said = results.write_report(run.record, dict(run.metrics), scores, versions, Keyframes(), [])
+    assert (run.config.output / "config.yaml").is_file()
+    if stages == "all":
+        assert said is None
+        page = Page((run.config.output / "report.html").read_text(encoding="utf-8"))
+        assert len(page.embedded("pictures", "jpeg")) == 3 * 6
+    else:
+        assert said.startswith("report.html could not be made: IndexError") and "\n" not in said
+        assert not (run.config.output / "report.html").exists()
