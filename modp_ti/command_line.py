@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 import traceback
@@ -81,7 +82,7 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
     """
     result = Outcome()
     try:
-        with redirect_stdout(sys.stderr) if as_json else nullcontext():
+        with _to_standard_error() if as_json else nullcontext():
             yield result
     except InputError as error:
         _end(BAD_INPUT, " ".join(str(error).split()), as_json)
@@ -96,6 +97,24 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
         typer.echo(result.text)
     if result.code:
         raise typer.Exit(result.code)
+
+
+@contextmanager
+def _to_standard_error() -> Iterator[None]:
+    """Send what is printed to standard output there, by libraries that are not Python's too."""
+    if sys.stdout is not sys.__stdout__:  # a caller in this process takes what is printed
+        with redirect_stdout(sys.stderr):
+            yield
+        return
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _end(code: int, message: str, as_json: bool) -> None:
