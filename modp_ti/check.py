@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from modp_ti.command_line import AsJson, Overrides, Quiet, examples, outcome, progress_console, standalone
 from modp_ti.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,34 +18,38 @@ if TYPE_CHECKING:
     from modp_ti.settings import SceneConfig
     from modp_ti.trackers import Tracker
 
-__all__ = ["check", "inspect_scene"]
+__all__ = ["EXAMPLES", "check", "inspect_scene"]
+
+EXAMPLES = examples(
+    "modp-ti check scene.yaml",
+    "modp-ti check scene.yaml --quiet && modp-ti run scene.yaml",
+    "modp-ti check scene.yaml --json > check.json",
+)
 
 
 def check(
     scene: Annotated[Path, typer.Argument(help="scene file (YAML); its paths are relative to it")],
-    as_json: Annotated[bool, typer.Option("--json", help="print the findings as JSON")] = False,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="overrides a key, for example --set source.scale=0.5"),
-    ] = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
     """Look a scene's input over without mapping it. Exit code: 0 fine, 1 with warnings, 2 unusable."""
-    # Imported here: asking for help must not wait for the readers.
-    from rich.console import Console
+    with outcome(as_json) as result:
+        # Imported here: asking for help must not wait for the readers.
+        from rich.console import Console
 
-    from modp_ti.config import load_scene
-    from modp_ti.inspection import report as reports
-    from modp_ti.inspection.finding import Finding, Severity, verdict
+        from modp_ti.config import load_scene
+        from modp_ti.inspection import report as reports
+        from modp_ti.inspection.finding import Finding, Severity, verdict
 
-    try:
-        report = inspect_scene(load_scene(scene, set_ or []), Console(stderr=True))
-    except InputError as error:
-        report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", " ".join(str(error).split()))])
-    if as_json:
-        typer.echo(json.dumps(reports.as_json(report), indent=2))
-    else:
-        reports.print_report(report, Console())
-    raise typer.Exit(verdict(report.findings)[1])
+        try:
+            report = inspect_scene(load_scene(scene, set_ or []), progress_console(quiet))
+        except InputError as error:
+            report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", " ".join(str(error).split()))])
+        result.code = verdict(report.findings)[1]
+        result.data = reports.as_json(report)
+        if not as_json:
+            reports.print_report(report, Console())
 
 
 def inspect_scene(config: SceneConfig, console: Console) -> Report:
@@ -77,7 +81,8 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
             seen = survey(chain([first], frames), total, lambda _: line.frame(None))
         finally:
             line.stop()
-        geometry, scale = measure_geometry(seen), measure_scale(seen.frames)
+        with line.working("comparing conventions"):
+            geometry, scale = measure_geometry(seen), measure_scale(seen.frames)
         findings = [
             *judge_geometry(geometry),
             *judge_sequence(seen.frames),
@@ -107,6 +112,4 @@ def _lens(tracker: Tracker) -> str:
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(check)
-    app()
+    standalone(check, EXAMPLES)

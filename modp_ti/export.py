@@ -8,9 +8,16 @@ from typing import Annotated
 
 import typer
 
-from modp_ti.command_line import Device, in_one_line
+from modp_ti.command_line import AsJson, Device, Quiet, examples, outcome, progress_console
 
-__all__ = ["export"]
+__all__ = ["EXAMPLES", "export"]
+
+EXAMPLES = examples(
+    "modp-ti export out/room --format mesh   (out/room/mesh.ply)",
+    "modp-ti export out/room --format mesh -o room.glb   (for browsers)",
+    "modp-ti export out/room --format spz   (splats, a tenth of the size)",
+    "modp-ti export out/room --format nerfstudio -o data/room",
+)
 
 
 class Format(str, Enum):
@@ -46,17 +53,20 @@ def export(
         float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
     ] = None,
     device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a finished map as points, mesh, compressed splats, data set or video."""
-    with in_one_line():
+    with outcome(as_json) as result:
         # Imported here: asking for help must not wait for the compiler and the readers.
-        from rich.console import Console
-
         from modp_ti.playback.export_map import ExportOptions, export_map
         from modp_ti.playback.finished_run import open_run
         from modp_ti.progress import ProgressLine
 
         options = ExportOptions(voxel or None, device.value)
-        line = ProgressLine(Console(stderr=True))
-        target = export_map(open_run(out), format.value, output, options, line)
-    typer.echo(f"written to {target}")
+        line = ProgressLine(progress_console(quiet))
+        with line.working("reading the run"):
+            run = open_run(out)
+        target = export_map(run, format.value, output, options, line)
+        result.text = f"written to {target}"
+        result.data = {"output": str(target.absolute()), "format": format.value}

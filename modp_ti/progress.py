@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pipelines.mapping import FrameReport
+if TYPE_CHECKING:
+    from pipelines.mapping import FrameReport
 
 __all__ = ["ProgressLine"]
 
@@ -79,6 +80,13 @@ class ProgressLine:
     def optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Show a step of offline optimisation that is done."""
         self._update(completed=step, state=f"{gaussians:,} Gaussians  {psnr:.2f} dB")
+
+    def start_evaluating(self, renders: int) -> None:
+        self._begin("evaluating the saved map", renders)
+
+    def evaluated(self) -> None:
+        """Show that one more frame has been compared with a map."""
+        self._update(advance=1)
 
     def stop(self) -> None:
         """End the line, leaving its last state on the screen."""

@@ -8,9 +8,19 @@ from typing import Annotated
 
 import typer
 
-from modp_ti.command_line import Device, in_one_line, picture_size
+from modp_ti.command_line import AsJson, Device, Quiet, examples, outcome, picture_size, progress_console
 
-__all__ = ["render"]
+__all__ = ["EXAMPLES", "render"]
+
+EXAMPLES = examples(
+    "modp-ti render out/room   (the recorded path, out/room/recorded.mp4)",
+    "modp-ti render out/room --path orbit --size 1280x720 --fov 70 -o orbit.webm",
+    "modp-ti render out/room --show depth -o depth/   (float32 TIFF files)",
+    "modp-ti render out/room --path mine.txt -o pictures/   (poses of your own)",
+)
+
+# As modp_ti.playback.flight has them, which needs the compiler.
+PATH_NAMES = ("recorded", "smoothed", "orbit")
 
 
 class Shown(str, Enum):
@@ -34,7 +44,11 @@ def render(
     ] = None,
     path: Annotated[
         str,
-        typer.Option(metavar="PATH", help="`recorded`, `smoothed`, `orbit`, or a trajectory file in TUM's format"),
+        typer.Option(
+            metavar="PATH",
+            help="`recorded`, `smoothed`, `orbit`, or a trajectory file in TUM's format",
+            autocompletion=lambda incomplete: [name for name in PATH_NAMES if name.startswith(incomplete)],
+        ),
     ] = "recorded",
     show: Annotated[Shown, typer.Option(help="in a folder, depth is float32 TIFF in scene units")] = Shown.colour,
     size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="of the pictures; empty: as mapped")] = None,
@@ -51,19 +65,22 @@ def render(
         float | None, typer.Option(min=1, max=120, help="frames per second of a video; empty: as recorded, else 30")
     ] = None,
     device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
     """Render a finished map along the recorded path, a smoothed one, an orbit, or any path of your own."""
-    with in_one_line():
+    with outcome(as_json) as result:
         # Imported here: asking for help must not wait for the compiler and the readers.
-        from rich.console import Console
-
         from modp_ti.playback.finished_run import open_run
         from modp_ti.playback.flight import film, plan_flight
         from modp_ti.progress import ProgressLine
 
-        run = open_run(out)
+        line = ProgressLine(progress_console(quiet))
+        with line.working("reading the run"):
+            run = open_run(out)
         flight = plan_flight(run, path, picture_size(size) if size is not None else None, fov, frames, fps, smooth)
         depth = show is Shown.depth
         target = output or run.folder / f"{Path(path).stem}{'-depth' if depth else ''}.mp4"
-        film(run, flight, target, depth, device.value, ProgressLine(Console(stderr=True)))
-    typer.echo(f"written to {target}")
+        film(run, flight, target, depth, device.value, line)
+        result.text = f"written to {target}"
+        result.data = {"output": str(target.absolute()), "pictures": len(flight.poses)}

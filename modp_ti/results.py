@@ -21,6 +21,9 @@ from modp_ti.exports.colmap_model import image_names, write_image
 from modp_ti.exports.map_folder import appearing, write_map
 from modp_ti.exports.scores_csv import write_scores
 from modp_ti.exports.splats_ply import read_splats
+from modp_ti.report.page import ReportedRun, write_report
+from modp_ti.report.pictures import Album
+from modp_ti.report.record import RunRecord
 from modp_ti.settings import SceneConfig
 
 __all__ = ["Results", "metrics_of"]
@@ -37,6 +40,7 @@ class Results:
         self.config = config
         self.frames = frames
         self._names = image_names(frames.name, config.export.images)
+        self._album = Album.of(frames.held_out)
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -55,16 +59,54 @@ class Results:
         return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
 
     def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
-        """Write the pictures of a frame: its image where asked for, and beside the map (H, W, 3) where held out."""
+        """Write the pictures of a frame: its image where asked for, and beside the map (H, W, 3) where held out.
+
+        Those that the report may show are kept for it.
+        """
         if self.config.export.images:
             write_image(self.folder / "colmap", self._names[frame.index], frame)
         if frame.held_out:
             _write_pair(self.folder / "renders" / f"{frame.index:06d}.png", frame.image, render)
+        if self.config.export.report:
+            self._album.keep(frame.index, frame.image, render)
 
     def write_scores(self, scores: list[FrameScore], metrics: dict) -> None:
         """Write the scores of all frames, and the run's figures."""
         write_scores(self.folder / "scores.csv", scores)
         (self.folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+
+    def write_report(
+        self,
+        record: RunRecord,
+        metrics: dict,
+        scores: list[FrameScore],
+        versions: dict[str, MapVersion],
+        keyframes: KeyframeStore,
+        truth: list[NDArray[np.float64]],
+    ) -> str | None:
+        """Write `report.html`; None, or in one line why there is none.
+
+        truth: true T_camera_world (4, 4) of all frames, or none.
+        """
+        mapped = {keyframe.index for keyframe in keyframes}
+        try:
+            last = [score for score in scores if score.stage == list(versions)[-1]]
+            run = ReportedRun(
+                config=self.config,
+                record=record,
+                metrics=metrics,
+                scores=scores,
+                versions=versions,
+                tracked=self.frames.T_tracked,
+                truth=truth,
+                keyframes=[place for place, index in enumerate(self.frames.index) if index in mapped],
+                scene_depth=keyframes.scene_depth,
+                comparisons=self._album.comparisons(last, self.folder / "renders"),
+            )
+            write_report(self.folder / "report.html", run)
+        except Exception as error:  # whatever it is, the map is finished and must not be lost
+            return f"report.html could not be made: {error!r}"
+        return None
 
 
 def metrics_of(

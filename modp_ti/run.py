@@ -2,32 +2,50 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from modp_ti.command_line import in_one_line
+from modp_ti.command_line import (
+    AsJson,
+    Overrides,
+    Quiet,
+    examples,
+    outcome,
+    progress_console,
+    standalone,
+)
 from modp_ti.errors import InputError
 
-__all__ = ["run"]
+__all__ = ["EXAMPLES", "run"]
+
+EXAMPLES = examples(
+    "modp-ti run scene.yaml",
+    "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
+    "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
+    "modp-ti run scene.yaml --quiet --json > result.json",
+)
 
 
 def run(
     scene: Annotated[Path, typer.Argument(help="scene file (YAML); its paths are relative to it")],
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="overrides a key, for example --set source.scale=0.5"),
-    ] = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
-    """Map a posed sequence while its frames arrive, and write splats, poses, metrics and pictures."""
-    with in_one_line():
-        folder = _run(scene, [*(set_ or []), *(more or [])])
-    typer.echo(f"written to {folder}")
+    """Map a posed sequence while its frames arrive, and write splats, poses, metrics, pictures and a report."""
+    with outcome(as_json) as result:
+        folder = _run(scene, [*(set_ or []), *(more or [])], quiet)
+        result.text = f"written to {folder}"
+        if as_json:
+            metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+            result.data = {"output": str(folder), "metrics": metrics}
 
 
-def _run(scene: Path, overrides: list[str]) -> Path:
+def _run(scene: Path, overrides: list[str], quiet: bool) -> Path:
     # Imported here: asking for help must not wait for the compiler and the readers.
     from modp_ti.config import load_scene
 
@@ -35,14 +53,10 @@ def _run(scene: Path, overrides: list[str]) -> Path:
     if config.output.exists() and not config.output.is_dir():
         raise InputError(f"{config.output}: output must be a folder, this is a file")
 
-    from rich.console import Console
-
     from modp_ti.session import run_scene
 
-    return run_scene(config, Console())
+    return run_scene(config, progress_console(quiet))
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(run)
-    app()
+    standalone(run, EXAMPLES)

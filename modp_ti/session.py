@@ -23,6 +23,7 @@ from modp_ti.lpips import open_lpips
 from modp_ti.mapper import Mapper
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
+from modp_ti.report.record import RunRecord
 from modp_ti.results import Results, metrics_of
 from modp_ti.settings import SceneConfig
 from modp_ti.trackers import close, events, frame_count, may_read_ahead, open_tracker
@@ -44,12 +45,14 @@ def run_scene(config: SceneConfig, console: Console | None = None) -> Path:
 def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     """`run_scene`; held: takes what is to be closed at its end, however it ends."""
     started = time.perf_counter()
+    record = RunRecord()
     line = ProgressLine(console)
     try:
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
-    console.print(f"device: {describe(backend)}", highlight=False, soft_wrap=True)
+    record.device = describe(backend)
+    console.print(f"device: {record.device}", highlight=False, soft_wrap=True)
     tick = time.perf_counter()
     tracker = open_tracker(config, line.prepare)
     held.callback(close, tracker)
@@ -63,7 +66,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         prepared = time.perf_counter() - tick
         lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
         notes = [*tracker.notes, *([no_lpips] if no_lpips else [])]
-        _say(notes, console)
+        _say(notes, console, record)
 
         mapper = build_mapper(config, first.camera)
         watch = mapper.pipeline.stopwatch
@@ -72,9 +75,10 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
             mapper.pipeline.compile()
         tick = time.perf_counter()
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
-        _map(mapper, chain([first], _timed(arriving, watch)), config, line)
+        _map(mapper, chain([first], _timed(arriving, watch)), config, line, record)
         mapping_seconds = time.perf_counter() - tick
-    _say([note for note in tracker.notes if note not in notes], console)  # how a live tracker's frames ended
+    # How a live tracker's frames ended.
+    _say([note for note in tracker.notes if note not in notes], console, record)
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     frames, keyframes = mapper.frames, mapper.pipeline.keyframes
     if len(keyframes) == 0:
@@ -85,22 +89,32 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     versions = {config.mode: mapper.version()}
     if config.refine.steps and config.mode != "offline":
         line.start_refining(config.refine.steps)
-        mapper.refine(config.refine.steps, config.refine, line.refined)
+
+        def refined(step: int, psnr: float) -> None:
+            line.refined(step, psnr)
+            record.refined(step, psnr)
+
+        mapper.refine(config.refine.steps, config.refine, refined)
         line.stop()
         versions["refined"] = mapper.version()
     last = list(versions)[-1]
     results = Results(config, frames)
     with results.writing():
         # What is scored is what a reader of the file gets.
-        versions[last] = results.write_map(versions[last], keyframes, mapper.pipeline.near)
+        with line.working("writing the map"):
+            versions[last] = results.write_map(versions[last], keyframes, mapper.pipeline.near)
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+            line.evaluated()
             if stage == last:
                 results.write_frame(frame, render)
 
-        with watch.measure("evaluate"), line.working("evaluating the saved map"):
-            with FramesAhead(tracker, ahead) as again:
+        line.start_evaluating(len(frames) * len(versions))
+        try:
+            with watch.measure("evaluate"), FramesAhead(tracker, ahead) as again:
                 scores = evaluate(mapper.pipeline, again, versions, lpips, keep)
+        finally:
+            line.stop()
         ground_truth = getattr(tracker, "ground_truth", list)()
         metrics = {
             "keyframes": len(keyframes),
@@ -115,13 +129,19 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
             **trajectory_errors(frames.T_tracked, versions[last].trajectory, ground_truth),
         }
         results.write_scores(scores, metrics)
+        if config.export.report:
+            with line.working("writing the report"):
+                problem = results.write_report(record, metrics, scores, versions, keyframes, ground_truth)
+            _say([problem] if problem else [], console, record)
     line.summary(metrics)
     return config.output
 
 
-def _say(notes: Iterable[str], console: Console) -> None:
+def _say(notes: Iterable[str], console: Console, record: RunRecord) -> None:
+    """Show remarks, and keep them for the report."""
     for note in notes:
-        console.print(f"note: {note}", highlight=False, soft_wrap=True)
+        console.print(f"note: {note}", highlight=False, soft_wrap=True, markup=False)
+        record.notes.append(note)
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
@@ -134,10 +154,15 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
 
 
 def _map(
-    mapper: Mapper, arriving: Iterable[TrackedFrame | PoseCorrection], config: SceneConfig, line: ProgressLine
+    mapper: Mapper,
+    arriving: Iterable[TrackedFrame | PoseCorrection],
+    config: SceneConfig,
+    line: ProgressLine,
+    record: RunRecord,
 ) -> None:
     """Take all frames and corrections in, in their order, and finish the map."""
     size = None
+    record.begin()
     try:
         for frame in arriving:
             if isinstance(frame, PoseCorrection):
@@ -149,10 +174,17 @@ def _map(
                     f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
                     "all images of a scene must have one size"
                 )
-            line.frame(mapper.add(frame))
+            report = mapper.add(frame)
+            record.frame(frame.index, report)
+            line.frame(report)
         if config.mode == "offline":
             line.start_offline(config.offline.steps)
-            mapper.finish(line.optimised)
+
+            def optimised(step: int, gaussians: int, psnr: float) -> None:
+                line.optimised(step, gaussians, psnr)
+                record.optimised(step, gaussians, psnr)
+
+            mapper.finish(optimised)
         else:
             mapper.finish()
     finally:

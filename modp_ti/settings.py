@@ -254,6 +254,9 @@ class ExportSettings(StrictModel):
         description="write the undistorted images, as mapped, into `colmap/images`: to go on with elsewhere, since the "
         "cameras of `colmap/` are theirs",
     )
+    report: bool = Field(
+        True, description="write `report.html`: figures, curves, pictures and settings of the run on one page"
+    )
 
 
 class SceneConfig(StrictModel):

@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modp_ti.command_line import in_one_line, picture_size
+from modp_ti.command_line import (
+    AsJson,
+    Overrides,
+    Quiet,
+    examples,
+    outcome,
+    picture_size,
+    progress_console,
+    standalone,
+)
 from modp_ti.errors import InputError
 
 if TYPE_CHECKING:
     from modp_ti.settings import SceneConfig
 
-__all__ = ["compile_size", "warmup"]
+__all__ = ["EXAMPLES", "compile_size", "warmup"]
+
+EXAMPLES = examples(
+    "modp-ti warmup scene.yaml",
+    "modp-ti warmup --size 640x480 --size 1280x720",
+)
 
 
 def warmup(
@@ -25,17 +38,19 @@ def warmup(
     size: Annotated[
         list[str] | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="of the frames as mapped; repeatable")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="overrides a key of the scene file"),
-    ] = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compile all kernels of a run now, so that the first run starts as fast as the later ones."""
-    with in_one_line():
-        _warmup(scene, size or [], set_ or [], typer.echo)
+    with outcome(as_json) as result:
+        compiled = _warmup(scene, size or [], set_ or [], quiet)
+        result.text = "\n".join("{width}x{height} on {backend}: {seconds} s".format(**one) for one in compiled)
+        result.data = {"compiled": compiled}
 
 
-def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], say: Callable[[str], None]) -> None:
+def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: bool) -> list[dict[str, Any]]:
+    """What was compiled: width, height, backend and seconds of each."""
     if scene is None and overrides:
         raise InputError("--set changes keys of a scene file: name one")
     if scene is None and not sizes:
@@ -50,10 +65,16 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], say: Cal
         config = SceneConfig(tracker=TrackerSettings(kind="synthetic"), output=Path())
     else:
         config = load_scene(scene, overrides)
+    from modp_ti.progress import ProgressLine
+
+    line, compiled = ProgressLine(progress_console(quiet)), []
     for size in wanted:
         start = time.perf_counter()
-        backend, width, height = compile_size(config, size)
-        say(f"{width}x{height} on {backend}: {time.perf_counter() - start:.1f} s")
+        with line.working("compiling kernels" if size is None else f"compiling kernels for {size[0]}x{size[1]}"):
+            backend, width, height = compile_size(config, size)
+        seconds = round(time.perf_counter() - start, 1)
+        compiled.append({"width": width, "height": height, "backend": backend, "seconds": seconds})
+    return compiled
 
 
 def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str, int, int]:
@@ -87,6 +108,4 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(warmup)
-    app()
+    standalone(warmup, EXAMPLES)

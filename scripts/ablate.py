@@ -7,7 +7,6 @@ folder, and used again as long as their settings are the same.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -50,7 +49,11 @@ TABLES = (
 
 def main() -> None:
     """Run what is missing, then print and write the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/ablate desk.yaml fox.yaml -o out/ablation",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("scenes", nargs="+", metavar="scene.yaml", help="scene files, one or several")
     parser.add_argument("-o", "--output", required=True, type=Path, help="folder of runs, ablation.md, ablation.json")
     parser.add_argument(
@@ -69,7 +72,7 @@ def main() -> None:
         jobs = plan(scenes, arguments.output, common, arguments.tracker, arguments.only or VARIANTS)
         metrics = execute([job for of_scene in jobs.values() for job in of_scene.values()], arguments.fresh)
     except InputError as error:
-        sys.exit(f"error: {error}")
+        parser.exit(2, f"error: {error}\n")
     rest = iter(metrics)
     figures = {
         scene: {variant: summary(next(rest), job.folder) for variant, job in of_scene.items()}

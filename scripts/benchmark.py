@@ -28,7 +28,11 @@ DEMO = Path(__file__).resolve().parent.parent / "demo" / "scene.yaml"
 
 def main() -> None:
     """Measure, and print the tables; exit code 2 for bad input."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/benchmark --quick -o out/benchmark",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="also write benchmark.md and .json there")
     parser.add_argument("--quick", action="store_true", help="the first size only; no growth, no voxels, no whole run")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
@@ -45,8 +49,7 @@ def main() -> None:
     try:
         figures = collect(arguments)
     except InputError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+        parser.exit(2, f"error: {' '.join(str(error).split())}\n")
     text = report(figures)
     if arguments.output is None:
         print(text)

@@ -7,7 +7,6 @@ Finished runs are kept in the output folder, and used again as long as their set
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,7 +48,11 @@ BREAKDOWN = {
 
 def main() -> None:
     """Run what is missing, then print and write the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/compare desk.yaml -o out/comparison --steps 1000 3000",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("scenes", nargs="+", metavar="scene.yaml", help="scene files, one or several")
     parser.add_argument(
         "-o", "--output", required=True, type=Path, help="folder of the runs, comparison.md, comparison.json"
@@ -88,7 +91,7 @@ def main() -> None:
                 job = offline_job(scene, file, arguments.output / scene, renders, common)
                 figures[scene][OFFLINE] = offline_row(execute([job], arguments.fresh)[0])
     except InputError as error:
-        sys.exit(f"error: {error}")
+        parser.exit(2, f"error: {error}\n")
     text = report(figures, breakdown)
     write_report(arguments.output, "comparison", text, {"quality": figures, "breakdown_percent": breakdown})
 

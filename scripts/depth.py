@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from fields.backend import initialise
 from fields.camera import PinholeCamera
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import load_scene
+from modp_ti.errors import InputError
 from modp_ti.trackers import open_tracker
 from pipelines.depth import DepthEstimate, DepthEstimator, FusedDepth, GaussianProcessDepth
 from pipelines.mapping import OnlineMapper
@@ -72,7 +74,11 @@ def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
 
 def main() -> None:
     """Map, compare, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/depth redkitchen.yaml data/redkitchen/depth --frames 200",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("scene", type=Path, help="scene.yaml")
     parser.add_argument("sensor", type=Path, help="folder of depth images")
     parser.add_argument("--focal", type=float, default=585.0, help="of the depth camera [px] (default 585)")
@@ -81,16 +87,19 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=10**9, help="map only so many")
     parser.add_argument("--set", action="append", default=[], help="override a setting, key=value")
     arguments = parser.parse_args()
-    config = load_scene(arguments.scene, arguments.set)
-    initialise(config.device, config.threads, config.seed)
-    frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
+    try:
+        config = load_scene(arguments.scene, arguments.set)
+        initialise(config.device, config.threads, config.seed)
+        frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
+    except InputError as error:
+        parser.exit(2, f"error: {error}\n")
     mapper = OnlineMapper(config.mapping, frames[0].camera.width, frames[0].camera.height, config.seed)
     constant = GaussianProcessDepth(config.mapping.depth, np.random.default_rng(config.seed))
     mapper.depth = recorder = Recorder(mapper.depth, constant)
     for n, frame in enumerate(frames):
         mapper.process(frame)
-        print(f"\r{n + 1} of {len(frames)} frames", end="", flush=True)
-    print()
+        print(f"\r{n + 1} of {len(frames)} frames", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
 
     by_index = {f.index: f for f in frames}
     truth, ratios = {}, []

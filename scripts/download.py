@@ -11,7 +11,6 @@ import hashlib
 import os
 import shutil
 import stat
-import sys
 import tarfile
 import urllib.error
 import urllib.request
@@ -245,7 +244,11 @@ def fetch(name: str, folder: Path, say: Callable[[str], None], sequences: dict[s
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/download fr1/desk -o data",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(SEQUENCES))
     parser.add_argument("-o", "--output", type=Path, default=Path("data"), help="folder of the sequences (data)")
     arguments = parser.parse_args()
@@ -260,7 +263,7 @@ def main() -> None:
         for name in arguments.names:
             fetch(name, arguments.output, lambda line: print(line, flush=True))
     except DownloadError as error:
-        sys.exit(f"error: {error}")
+        parser.exit(2, f"error: {error}\n")
 
 
 if __name__ == "__main__":

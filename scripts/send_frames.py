@@ -9,7 +9,6 @@ import argparse
 import os
 import socket
 import struct
-import sys
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -224,7 +223,11 @@ def _points(frame) -> tuple[NDArray, NDArray, NDArray]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/send_frames scene.yaml --to 127.0.0.1:7007 --late 3",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("scene", type=Path, help="scene file whose frames are sent, whatever its tracker")
     parser.add_argument("--to", default="127.0.0.1:7007", metavar="ADDRESS", help="host:port, or a Unix socket's path")
     parser.add_argument("--late", type=int, default=0, metavar="N", help="send each pose and its points N frames late")
@@ -237,7 +240,7 @@ def main() -> None:
     try:
         taken = play(arguments.scene, arguments.set, arguments.to, arguments.wait, arguments.late, arguments.rate)
     except (DoorError, InputError) as error:
-        sys.exit(f"error: {error}")
+        parser.exit(2, f"error: {error}\n")
     print(f"{taken} frames taken")
 
 

@@ -111,8 +111,9 @@ def _farthest(run: FinishedRun) -> float:
 
 def _surface(run: FinishedRun, device: str, line: ProgressLine) -> Iterator[SurfaceView]:
     """What the frames that were mapped see of the map."""
-    gaussians = run.gaussians
-    start_device(device)
+    with line.working("loading the map"):
+        gaussians = run.gaussians
+        start_device(device)
     mapped = run.mapped
     chosen = [
         mapped[i * len(mapped) // min(len(mapped), SURFACE_VIEWS)] for i in range(min(len(mapped), SURFACE_VIEWS))

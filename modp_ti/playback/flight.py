@@ -87,10 +87,11 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
     """
     require_writable(output)
     flight = flight.even() if is_video(output) else flight
-    gaussians = run.gaussians
-    start_device(device)
-    width, height = (max(getattr(c, side) for c in flight.cameras) for side in ("width", "height"))
-    renderer = MapRenderer(gaussians, width, height, run.record.near)
+    with line.working("loading the map"):
+        gaussians = run.gaussians
+        start_device(device)
+        width, height = (max(getattr(c, side) for c in flight.cameras) for side in ("width", "height"))
+        renderer = MapRenderer(gaussians, width, height, run.record.near)
 
     def views() -> Iterator[RenderedView]:
         pairs = list(zip(flight.cameras, flight.poses, strict=True))

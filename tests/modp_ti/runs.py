@@ -13,6 +13,7 @@ FILES = [
     "frames.json",
     "metrics.json",
     "renders",
+    "report.html",
     "scores.csv",
     "splats.ply",
     "trajectory.txt",
@@ -32,5 +33,6 @@ def finished_run(folder: Path, scene: str, said: str) -> Path:
     file.write_text(scene)
     result = run(file)
     assert result.returncode == 0, result.stderr
-    assert said in result.stdout
+    assert said in result.stderr
+    assert result.stdout == f"written to {folder.resolve() / 'out'}\n"
     return folder / "out"

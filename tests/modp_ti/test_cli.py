@@ -1,7 +1,12 @@
-"""The command line: one job, two names, quick help; bad input gets one line, exit code 2 and no files."""
+"""The command line: one job, two names, quick help and completion; what is printed where, and the exit codes."""
 
 from __future__ import annotations
 
+import json
+import os
+import shlex
+import shutil
+import signal
 import subprocess
 import sys
 import types
@@ -11,7 +16,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from modp_ti import cli
+import modp_ti
+from modp_ti import cli, command_line
 from modp_ti import run as run_module
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -27,7 +33,10 @@ def session(monkeypatch):
 
         configs.append(config)
         list(open_tracker(config))
+        console.print("3 of 7 mapped")
+        print("printed by a library")
         config.output.mkdir(parents=True)
+        (config.output / "metrics.json").write_text('{"frames": 7}')
         return config.output
 
     module = types.ModuleType("modp_ti.session")
@@ -73,7 +82,7 @@ def failure(scene: Path, *arguments: str) -> str:
 def test_run_maps_the_scene_and_says_where_the_result_lies(scene, session):
     result = invoke(scene)
     assert result.exit_code == 0, result.output
-    assert result.stdout == f"written to {(scene.parent / 'out').resolve()}\n"
+    assert result.stdout == f"printed by a library\nwritten to {(scene.parent / 'out').resolve()}\n"
     assert session[0].source.path == (scene.parent / "images").resolve()
 
 
@@ -158,3 +167,186 @@ def test_readers_need_no_compiler_and_no_torch(scene):
         "print([name for name in ('taichi', 'torch', 'open3d') if name in sys.modules])"
     )
     assert python(code).stdout.split("\n")[:2] == ["7", "[]"]
+
+
+def test_a_run_says_progress_on_one_channel_and_its_result_on_the_other(scene, session):
+    shown = invoke(scene)
+    assert "3 of 7 mapped" in shown.stderr and "3 of 7 mapped" not in shown.stdout
+    shutil.rmtree(scene.parent / "out")
+    quiet = invoke(scene, "--quiet")
+    assert (quiet.stdout, quiet.stderr) == (shown.stdout, "")
+
+
+def test_json_is_one_object_with_what_a_run_has_measured(scene, session):
+    result = invoke(scene, "--json")
+    assert json.loads(result.stdout) == {
+        "exit_code": 0,
+        "output": str((scene.parent / "out").resolve()),
+        "metrics": {"frames": 7},
+    }
+    assert "printed by a library" in result.stderr
+
+
+@pytest.mark.parametrize("quiet", [[], ["--quiet"]])
+def test_errors_are_said_to_people_and_to_programs_whatever_else_is_not(tmp_path, quiet):
+    for command in (["run", "gone.yaml"], ["warmup", "gone.yaml"], ["render", "gone"], ["export", "gone", "-f", "spz"]):
+        result = CliRunner().invoke(cli.app, [*command, "--json", *quiet])
+        data = json.loads(result.stdout)
+        assert (result.exit_code, data["exit_code"]) == (2, 2)
+        assert list(data) == ["exit_code", "error"] and "gone" in data["error"]
+        assert result.stderr == f"error: {data['error']}\n"
+    result = CliRunner().invoke(cli.app, ["check", "gone.yaml", "--json", *quiet])
+    data = json.loads(result.stdout)
+    assert (result.exit_code, data["exit_code"], data["verdict"]) == (2, 2, "unusable")
+
+
+def failing_with(error: BaseException, monkeypatch) -> None:
+    module = types.ModuleType("modp_ti.session")
+
+    def run_scene(config, console):
+        raise error
+
+    module.run_scene = run_scene
+    monkeypatch.setitem(sys.modules, "modp_ti.session", module)
+
+
+def test_a_fault_of_the_program_has_a_traceback_and_a_code_of_its_own(scene, monkeypatch):
+    failing_with(ZeroDivisionError("of all things"), monkeypatch)
+    result = CliRunner().invoke(cli.app, ["run", str(scene), "--json"])
+    assert (result.exit_code, json.loads(result.stdout)["exit_code"]) == (3, 3)
+    assert "Traceback" in result.stderr and "in run_scene" in result.stderr
+    assert "a fault of the program" in result.stderr.splitlines()[-1]
+
+
+def test_an_interrupted_command_says_so_and_ends_with_130(scene, monkeypatch):
+    failing_with(KeyboardInterrupt(), monkeypatch)
+    result = CliRunner().invoke(cli.app, ["run", str(scene)])
+    assert (result.exit_code, result.stdout, result.stderr) == (130, "", "error: interrupted\n")
+
+
+def test_ctrl_c_ends_a_real_process_with_130_and_leaves_nothing(scene):
+    code = (
+        "import os, sys, types, time; sys.argv[0] = 'modp-ti'; module = types.ModuleType('modp_ti.session')\n"
+        "def run_scene(config, console):\n"
+        "    config.output.with_name('out.partial').mkdir()\n"
+        "    try: os.write(1, b'begun\\n'); time.sleep(60)\n"
+        "    finally: config.output.with_name('out.partial').rmdir()\n"
+        "module.run_scene = run_scene; sys.modules['modp_ti.session'] = module\n"
+        "from modp_ti.cli import app; app()"
+    )
+    command = [sys.executable, "-c", code, "run", str(scene), "--json"]
+    process = subprocess.Popen(command, cwd=PROJECT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr.readline() == "begun\n"  # what a library writes past Python goes there as well
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert json.loads(out) == {"exit_code": 130, "error": "interrupted"}
+    assert err == "error: interrupted\n"
+    assert sorted(p.name for p in scene.parent.iterdir()) == ["images", "scene.yaml", "sparse"]
+
+
+@pytest.mark.parametrize("arguments", [["run"], ["run", "a.yaml", "--nonsense"], ["export", "out"], ["nonsense"]])
+def test_wrong_options_end_with_two(arguments):
+    result = CliRunner().invoke(cli.app, arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "Usage:" in result.stderr
+
+
+COMMANDS = ["run", "check", "render", "export", "warmup"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_teaches_by_examples_and_all_commands_can_be_quiet_and_speak_json(command):
+    text = CliRunner().invoke(cli.app, [command, "--help"], terminal_width=200).stdout
+    assert "--quiet" in text and "--json" in text
+    lines = [line.strip() for line in text.partition("Examples:")[2].splitlines() if line.strip()]
+    assert len(lines) > 1 and all(line.startswith(f"modp-ti {command} ") for line in lines)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_examples_are_calls_that_the_command_takes(command):
+    epilog = next(info.epilog for info in cli.app.registered_commands if info.name == command)
+    click_app = typer.main.get_command(cli.app)
+    calls = [line.split("   (")[0].split(" > ")[0] for line in epilog.splitlines()[1:]]
+    for call in (part for line in calls for part in line.split("&&")):
+        words = shlex.split(call)
+        assert words[0] == "modp-ti"
+        sub = click_app.commands[words[1]]
+        sub.make_context(words[1], words[2:])  # raises for options that it does not have
+
+
+def test_the_page_of_commands_names_every_command_option_and_exit_code():
+    page = (PROJECT / "docs" / "commands.md").read_text()
+    click_app = typer.main.get_command(cli.app)
+    for name, sub in click_app.commands.items():
+        assert f"modp-ti {name} " in page
+        for option in (word for parameter in sub.params for word in parameter.opts if word.startswith("-")):
+            assert f"`{option}" in page or option == "--help", f"{name} {option}"
+    for code in (0, 1, command_line.BAD_INPUT, command_line.FAULT, command_line.INTERRUPTED):
+        assert f"| {code} | " in page
+
+
+def test_version():
+    result = CliRunner().invoke(cli.app, ["--version"])
+    assert (result.exit_code, result.stdout) == (0, f"modp-ti {modp_ti.__version__}\n")
+
+
+def completed(line: str) -> tuple[list[str], str]:
+    """What bash is offered at the end of a line, and the heavy libraries that were loaded for it."""
+    code = (
+        "import sys; sys.argv[0] = 'modp-ti'\n"
+        "from modp_ti.cli import app\n"
+        "try: app()\n"
+        f"finally: print([name for name in {HEAVY_TO_COMPLETE} if name in sys.modules], file=sys.stderr)"
+    )
+    words = line.split(" ")
+    environment = os.environ | {
+        "_MODP_TI_COMPLETE": "complete_bash",
+        "COMP_WORDS": "\n".join(words),
+        "COMP_CWORD": str(len(words) - 1),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=PROJECT, env=environment, capture_output=True, text=True, check=False
+    )
+    return done.stdout.split(), done.stderr.strip()
+
+
+HEAVY_TO_COMPLETE = "('taichi', 'torch', 'open3d', 'pycolmap', 'matplotlib')"
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("modp-ti ", COMMANDS),
+        ("modp-ti run scene.yaml --q", ["--quiet"]),
+        ("modp-ti export out --format sp", ["splat", "spz"]),
+        ("modp-ti render out --path ", ["recorded", "smoothed", "orbit"]),
+        ("modp-ti run scene.yaml --set source.sc", ["source.scale=1.0"]),
+    ],
+)
+def test_the_shell_is_offered_commands_options_and_values_without_waiting(line, offered):
+    assert completed(line) == (offered, "[]")
+
+
+def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):
+    from modp_ti.completion import matching_settings
+    from modp_ti.config import load_scene
+    from modp_ti.config_keys import documented_keys
+    from modp_ti.settings import SceneConfig
+
+    offered = [value for value, _ in matching_settings("")]
+    assert [value.partition("=")[0] for value in offered] == [entry.key for entry in documented_keys(SceneConfig)]
+    defaults = [value for value in offered if not value.endswith("=")]
+    assert len(defaults) > 100
+    usable = [value for value in defaults if not value.startswith(("source.vrs", "tracker.camera"))]
+    loaded = load_scene(scene, usable)
+    assert loaded == load_scene(scene, [])
+
+
+def test_the_completion_of_bash_can_be_had():
+    code = "import sys; sys.argv[0] = 'modp-ti'; from modp_ti.cli import app; app()"
+    environment = os.environ | {"_MODP_TI_COMPLETE": "source_bash"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=PROJECT, env=environment, capture_output=True, text=True, check=True
+    )
+    assert "complete -o default -F _modp_ti_completion modp-ti" in done.stdout

@@ -10,6 +10,7 @@ import pytest
 
 from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory
+from tests.modp_ti.report.made_up_run import Page
 from tests.modp_ti.runs import FILES, finished_run, run
 
 SCENE = """
@@ -46,6 +47,12 @@ def test_the_metrics_say_what_happened(folder: Path) -> None:
     assert metrics["seconds"]["refine"] == metrics["seconds"]["depth"] == 0
 
 
+def test_the_report_shows_how_the_map_was_optimised(folder: Path) -> None:
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    assert len(page.curves()["step-gaussians"][0]) == 90
+    assert "Offline optimisation" in page.text and "Post refinement" not in page.text
+
+
 def test_the_splats_have_the_harmonics_of_degree_three(folder: Path) -> None:
     sh = read_splats(folder / "splats.ply")["sh"]
     assert sh.shape == (json.loads((folder / "metrics.json").read_text())["gaussians"], 16, 3)
@@ -62,7 +69,7 @@ def test_the_written_configuration_gives_the_same_map_byte_for_byte(folder: Path
 def test_frames_without_points_are_an_error_of_one_line(tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(SCENE.replace("stop: 9", "stop: 1"))  # only a frame that is held out
-    result = run(scene, "--set", "offline.sh_degree=0")
+    result = run(scene, "--quiet", "--set", "offline.sh_degree=0")
     assert result.returncode == 2
     assert result.stderr.startswith("error: `mode: offline` starts from tracked points: ")
     assert result.stderr.count("\n") == 1

@@ -24,6 +24,7 @@ from modp_ti.exports.trajectory import read_trajectory
 from modp_ti.lpips import open_lpips
 from modp_ti.trackers import open_tracker
 from pipelines.stopwatch import Stopwatch
+from tests.modp_ti.report.made_up_run import Page
 from tests.modp_ti.runs import FILES, finished_run, run
 
 SCENE = """
@@ -94,6 +95,33 @@ def test_the_scores_are_those_of_the_pictures(folder: Path) -> None:
     assert held_out["psnr"] == pytest.approx(np.mean(errors), abs=0.02)
 
 
+def test_the_report_shows_the_figures_and_the_pictures_of_the_run(folder: Path) -> None:
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    metrics = json.loads((folder / "metrics.json").read_text())
+    rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
+    for stage in ("online", "refined"):
+        held_out, every = metrics[stage]["held_out"], metrics[stage]["all"]
+        assert rows[stage][0] == f"{held_out['psnr']:.2f}" and rows[stage][4] == f"{every['psnr']:.2f}"
+    times = {row[0]: row[2] for row in page.tables["time"]}
+    assert times["total"] == f"{metrics['seconds']['total']:.1f} s"
+    assert any(line.startswith("embedded demo room: 9 frames") for line in page.text), "what the run remarked"
+    assert ["tracker.kind", '"synthetic"', "none"] in page.tables["settings"]
+    growth = page.curves()["gaussians"][0]
+    assert len(growth) == 9 and growth[0, 1] > growth[-1, 1], "the map grew"
+    assert len(page.curves()["step-psnr"][0]) == 5
+
+    pictures = [cv2.imdecode(np.frombuffer(data, np.uint8), 1) for data in page.embedded("pictures", "jpeg")]
+    by_psnr = sorted(
+        (score.psnr, score.index)
+        for score in read_scores(folder / "scores.csv")
+        if score.held_out and score.stage == "refined"
+    )
+    assert len(pictures) == 3 * len(by_psnr)
+    for (_, index), frame, render in zip(by_psnr, pictures[::3], pictures[1::3], strict=True):
+        pair = cv2.imread(str(folder / "renders" / f"{index:06d}.png")).astype(float)
+        assert np.abs(np.hstack([frame, render]) - pair).mean() < 6, "as JPEG shows them"
+
+
 def test_every_frame_has_its_scores_in_each_version_of_the_map(folder: Path) -> None:
     scores = read_scores(folder / "scores.csv")
     assert [(score.stage, score.index) for score in scores] == [
@@ -150,16 +178,20 @@ def test_the_trajectory_errors_are_those_of_the_written_and_of_the_tracked_poses
 def again(folder: Path, lpips_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of a second run, from the configuration that the first one wrote, and with LPIPS."""
     output = tmp_path_factory.mktemp("again") / "out"
-    overrides = (f"output={output}", f"evaluation.lpips_weights={lpips_weights}")
+    overrides = (f"output={output}", f"evaluation.lpips_weights={lpips_weights}", "export.report=false")
     result = run(folder / "config.yaml", *(word for override in overrides for word in ("--set", override)))
     assert result.returncode == 0, result.stderr
-    assert ", LPIPS " in result.stdout
+    assert ", LPIPS " in result.stderr
     return output
 
 
 def test_the_written_configuration_gives_the_same_map_byte_for_byte(folder: Path, again: Path) -> None:
     for name in ("splats.ply", "trajectory.txt"):
         assert (again / name).read_bytes() == (folder / name).read_bytes()
+
+
+def test_a_run_that_asks_for_no_report_leaves_none(again: Path) -> None:
+    assert sorted(p.name for p in again.iterdir()) == [name for name in FILES if name != "report.html"]
 
 
 def test_lpips_is_that_of_the_pictures(again: Path, lpips_weights: Path) -> None:
@@ -178,7 +210,7 @@ def test_lpips_is_that_of_the_pictures(again: Path, lpips_weights: Path) -> None
 def test_bad_input_writes_nothing(tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(SCENE.replace("stop: 9", "start: 900"))
-    result = run(scene)
+    result = run(scene, "--quiet")
     assert result.returncode == 2
     assert result.stderr.startswith("error: ")
     assert result.stderr.count("\n") == 1
