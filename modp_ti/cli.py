@@ -8,6 +8,7 @@ from modp_ti.check import check
 from modp_ti.export import export
 from modp_ti.render import render
 from modp_ti.run import run
+from modp_ti.view import view
 from modp_ti.warmup import warmup
 
 __all__ = ["app"]
@@ -23,6 +24,7 @@ app.command("run")(run)
 app.command("check")(check)
 app.command("render")(render)
 app.command("export")(export)
+app.command("view")(view)
 app.command("warmup")(warmup)
 
 

@@ -19,11 +19,12 @@ def run(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="overrides a key, for example --set source.scale=0.5"),
     ] = None,
+    view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
     """Map a posed sequence while its frames arrive, and write splats, poses, metrics and pictures."""
     with in_one_line():
-        folder = _run(scene, [*(set_ or []), *(more or [])])
+        folder = _run(scene, [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])])
     typer.echo(f"written to {folder}")
 
 

@@ -21,6 +21,7 @@ from modp_ti.errors import InputError
 from modp_ti.evaluation import evaluate, trajectory_errors
 from modp_ti.lpips import open_lpips
 from modp_ti.mapper import Mapper
+from modp_ti.observer import Observer, Unobserved
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
 from modp_ti.results import Results, metrics_of
@@ -45,6 +46,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     """`run_scene`; held: takes what is to be closed at its end, however it ends."""
     started = time.perf_counter()
     line = ProgressLine(console)
+    observer = _open_observer(config, console, held)
     try:
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
@@ -70,10 +72,11 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         watch.seconds["track"] = prepared
         with line.working("compiling kernels (the first time on this machine takes longest)"):
             mapper.pipeline.compile()
+        observer.begin(mapper, frame_count(tracker))
         tick = time.perf_counter()
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
-        _map(mapper, chain([first], _timed(arriving, watch)), config, line)
-        mapping_seconds = time.perf_counter() - tick
+        _map(mapper, chain([first], _timed(arriving, watch)), config, line, observer)
+        mapping_seconds = time.perf_counter() - tick - observer.waited
     _say([note for note in tracker.notes if note not in notes], console)  # how a live tracker's frames ended
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
     frames, keyframes = mapper.frames, mapper.pipeline.keyframes
@@ -85,10 +88,16 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     versions = {config.mode: mapper.version()}
     if config.refine.steps and config.mode != "offline":
         line.start_refining(config.refine.steps)
-        mapper.refine(config.refine.steps, config.refine, line.refined)
+
+        def refined(step: int, psnr: float) -> None:
+            line.refined(step, psnr)
+            observer.on_step("refining", step, config.refine.steps, psnr)
+
+        mapper.refine(config.refine.steps, config.refine, refined)
         line.stop()
         versions["refined"] = mapper.version()
     last = list(versions)[-1]
+    observer.on_stage("evaluating the saved map")
     results = Results(config, frames)
     with results.writing():
         # What is scored is what a reader of the file gets.
@@ -124,6 +133,19 @@ def _say(notes: Iterable[str], console: Console) -> None:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
 
+def _open_observer(config: SceneConfig, console: Console, held: ExitStack) -> Observer:
+    """The viewer where the scene asks for it; it is there before anything that takes minutes."""
+    if not config.view.enabled:
+        return Unobserved()
+    # Imported here: viser is an extra.
+    from modp_ti.viewer.live import LiveViewer
+
+    viewer = LiveViewer(config.view, lambda text: _say([text], console))
+    held.callback(viewer.close)
+    console.print(f"viewer: {viewer.url}", highlight=False, soft_wrap=True)
+    return viewer
+
+
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
     """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
     settings = config.offline if config.mode == "offline" else config.mapping
@@ -134,7 +156,11 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
 
 
 def _map(
-    mapper: Mapper, arriving: Iterable[TrackedFrame | PoseCorrection], config: SceneConfig, line: ProgressLine
+    mapper: Mapper,
+    arriving: Iterable[TrackedFrame | PoseCorrection],
+    config: SceneConfig,
+    line: ProgressLine,
+    observer: Observer,
 ) -> None:
     """Take all frames and corrections in, in their order, and finish the map."""
     size = None
@@ -149,10 +175,17 @@ def _map(
                     f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
                     "all images of a scene must have one size"
                 )
-            line.frame(mapper.add(frame))
+            report = mapper.add(frame)
+            line.frame(report)
+            observer.on_frame(frame, report)
         if config.mode == "offline":
             line.start_offline(config.offline.steps)
-            mapper.finish(line.optimised)
+
+            def optimised(step: int, gaussians: int, psnr: float) -> None:
+                line.optimised(step, gaussians, psnr)
+                observer.on_step("optimising", step, config.offline.steps, psnr)
+
+            mapper.finish(optimised)
         else:
             mapper.finish()
     finally:
