@@ -262,14 +262,15 @@ class ViewSettings(StrictModel):
 
     enabled: bool = Field(
         False,
-        description="serve a web page that shows the map as it grows (docs/viewer.md). `view: true` is short for it, and "
-        "a section that says anything else means it too",
+        description="serve a web page that shows the map as it grows (docs/viewer.md). `view: true` is short for it, "
+        "and a section that says anything else means it too",
     )
     host: str = Field(
         "127.0.0.1",
         description="address to serve at: this machine alone sees 127.0.0.1; 0.0.0.0 is for all that reach it",
     )
     port: int = Field(8080, ge=0, le=65535, description="port, or the next one that is free; 0 for any")
+    paused: bool = Field(False, description="hold after the first frame until a browser says to go on")
     max_cost: float = Field(
         5.0, gt=0, le=100, description="percent of the mapping time that the viewer may take; it shows less instead"
     )

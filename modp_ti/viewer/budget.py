@@ -62,20 +62,23 @@ class CostLimit:
 
 
 class ThreadClock:
-    """Processor time [s] that threads have taken since it was asked last; they must be alive.
+    """Processor time [s] that threads have taken since it was asked last. They must be alive at first.
 
     Where the system does not tell (it does on Linux), always 0.
     """
 
     def __init__(self, threads: list[threading.Thread]) -> None:
         clock_of = getattr(time, "pthread_getcpuclockid", None)
-        self._clocks = [] if clock_of is None else [clock_of(thread.ident) for thread in threads]
-        self._last = self._now()
+        clocks = [] if clock_of is None else [clock_of(thread.ident) for thread in threads]
+        self._last = {clock: time.clock_gettime(clock) for clock in clocks}
 
     def since_last(self) -> float:
-        now = self._now()
-        taken, self._last = now - self._last, now
+        taken = 0.0
+        for clock, before in list(self._last.items()):
+            try:
+                self._last[clock] = time.clock_gettime(clock)
+            except OSError:  # the thread has ended
+                del self._last[clock]
+            else:
+                taken += self._last[clock] - before
         return taken
-
-    def _now(self) -> float:
-        return sum(time.clock_gettime(clock) for clock in self._clocks)

@@ -85,6 +85,7 @@ class LiveViewer:
         self._say = say
         self._clock = clock
         self._gate = Gate()
+        self._gate.pause(settings.paused)
         self.page = Page(settings.host, settings.port, self._gate)
         self.url = self.page.url
         share = PLANNED * settings.max_cost / 100.0
@@ -100,6 +101,7 @@ class LiveViewer:
         self._frames: int | None = None
         self._began = clock()
         self._numbers_at = -np.inf
+        self._visited = False  # by a browser, so far
         self._behind = True  # the splats on the page are not those of the map
         self._failed = False
 
@@ -119,6 +121,7 @@ class LiveViewer:
     def begin(self, mapper: Mapper, frames: int | None) -> None:
         self._mapper, self._frames = mapper, frames
         self._began = self._clock()
+        self._serving.since_last()  # browsers that came before took nothing from the mapping
 
     def on_frame(self, frame: TrackedFrame, report: FrameReport | None) -> None:
         self._frame = frame
@@ -153,16 +156,17 @@ class LiveViewer:
             self._give_up(error)
 
     def _give_up(self, error: Exception) -> None:
+        if self._failed:
+            return
         self._failed = True
         self._gate.pause(False)
         self._say(f"the viewer has stopped, the run goes on: {type(error).__name__}: {error}")
 
     def _look_around(self) -> None:
-        pipeline = self._mapper.pipeline
         if not len(self.page.requests):
             return
-        if len(pipeline.keyframes):
-            self.page.settle(pipeline.keyframes.scene_depth, pipeline.keyframes[0].T_camera_world)
+        self._visited = True
+        self._settle()
         if self._clock() - self._numbers_at >= NUMBERS_EVERY and self.numbers_limit.allows():
             self._numbers_at = self._clock()
             with self.numbers_limit.measured():
@@ -171,6 +175,12 @@ class LiveViewer:
             with self.pictures_limit.measured():
                 self._show_map()
 
+    def _settle(self) -> None:
+        """Give the page its units, once there is a keyframe to tell them."""
+        store = self._mapper.pipeline.keyframes
+        if len(store):
+            self.page.settle(store.scene_depth, store[0].T_camera_world)
+
     def _hold(self) -> None:
         """Wait at the gate. Browsers are served at once: there is no mapping to be slowed."""
         alone_since: float | None = None
@@ -178,13 +188,15 @@ class LiveViewer:
         def serve() -> None:
             nonlocal alone_since
             now = self._clock()
-            alone_since = None if len(self.page.requests) else alone_since or now
+            self._visited |= len(self.page.requests) > 0
+            alone_since = None if len(self.page.requests) or not self._visited else alone_since or now
             if alone_since is not None and now - alone_since > PATIENCE:
                 self._gate.pause(False)
                 self.page.show_paused(False)
-            elif len(self.page.requests):
+            else:
                 self._show_map()
 
+        self._settle()
         self._updates.put(self._overview())
         with self.numbers_limit.suspended(), self.pictures_limit.suspended():
             self.waited += self._gate.hold(serve)
@@ -195,7 +207,9 @@ class LiveViewer:
         store, gaussians = self._mapper.pipeline.keyframes, self._mapper.pipeline.gaussians
         cost = 100.0 * self.cost / max(self._clock() - self._began - self.waited, 1e-9)
         paused = "  \n**paused**" if self._gate.paused else ""
-        numbers = f"{self._state}  \n{len(store)} keyframes, {len(gaussians):,} Gaussians{paused}  \nviewer: {cost:.1f} %"
+        numbers = (
+            f"{self._state}  \n{len(store)} keyframes, {len(gaussians):,} Gaussians  \nviewer: {cost:.1f} %{paused}"
+        )
         frame = self._frame
         if frame is None or len(store) == 0:
             return Update(numbers=numbers)
@@ -211,7 +225,7 @@ class LiveViewer:
     def _show_map(self) -> None:
         """The splats, or the picture that one browser waits for, unless the publisher is not done with the last."""
         pipeline, waiting = self._mapper.pipeline, self._updates.waiting
-        if len(pipeline.keyframes) == 0 or len(pipeline.gaussians) == 0:
+        if not len(self.page.requests) or len(pipeline.keyframes) == 0 or len(pipeline.gaussians) == 0:
             return
         if self.page.requests.mode == SPLATS:
             if self._behind and (waiting is None or waiting.splats is None):

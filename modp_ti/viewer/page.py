@@ -30,7 +30,7 @@ DEPTH_ON_PAGE = 4.0
 # How far the first look is behind and above the first frame, in the page's units.
 BEHIND, ABOVE = 2.0, 1.0
 # Depths of the frustums of keyframes and of the current frame, and size of points, in the page's units.
-KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.02
+KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.015
 KEYFRAME_COLOUR, FRAME_COLOUR, POINT_COLOUR = (90, 140, 255), (255, 120, 30), (255, 60, 60)
 JPEG_QUALITY = 85
 KEYFRAMES, FRAME, POINTS = "Keyframes", "Current frame", "Tracked points"
@@ -210,6 +210,7 @@ class Page:
         self._numbers = gui.add_markdown("waiting for the first frame")
         if self._gate is not None:
             self._pause = gui.add_button("Pause", hint="hold the mapping after the frame or step that it is at")
+            self.show_paused(self._gate.paused)
             self._pause.on_click(lambda _: self._set_paused(not self._gate.paused))
             step = gui.add_button("Step", hint="map one frame, or take one step, and hold again")
             step.on_click(lambda _: self._step())
@@ -262,9 +263,7 @@ class Page:
         if client.client_id not in self._server.get_clients():
             return  # a last word of one that has gone
         c = client.camera
-        self.requests.look(
-            BrowserCamera(client.client_id, c.wxyz, c.position, c.fov, c.image_width, c.image_height)
-        )
+        self.requests.look(BrowserCamera(client.client_id, c.wxyz, c.position, c.fov, c.image_width, c.image_height))
         if self._gate is not None:
             self._gate.wake()
 
