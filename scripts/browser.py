@@ -58,5 +58,5 @@ def open_page(url: str, width: int = 1000, height: int = 640) -> Iterator[Page]:
 
 def choose_mode(page: Page, mode: str) -> None:
     """Choose what the page shows."""
-    page.locator("input[aria-haspopup=listbox]").first.click()
+    page.locator("input[role=combobox]:visible").first.click()
     page.get_by_role("option", name=mode, exact=True).click()

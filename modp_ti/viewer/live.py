@@ -97,7 +97,7 @@ class LiveViewer:
         self._serving = ThreadClock([self._publisher, *self.page.threads])
         self._mapper: Mapper | None = None
         self._frame: TrackedFrame | None = None
-        self._state = ""
+        self._state = self._psnr = ""
         self._frames: int | None = None
         self._began = clock()
         self._numbers_at = -np.inf
@@ -127,9 +127,10 @@ class LiveViewer:
         self._frame = frame
         count = len(self._mapper.frames)
         of = "" if self._frames is None else f" of {self._frames}"
-        psnr = "" if report is None or report.psnr is None else f"{report.psnr:.2f} dB"
+        if report is not None and report.psnr is not None:
+            self._psnr = f"{report.psnr:.2f} dB"
         seconds = self._clock() - self._began - self.waited
-        self._state = f"frame **{count}**{of}  \n{psnr}  \n{count / max(seconds, 1e-9):.2f} frames/s"
+        self._state = f"frame **{count}**{of}, {count / max(seconds, 1e-9):.2f} frames/s  \n{self._psnr}"
         self._changed()
 
     def on_step(self, stage: str, step: int, steps: int, psnr: float) -> None:
