@@ -16,6 +16,8 @@ from modp_ti.render import EXAMPLES as RENDER_EXAMPLES
 from modp_ti.render import render
 from modp_ti.run import EXAMPLES as RUN_EXAMPLES
 from modp_ti.run import run
+from modp_ti.view import EXAMPLES as VIEW_EXAMPLES
+from modp_ti.view import view
 from modp_ti.warmup import EXAMPLES as WARMUP_EXAMPLES
 from modp_ti.warmup import warmup
 
@@ -60,6 +62,7 @@ app.command("run", epilog=RUN_EXAMPLES)(run)
 app.command("check", epilog=CHECK_EXAMPLES)(check)
 app.command("render", epilog=RENDER_EXAMPLES)(render)
 app.command("export", epilog=EXPORT_EXAMPLES)(export)
+app.command("view", epilog=VIEW_EXAMPLES)(view)
 app.command("warmup", epilog=WARMUP_EXAMPLES)(warmup)
 
 

@@ -32,13 +32,14 @@ EXAMPLES = examples(
 def run(
     scene: Annotated[Path, typer.Argument(help="scene file (YAML); its paths are relative to it")],
     set_: Overrides = None,
+    view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
     """Map a posed sequence while its frames arrive, and write splats, poses, metrics, pictures and a report."""
     with outcome(as_json) as result:
-        folder = _run(scene, [*(set_ or []), *(more or [])], quiet)
+        folder = _run(scene, [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])], quiet)
         result.text = f"written to {folder}"
         if as_json:
             metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))

@@ -21,6 +21,7 @@ from modp_ti.errors import InputError
 from modp_ti.evaluation import evaluate, trajectory_errors
 from modp_ti.lpips import open_lpips
 from modp_ti.mapper import Mapper
+from modp_ti.observer import Observer, Unobserved
 from modp_ti.prefetch import FramesAhead
 from modp_ti.progress import ProgressLine
 from modp_ti.report.record import RunRecord
@@ -47,6 +48,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
     started = time.perf_counter()
     record = RunRecord()
     line = ProgressLine(console)
+    observer = _open_observer(config, console, record, held)
     try:
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
@@ -73,10 +75,11 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         watch.seconds["track"] = prepared
         with line.working("compiling kernels (the first time on this machine takes longest)"):
             mapper.pipeline.compile()
+        observer.begin(mapper, frame_count(tracker))
         tick = time.perf_counter()
         line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping")
-        _map(mapper, chain([first], _timed(arriving, watch)), config, line, record)
-        mapping_seconds = time.perf_counter() - tick
+        _map(mapper, chain([first], _timed(arriving, watch)), config, line, record, observer)
+        mapping_seconds = time.perf_counter() - tick - observer.waited
     # How a live tracker's frames ended.
     _say([note for note in tracker.notes if note not in notes], console, record)
     breakdown = breakdown_percent(watch.seconds, mapping_seconds)
@@ -93,11 +96,13 @@ def _run(config: SceneConfig, console: Console, held: ExitStack) -> Path:
         def refined(step: int, psnr: float) -> None:
             line.refined(step, psnr)
             record.refined(step, psnr)
+            observer.on_step("refining", step, config.refine.steps, psnr)
 
         mapper.refine(config.refine.steps, config.refine, refined)
         line.stop()
         versions["refined"] = mapper.version()
     last = list(versions)[-1]
+    observer.on_stage("evaluating the saved map")
     results = Results(config, frames)
     with results.writing():
         # What is scored is what a reader of the file gets.
@@ -144,6 +149,19 @@ def _say(notes: Iterable[str], console: Console, record: RunRecord) -> None:
         record.notes.append(note)
 
 
+def _open_observer(config: SceneConfig, console: Console, record: RunRecord, held: ExitStack) -> Observer:
+    """The viewer where the scene asks for it; it is there before anything that takes minutes."""
+    if not config.view.enabled:
+        return Unobserved()
+    # Imported here: viser is an extra.
+    from modp_ti.viewer.live import LiveViewer
+
+    viewer = LiveViewer(config.view, lambda text: _say([text], console, record))
+    held.callback(viewer.close)
+    console.print(f"viewer: {viewer.url}", highlight=False, soft_wrap=True)
+    return viewer
+
+
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
     """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
     settings = config.offline if config.mode == "offline" else config.mapping
@@ -159,6 +177,7 @@ def _map(
     config: SceneConfig,
     line: ProgressLine,
     record: RunRecord,
+    observer: Observer,
 ) -> None:
     """Take all frames and corrections in, in their order, and finish the map."""
     size = None
@@ -175,14 +194,16 @@ def _map(
                     "all images of a scene must have one size"
                 )
             report = mapper.add(frame)
-            record.frame(frame.index, report)
             line.frame(report)
+            record.frame(frame.index, report)
+            observer.on_frame(frame, report)
         if config.mode == "offline":
             line.start_offline(config.offline.steps)
 
             def optimised(step: int, gaussians: int, psnr: float) -> None:
                 line.optimised(step, gaussians, psnr)
                 record.optimised(step, gaussians, psnr)
+                observer.on_step("optimising", step, config.offline.steps, psnr)
 
             mapper.finish(optimised)
         else:

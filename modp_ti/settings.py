@@ -16,6 +16,7 @@ __all__ = [
     "SceneConfig",
     "SourceSettings",
     "TrackerSettings",
+    "ViewSettings",
     "VrsSettings",
 ]
 
@@ -259,6 +260,37 @@ class ExportSettings(StrictModel):
     )
 
 
+class ViewSettings(StrictModel):
+    """The live viewer."""
+
+    enabled: bool = Field(
+        False,
+        description="serve a web page that shows the map as it grows (docs/viewer.md). `view: true` is short for it, "
+        "and a section that says anything else means it too",
+    )
+    host: str = Field(
+        "127.0.0.1",
+        description="address to serve at: this machine alone sees 127.0.0.1; 0.0.0.0 is for all that reach it",
+    )
+    port: int = Field(8080, ge=0, le=65535, description="port, or the next one that is free; 0 for any")
+    paused: bool = Field(False, description="hold after the first frame until a browser says to go on")
+    max_cost: float = Field(
+        5.0, gt=0, le=100, description="percent of the mapping time that the viewer may take; it shows less instead"
+    )
+    max_splats: int = Field(
+        100_000, ge=100, description="splats that a browser draws; of larger maps a subsample, grown to cover the rest"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, given: object) -> object:
+        if isinstance(given, bool):
+            return {"enabled": given}
+        if isinstance(given, dict) and given and "enabled" not in given:
+            return {"enabled": True, **given}
+        return given
+
+
 class SceneConfig(StrictModel):
     """Everything that a run depends on."""
 
@@ -277,6 +309,7 @@ class SceneConfig(StrictModel):
     offline: OfflineSettings = OfflineSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
     export: ExportSettings = ExportSettings()
+    view: ViewSettings = ViewSettings()
 
     @model_validator(mode="after")
     def _images_are_named(self) -> SceneConfig:

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["write_exposures"]
+from modp_ti.errors import InputError
+
+__all__ = ["read_exposures", "write_exposures"]
 
 
 def write_exposures(
@@ -34,3 +36,14 @@ def write_exposures(
     ]
     lines = ",\n".join("  " + json.dumps(frame) for frame in frames)
     path.write_text(f'{{"frames": [\n{lines}\n]}}\n', encoding="utf-8")
+
+
+def read_exposures(path: Path) -> dict[int, NDArray[np.float64]]:
+    """(A, b) (3, 4) by index of the frame; none where there is no file. Raises InputError for a damaged one."""
+    if not path.is_file():
+        return {}
+    try:
+        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        return {int(frame["index"]): np.array(frame["matrix"], dtype=np.float64).reshape(3, 4) for frame in frames}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as the exposures of a run: {error!r}") from None

@@ -1,0 +1,35 @@
+"""A picture of the viewer's page: `scripts/screenshot URL FILE.png`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from browser import choose_mode, missing, open_page
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("url", help="what `modp-ti run --view` or `modp-ti view` printed")
+    parser.add_argument("file", help="PNG to write")
+    parser.add_argument("--mode", default="splats", help="what the page shows")
+    parser.add_argument("--wait", type=float, default=15.0, help="seconds for the page to show it")
+    parser.add_argument("--until", help="text in the page that is waited for first, such as `frame 30`")
+    arguments = parser.parse_args()
+    lacking = missing()
+    if lacking:
+        print(f"error: {lacking}", file=sys.stderr)
+        return 2
+    with open_page(arguments.url) as page:
+        if arguments.until:
+            page.get_by_text(arguments.until).first.wait_for(timeout=600_000)
+        if arguments.mode != "splats":
+            choose_mode(page, arguments.mode)
+        page.wait_for_timeout(1000 * arguments.wait)
+        page.screenshot(path=arguments.file)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,102 @@
+"""The page in a real browser, while a run maps: it opens, shows the map, and its buttons hold the run."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import browser
+import cv2
+import numpy as np
+import pytest
+
+if browser.missing():
+    pytest.skip(browser.missing(), allow_module_level=True)
+
+SCENE = """
+source:  {scale: 0.25, stop: 24, fps: 10}
+tracker: {kind: synthetic}
+output:  out
+device:  cpu
+mapping: {optimise: {steps: 3, last_steps: 4}}
+refine:  {steps: 0}
+view:    {port: 0, paused: true}
+"""
+PATIENCE = 240.0
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[tuple[subprocess.Popen, str]]:
+    """A run that holds after its first frame, and where its page is."""
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    command = [sys.executable, "-m", "modp_ti.run", str(tmp_path / "scene.yaml")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        said = next(line for line in process.stdout if line.startswith("viewer: "))
+        yield process, said.split()[1]
+    finally:
+        process.kill()
+        process.wait()
+
+
+def frame_number(page) -> int:
+    """What the frame counter says."""
+    found = re.search(r"frame (\d+) of 24", page.locator("body").inner_text())
+    return int(found[1]) if found else 0
+
+
+def wait_until(page, happens) -> None:
+    end = time.monotonic() + PATIENCE
+    while not happens():
+        assert time.monotonic() < end, page.locator("body").inner_text()
+        page.wait_for_timeout(100)
+
+
+def picture(page) -> np.ndarray:
+    """The canvas (H, W, 3), left of the controls."""
+    encoded = page.screenshot(clip={"x": 0, "y": 0, "width": 600, "height": 640})
+    return cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR).astype(int)
+
+
+def drawn(page) -> float:
+    """Share of the canvas that is not the background."""
+    image = picture(page)
+    return float((np.abs(image - np.median(image[:8], axis=(0, 1))).max(axis=2) > 24).mean())
+
+
+def colourful(page) -> float:
+    """Share of the canvas that is not grey."""
+    return float((np.ptp(picture(page), axis=2) > 24).mean())
+
+
+def test_the_page_shows_the_map_and_its_buttons_hold_the_run(run: tuple[subprocess.Popen, str]):
+    process, url = run
+    with browser.open_page(url) as page:
+        wait_until(page, lambda: frame_number(page) == 1)
+        for number in (2, 3, 4):
+            page.get_by_role("button", name="Step").click()
+            wait_until(page, lambda number=number: frame_number(page) == number)
+        wait_until(page, lambda: drawn(page) > 0.05 and colourful(page) > 0.02)  # splats
+
+        # Our renderer's opacity: grey, from where the browser looks.
+        for box in ("Keyframes", "Current frame", "Tracked points"):
+            page.get_by_role("checkbox", name=box).click()
+        browser.choose_mode(page, "opacity")
+        wait_until(page, lambda: drawn(page) > 0.05 and colourful(page) < 0.01)
+
+        page.get_by_role("button", name="Resume").click()
+        wait_until(page, lambda: frame_number(page) >= 6)
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_text("paused").wait_for()
+        held = frame_number(page)
+        assert held < 24
+        page.wait_for_timeout(2000)
+        assert frame_number(page) == held
+        page.get_by_role("button", name="Step").click()
+        wait_until(page, lambda: frame_number(page) == held + 1)
+    # The browser is closed while the run is paused: it goes on, and ends well.
+    assert process.wait(timeout=PATIENCE) == 0
