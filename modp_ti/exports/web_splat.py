@@ -23,7 +23,7 @@ RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4
 
 
 def write_web_splat(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
-    """Write Gaussians as `GaussianField.to_numpy` gives them. Of their colours the constant part is kept."""
+    """Write Gaussians as `GaussianField.to_numpy` gives them. Of their colours the constant part is kept, clipped."""
     opacity = opacities(state)
     importance = opacity * np.exp(state["log_scale"].astype(np.float64).sum(axis=1))
     order = np.argsort(-importance, kind="stable")

@@ -25,6 +25,7 @@ from modp_ti.playback.finished_run import FinishedRun
 from modp_ti.playback.flight import film, plan_flight
 from modp_ti.playback.map_renderer import MapRenderer, eight_bits, start_device
 from modp_ti.playback.mapped_images import dataset_names, write_images
+from modp_ti.playback.plain_colours import with_plain_colours
 from modp_ti.progress import ProgressLine
 
 __all__ = ["DEFAULT_NAMES", "export_map"]
@@ -40,7 +41,7 @@ DEFAULT_NAMES = {
     "nerfstudio": "nerfstudio",
     "video": "recorded.mp4",
 }
-SPLATS = {"splat": write_web_splat, "spz": write_spz, "compressed-ply": write_compressed_ply}
+SPLATS = {"spz": write_spz, "compressed-ply": write_compressed_ply}
 # Edge of the mesh's voxels in scene depths, and how far its surface reaches.
 VOXEL = 1 / 160
 FARTHEST = 4.0
@@ -68,6 +69,9 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
                 write_points(target, run.gaussians)
         elif format == "mesh":
             _mesh(run, target, options, line)
+        elif format == "splat":
+            start_device(options.device)
+            write_web_splat(target, with_plain_colours(run, line))
         elif format in SPLATS:
             with line.working("writing splats"):
                 SPLATS[format](target, run.gaussians)
