@@ -1,6 +1,6 @@
 """`with_plain_colours`: a map whose colours lie in [0, 1] and do not depend on the direction, looking as it did."""
 
-from collections.abc import Mapping
+from dataclasses import asdict
 
 import numpy as np
 import taichi as ti
@@ -29,8 +29,8 @@ LARGEST = 0.5 / SH_C0
 def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArray[np.float32]]:
     """The run's Gaussians (as `GaussianField.load` takes them), optimised under that constraint to render alike.
 
-    A brighter Gaussian than 1 lets light through: clipped, it is darker, and what shines through it is not. So colours,
-    opacities and sizes are fitted to the map's own pictures at its frames. Taichi runs already.
+    Where a Gaussian brighter than 1 lets light through, clipping makes it too dark. So colours, opacities and sizes are
+    fitted to the map's own pictures at the frames that were mapped. Taichi runs already.
     """
     mapped = run.mapped
     chosen = [mapped[i * len(mapped) // min(len(mapped), VIEWS)] for i in range(min(len(mapped), VIEWS))]
@@ -53,7 +53,8 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
         loss.forward()
         loss.backward(SSIM_WEIGHT)
         renderer.backward()
-        adam.step(_scaled(RATES, DECAY ** (step / STEPS)))
+        decayed = DECAY ** (step / STEPS)
+        adam.step(LearningRates(**{name: decayed * rate for name, rate in asdict(RATES).items()}))
         constraint.impose()
     return gaussians.to_numpy()
 
@@ -76,8 +77,3 @@ class PlainColours:
             self.gaussians.sh[i, 0] = ti.min(ti.max(self.gaussians.sh[i, 0], -LARGEST), LARGEST)
             for k in range(1, self.gaussians.sh_count):
                 self.gaussians.sh[i, k].fill(0.0)
-
-
-def _scaled(rates: LearningRates, factor: float) -> LearningRates:
-    scaled: Mapping[str, float] = {name: factor * rate for name, rate in vars(rates).items()}
-    return LearningRates(**scaled)

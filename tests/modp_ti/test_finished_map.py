@@ -173,7 +173,7 @@ def test_every_form_of_the_splats_shows_the_same_map(out: Path, renderer: Callab
     metrics = json.loads((out / "metrics.json").read_text())
     assert ours == pytest.approx(metrics["refined"]["held_out"]["psnr"], abs=0.05)
     assert abs(psnr(show, out, ply) - ours) <= 0.01
-    # `.splat` cannot hold colours beyond [0, 1] nor any that depend on the direction: fitted, it is better than clipped.
+    # `.splat` holds no colours beyond [0, 1] and none that depend on the direction: fitted, it is better than clipped.
     held = np.clip(0.5 + 0.2820948 * sh[:, :1], 0, 1)
     clipped = psnr(show, out, {**ply, "sh": (held - 0.5) / 0.2820948})
     for form, path in files.items():
