@@ -80,13 +80,13 @@ def test_the_page_shows_the_map_and_its_buttons_hold_the_run(run: tuple[subproce
         for number in (2, 3, 4):
             page.get_by_role("button", name="Step").click()
             wait_until(page, lambda number=number: frame_number(page) == number)
-        wait_until(page, lambda: drawn(page) > 0.05 and colourful(page) > 0.02)  # splats
+        wait_until(page, lambda: drawn(page) > 0.02 and colourful(page) > 0.01)  # splats
 
         # Our renderer's opacity: grey, from where the browser looks.
         for box in ("Keyframes", "Current frame", "Tracked points"):
             page.get_by_role("checkbox", name=box).click()
         browser.choose_mode(page, "opacity")
-        wait_until(page, lambda: drawn(page) > 0.05 and colourful(page) < 0.01)
+        wait_until(page, lambda: drawn(page) > 0.01 and colourful(page) < 0.001)
 
         page.get_by_role("button", name="Resume").click()
         wait_until(page, lambda: frame_number(page) >= 6)
