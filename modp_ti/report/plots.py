@@ -106,7 +106,7 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
         axes[0].plot(*places, ".", ms=4, color=BLUE, label="keyframes")
         axes[0].legend(loc="upper left")
     _line(axes[1], x, frame_rate(frames, window), "frame-rate", color=GREEN)
-    axes[1].set_ylim(bottom=0)
+    axes[1].set_yscale("log")  # frames that are no keyframes pass a hundred times faster
     _label(axes[1], "" if mapped else "frame", f"frames per second\n(last {window})")
     if mapped:
         y = np.array([note.psnr for note in mapped], float)
