@@ -15,7 +15,7 @@ def main() -> int:
     parser.add_argument("file", help="PNG to write")
     parser.add_argument("--mode", default="splats", help="what the page shows")
     parser.add_argument("--wait", type=float, default=15.0, help="seconds for the page to show it")
-    parser.add_argument("--until", help="text in the page that is waited for first, such as `frame 30`")
+    parser.add_argument("--until", help="text in the page that is waited for first, two minutes long: `frame 30`")
     arguments = parser.parse_args()
     lacking = missing()
     if lacking:
@@ -23,7 +23,7 @@ def main() -> int:
         return 2
     with open_page(arguments.url) as page:
         if arguments.until:
-            page.get_by_text(arguments.until).first.wait_for(timeout=600_000)
+            page.get_by_text(arguments.until).first.wait_for()
         if arguments.mode != "splats":
             choose_mode(page, arguments.mode)
         page.wait_for_timeout(1000 * arguments.wait)
