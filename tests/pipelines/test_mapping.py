@@ -70,13 +70,16 @@ def test_held_out_frames_are_refused(mapped: OnlineMapper) -> None:
 
 def test_refinement_improves_the_map_and_leaves_the_poses(mapped: OnlineMapper) -> None:
     poses = [k.T_camera_world.copy() for k in mapped.keyframes]
+    # Room to improve: the wall is shown at 46 dB already, where rounding decides.
+    faded = mapped.gaussians.to_numpy()
+    mapped.gaussians.load(faded | {"sh": 0.9 * faded["sh"]})
     before = np.mean([psnr(mapped, i) for i in range(7)])
     seen = []
     renders = mapped.renderer.view_renders
     refine(mapped, RefineSettings(steps=40, views=4), lambda step, _: seen.append(step))
     # Once over the keyframes for what shows, then the steps.
     assert mapped.renderer.view_renders == renders + len(mapped.keyframes) + 40 * 4
-    assert np.mean([psnr(mapped, i) for i in range(7)]) > before
+    assert np.mean([psnr(mapped, i) for i in range(7)]) > before + 3
     assert seen == list(range(1, 41))
     for keyframe, T in zip(mapped.keyframes, poses, strict=True):
         np.testing.assert_array_equal(keyframe.T_camera_world, T)
