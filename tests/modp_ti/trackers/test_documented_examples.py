@@ -151,7 +151,7 @@ def test_what_is_wrong_is_one_line_and_exit_code_2(recording):
         "source: {path: images, intrinsics: {fx: 300}}\ntracker: {kind: tum, path: trajectory.txt}\n"
         "output: out\ndevice: cpu\n"
     )
-    result = CliRunner().invoke(cli.app, ["run", str(file)])
+    result = CliRunner().invoke(cli.app, ["run", str(file), "--quiet"])
     assert result.exit_code == 2
     assert "trajectory.txt:2: holds 9 columns instead of 8" in result.stderr
     assert result.stderr.count("\n") == 1 and result.stderr.startswith("error: ")
