@@ -235,7 +235,11 @@ def test_ctrl_c_ends_a_real_process_with_130_and_leaves_nothing(scene):
         "from modp_ti.cli import app; app()"
     )
     command = [sys.executable, "-c", code, "run", str(scene), "--json"]
-    process = subprocess.Popen(command, cwd=PROJECT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # Where the tests run in a shell's background, children inherit that Ctrl-C is ignored.
+    process = subprocess.Popen(
+        command, cwd=PROJECT, **pipes, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    )
     assert process.stderr.readline() == "begun\n"  # what a library writes past Python goes there as well
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=30)
