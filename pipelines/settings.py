@@ -65,10 +65,10 @@ class KeyframeSettings(StrictModel):
 class EpipolarSettings(StrictModel):
     """Search along epipolar lines in neighbour keyframes."""
 
-    views: int = Field(4, ge=1, description="neighbours that are searched")
+    views: int = Field(8, ge=1, description="neighbours that are searched")
     parallax: float = Field(0.15, gt=0, description="baseline to them that is preferred [the view's median depths]")
     max_samples: int = Field(128, ge=8, description="samples of inverse depth along a line at most")
-    min_score: float = Field(0.8, ge=-1, le=1, description="correlation (ZNCC) that a match must have")
+    min_score: float = Field(0.7, ge=-1, le=1, description="correlation (ZNCC) that a match must have")
     min_lead: float = Field(0.1, ge=0, le=2, description="by how much it must beat all others along the line")
     pixel_noise: float = Field(0.2, ge=0, description="standard deviation of a sharp match [px]")
 
@@ -96,7 +96,7 @@ class DepthSettings(StrictModel):
     checkpoint: Path | None = Field(
         None, description="DepthCov's weights (`scannet.ckpt` or `nyu.ckpt`), a file of the user's own; for depthcov"
     )
-    neighbours: int = Field(30, ge=0, description="latest other keyframes among which matches are looked for")
+    neighbours: int = Field(100, ge=0, description="latest other keyframes among which matches are looked for")
     epipolar: EpipolarSettings = EpipolarSettings()
 
     @model_validator(mode="after")

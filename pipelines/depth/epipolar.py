@@ -32,9 +32,10 @@ OUTSIDE = -2.0
 class EpipolarDepth:
     """Zero-mean normalised cross correlation (ZNCC) over samples of inverse depth, averaged over the neighbours.
 
-    A patch's pixels are carried over at one depth each, by rotation and translation, so that turned and scaled views
-    match. The best sample is refined by a parabola; matches that are weak, at the end of the range, or nearly as
-    good elsewhere are given up. The deviation follows from how sharp the peak is, in pixels of the neighbours.
+    A patch is carried over at one depth, to first order, so that turned and scaled views match. A sample is given up
+    as soon as the neighbours to come cannot make a match of it. The best is refined by a parabola; matches that are
+    weak, at the end of the range, or nearly as good elsewhere are given up. The deviation follows from how sharp the
+    peak is, in pixels of the neighbours.
     """
 
     def __init__(self, settings: EpipolarSettings) -> None:
@@ -59,9 +60,15 @@ class EpipolarDepth:
         sizes = np.array([k.rgba.shape[1::-1] for k in chosen], dtype=np.int32)
         for image, k in zip(others, chosen, strict=True):
             image[: k.rgba.shape[0], : k.rgba.shape[1]] = _grey(k)
+        images = (grey, others, sizes, warps, pixels.astype(np.float32), inverse.astype(np.float32))
         scores = np.empty((len(pixels), samples), dtype=np.float32)
-        self._score(grey, others, sizes, warps, pixels.astype(np.float32), inverse.astype(np.float32), scores)
-        return self._peaks(scores, inverse, reach)
+        everywhere = np.zeros(len(pixels), dtype=np.int32)
+        self._score(*images, everywhere, self.settings.min_score - self.settings.min_lead, scores)
+        # What was left off as hopeless may lie beside a peak, whose form it is part of.
+        best = np.clip(scores.argmax(axis=1), 1, samples - 2)
+        peak = np.empty((len(pixels), 3), dtype=np.float32)
+        self._score(*images, (best - 1).astype(np.int32), OUTSIDE, peak)
+        return self._peaks(scores, peak, inverse, reach)
 
     def _choose(self, view: Keyframe, neighbours: Sequence[Keyframe]) -> list[Keyframe]:
         """The neighbours whose parallax is nearest to the wanted one, of those that look the same way."""
@@ -81,13 +88,14 @@ class EpipolarDepth:
         K, K_other = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1.0]]) for c in (view.camera, other.camera))
         return np.concatenate([K_other @ T[:3, :3] @ np.linalg.inv(K), (K_other @ T[:3, 3])[:, None]], axis=1)
 
-    def _peaks(self, scores: NDArray[np.float32], inverse: NDArray[np.float64], reach: float) -> DepthEstimate:
+    def _peaks(
+        self, scores: NDArray[np.float32], peak: NDArray[np.float32], inverse: NDArray[np.float64], reach: float
+    ) -> DepthEstimate:
+        """scores: (N, samples), too low where there is no match. peak: (N, 3) around the best of the inner samples."""
         samples = len(inverse)
-        rows = np.arange(len(scores))
         best = scores.argmax(axis=1)
-        top = scores[rows, best]
         inner = np.clip(best, 1, samples - 2)
-        left, right = scores[rows, inner - 1], scores[rows, inner + 1]
+        left, top, right = peak.T
         curvature = np.maximum(2 * top - left - right, 1e-6)
         offset = np.clip((right - left) / (2 * curvature), -0.5, 0.5)
         away = np.abs(np.arange(samples)[None] - best[:, None]) > 2
@@ -114,19 +122,22 @@ class EpipolarDepth:
         warps: ti.types.ndarray(dtype=ti.f32, ndim=3),
         pixels: ti.types.ndarray(dtype=ti.f32, ndim=2),
         inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        floor: ti.f32,
         scores: ti.types.ndarray(dtype=ti.f32, ndim=2),
     ):
+        """Scores of consecutive samples of each pixel, from its `first`; below `floor` an upper bound will do."""
         if ti.static(on_gpu()):
             # A thread a sample, which sums the patch anew: a quarter more work, in a hundred times as many threads.
-            samples = inverse.shape[0]
+            samples = scores.shape[1]
             for i in range(pixels.shape[0] * samples):
-                s = i % samples
-                self._score_pixel(i // samples, s, s + 1, grey, others, sizes, warps, pixels, inverse, scores)
+                n, s = i // samples, i % samples
+                self._score_pixel(n, s, s + 1, grey, others, sizes, warps, pixels, inverse, first, floor, scores)
         else:
             for i in range(pixels.shape[0] * SPREAD):
                 if i % SPREAD == 0:
-                    n = i // SPREAD
-                    self._score_pixel(n, 0, inverse.shape[0], grey, others, sizes, warps, pixels, inverse, scores)
+                    n, end = i // SPREAD, scores.shape[1]
+                    self._score_pixel(n, 0, end, grey, others, sizes, warps, pixels, inverse, first, floor, scores)
 
     @ti.func
     def _score_pixel(
@@ -140,6 +151,8 @@ class EpipolarDepth:
         warps: ti.template(),
         pixels: ti.template(),
         inverse: ti.template(),
+        first: ti.template(),
+        floor,
         scores: ti.template(),
     ):
         # Replicating the border keeps patches at the edge usable.
@@ -151,37 +164,68 @@ class EpipolarDepth:
             mean += value / PATCH
             square += value * value
         square -= PATCH * mean * mean
-        for s in range(begin, end):
+        textured = square > PATCH * MIN_CONTRAST * MIN_CONTRAST
+        for place in range(begin, end):
+            w = inverse[first[n] + place]
             total, seen = 0.0, 0
-            if square > PATCH * MIN_CONTRAST * MIN_CONTRAST:
-                for j in range(warps.shape[0]):
-                    inside = 1
-                    sum_, square_, product = 0.0, 0.0, 0.0
-                    for dy, dx in ti.ndrange(SIDE, SIDE):
-                        here = grey[ti.min(ti.max(top + dy, 0), bottom), ti.min(ti.max(left + dx, 0), right)]
-                        px, py = pixels[n, 0] + (dx - RADIUS), pixels[n, 1] + (dy - RADIUS)
-                        q = ti.Vector([0.0, 0.0, 0.0])
-                        for c in ti.static(range(3)):
-                            q[c] = (
-                                warps[j, c, 0] * px + warps[j, c, 1] * py + warps[j, c, 2] + inverse[s] * warps[j, c, 3]
-                            )
-                        x, y = q[0] / q[2] - 0.5, q[1] / q[2] - 0.5
-                        ok = (q[2] > 0.0) & (x >= 0.0) & (y >= 0.0)
-                        ok = ok & (x < sizes[j, 0] - 1.0) & (y < sizes[j, 1] - 1.0)
-                        inside = ti.select(ok, inside, 0)
-                        x0, y0 = ti.select(ok, ti.cast(x, ti.i32), 0), ti.select(ok, ti.cast(y, ti.i32), 0)
-                        u, v = x - x0, y - y0
-                        above = others[j, y0, x0] * (1.0 - u) + others[j, y0, x0 + 1] * u
-                        below = others[j, y0 + 1, x0] * (1.0 - u) + others[j, y0 + 1, x0 + 1] * u
-                        there = above * (1.0 - v) + below * v
-                        sum_ += there
-                        square_ += there * there
-                        product += there * (here - mean)
-                    if inside == 1:
-                        variance = ti.max(square_ - sum_ * sum_ / PATCH, 1e-8)
-                        total += product / ti.sqrt(variance * square)
+            bound = ti.select(textured, 1.0, OUTSIDE)
+            for j in range(warps.shape[0]):
+                if bound >= floor and textured:
+                    score = self._correlate(n, j, w, left, top, mean, square, grey, others, sizes, warps, pixels)
+                    if score > OUTSIDE:
+                        total += score
                         seen += 1
-            scores[n, s] = ti.select(seen > 0, total / ti.max(seen, 1), OUTSIDE)
+                    # The neighbours to come may agree wholly, but not more.
+                    more = warps.shape[0] - 1 - j
+                    bound = ti.select(seen + more > 0, (total + more) / ti.max(seen + more, 1), OUTSIDE)
+            scores[n, place] = bound
+
+    @ti.func
+    def _correlate(
+        self,
+        n,
+        j,
+        w,
+        left,
+        top,
+        mean,
+        square,
+        grey: ti.template(),
+        others: ti.template(),
+        sizes: ti.template(),
+        warps: ti.template(),
+        pixels: ti.template(),
+    ):
+        """ZNCC of a pixel's patch with neighbour j at inverse depth w; OUTSIDE where it leaves that image."""
+        right, bottom = grey.shape[1] - 1, grey.shape[0] - 1
+        q = ti.Vector([0.0, 0.0, 0.0])
+        for c in ti.static(range(3)):
+            q[c] = warps[j, c, 0] * pixels[n, 0] + warps[j, c, 1] * pixels[n, 1] + warps[j, c, 2] + w * warps[j, c, 3]
+        x, y = q[0] / q[2], q[1] / q[2]
+        # How the patch is turned and scaled, to first order: over three pixels the next is thousandths of one.
+        xx, xy = (warps[j, 0, 0] - x * warps[j, 2, 0]) / q[2], (warps[j, 0, 1] - x * warps[j, 2, 1]) / q[2]
+        yx, yy = (warps[j, 1, 0] - y * warps[j, 2, 0]) / q[2], (warps[j, 1, 1] - y * warps[j, 2, 1]) / q[2]
+        x, y = x - 0.5, y - 0.5
+        across, down = RADIUS * (ti.abs(xx) + ti.abs(xy)), RADIUS * (ti.abs(yx) + ti.abs(yy))
+        inside = (q[2] > 0.0) & (x >= across) & (y >= down)
+        inside = inside & (x + across < sizes[j, 0] - 1.0) & (y + down < sizes[j, 1] - 1.0)
+        score = OUTSIDE
+        if inside:
+            sum_, square_, product = 0.0, 0.0, 0.0
+            for dy, dx in ti.ndrange(SIDE, SIDE):
+                here = grey[ti.min(ti.max(top + dy, 0), bottom), ti.min(ti.max(left + dx, 0), right)]
+                px, py = x + (dx - RADIUS) * xx + (dy - RADIUS) * xy, y + (dx - RADIUS) * yx + (dy - RADIUS) * yy
+                x0, y0 = ti.cast(px, ti.i32), ti.cast(py, ti.i32)
+                u, v = px - x0, py - y0
+                above = others[j, y0, x0] * (1.0 - u) + others[j, y0, x0 + 1] * u
+                below = others[j, y0 + 1, x0] * (1.0 - u) + others[j, y0 + 1, x0 + 1] * u
+                there = above * (1.0 - v) + below * v
+                sum_ += there
+                square_ += there * there
+                product += there * (here - mean)
+            variance = ti.max(square_ - sum_ * sum_ / PATCH, 1e-8)
+            score = product / ti.sqrt(variance * square)
+        return score
 
 
 def _grey(view: Keyframe) -> NDArray[np.float32]:

@@ -43,6 +43,15 @@ def painted(store: KeyframeStore, paint) -> list[Keyframe]:
     return views
 
 
+def score(grey, others, warps, pixels, inverse, floor: float = OUTSIDE) -> np.ndarray:
+    """Scores (N, samples) of pixels at every inverse depth."""
+    scores = np.empty((len(pixels), len(inverse)), dtype=np.float32)
+    sizes = np.tile(np.array(others.shape[:0:-1], dtype=np.int32), (len(others), 1))
+    first = np.zeros(len(pixels), dtype=np.int32)
+    EpipolarDepth(SETTINGS)._score(grey, others, sizes, warps, pixels, inverse, first, floor, scores)
+    return scores
+
+
 def test_the_wall_is_found_to_a_part_of_a_pixel(store: KeyframeStore) -> None:
     estimate = EpipolarDepth(SETTINGS).estimate(store[2], list(store), PIXELS)
     known = np.isfinite(estimate.deviation)
@@ -60,9 +69,8 @@ def test_scores_are_the_correlation_of_patches_carried_over_at_that_depth(store:
     there = np.random.default_rng(1).uniform(size=(48, 64)).astype(np.float32)
     inverse = np.array([0.2, 0.25, 0.3], dtype=np.float32)
     pixels = np.array([[30.5, 20.5], [12.5, 33.5]], dtype=np.float32)
-    scores = np.empty((2, 3), dtype=np.float32)
     warp = EpipolarDepth._warp(view, other)[None].astype(np.float32)
-    EpipolarDepth(SETTINGS)._score(grey, there[None], np.array([[64, 48]], np.int32), warp, pixels, inverse, scores)
+    scores = score(grey, there[None], warp, pixels, inverse)
     T = other.T_camera_world @ inverse_se3(view.T_camera_world)
     steps = np.arange(-RADIUS, RADIUS + 1.0)
     offsets = np.stack([a.ravel() for a in np.meshgrid(steps, steps)], axis=1)
@@ -77,19 +85,29 @@ def test_scores_are_the_correlation_of_patches_carried_over_at_that_depth(store:
             b = (there[y, x] * (1 - u) + there[y, x + 1] * u) * (1 - v) + (
                 there[y + 1, x] * (1 - u) + there[y + 1, x + 1] * u
             ) * v
-            assert scores[n, s] == pytest.approx(np.corrcoef(a, b)[0, 1], abs=1e-4)
+            # White noise in a wide image shows most that the patch is turned and scaled to first order only.
+            assert scores[n, s] == pytest.approx(np.corrcoef(a, b)[0, 1], abs=3e-3)
 
 
 def test_patches_that_leave_the_image_have_no_score(store: KeyframeStore) -> None:
     view, other = store[4], store[0]  # the camera moves left: what is at the right edge of 4 is outside 0
-    scores = np.empty((1, 1), dtype=np.float32)
     grey = np.random.default_rng(0).uniform(size=(48, 64)).astype(np.float32)
     warp = EpipolarDepth._warp(view, other)[None].astype(np.float32)
     far_right = np.array([[1000.5, 20.5]], np.float32)
-    EpipolarDepth(SETTINGS)._score(
-        grey, grey[None], np.array([[64, 48]], np.int32), warp, far_right, np.array([0.25], np.float32), scores
-    )
-    assert scores[0, 0] == OUTSIDE
+    assert score(grey, grey[None], warp, far_right, np.array([0.25], np.float32))[0, 0] == OUTSIDE
+
+
+def test_a_sample_is_given_up_only_where_it_cannot_reach_the_floor(store: KeyframeStore) -> None:
+    grey, *others = np.random.default_rng(0).uniform(size=(4, 48, 64)).astype(np.float32)
+    others = np.stack([others[0], others[1], grey])
+    warps = np.stack([EpipolarDepth._warp(store[2], store[i]) for i in (0, 1, 2)]).astype(np.float32)
+    pixels, inverse = PIXELS.astype(np.float32), np.linspace(0.15, 0.4, 30).astype(np.float32)
+    exact = score(grey, others, warps, pixels, inverse)
+    bounds = score(grey, others, warps, pixels, inverse, floor=0.5)
+    given_up = bounds != exact
+    assert 0.3 < given_up.mean() < 0.99
+    assert (exact <= bounds + 1e-6).all()
+    assert (bounds[given_up] < 0.5).all()
 
 
 def test_a_blank_wall_is_left_out(store: KeyframeStore) -> None:
