@@ -53,6 +53,7 @@ class GaussianField:
         self.steps = ti.field(ti.i32)
         self.anchor = ti.field(ti.i32)
         self.touched = ti.field(ti.i32)
+        self._caught = ti.field(ti.i32)
 
         builder = ti.FieldsBuilder()
         blocks = growing(builder, self.capacity // BLOCK)
@@ -68,8 +69,9 @@ class GaussianField:
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
         blocks.dense(ti.i, BLOCK).place(self.steps, self.anchor, self.touched)
+        builder.dense(ti.i, 2).place(self._caught)
         builder.finalize()
-        refuse_too_many_fields(self.touched)
+        refuse_too_many_fields(self._caught)
 
     def __len__(self) -> int:
         return self.count
@@ -227,6 +229,12 @@ class GaussianField:
         """Drop what the views rendered since the last Adam step have added to the gradients."""
         if self.count:
             self._clear_gradients(self.count)
+
+    def take_caught(self) -> tuple[int, int]:
+        """Steps that were left out and Gaussians that had exploded (see `Adam`), since this was asked last."""
+        caught = self._caught[0], self._caught[1]
+        self._caught.fill(0)
+        return caught
 
     def opacities(self) -> NDArray:
         """Opacity in (0, 1) of all Gaussians (N,)."""

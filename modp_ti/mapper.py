@@ -104,8 +104,8 @@ class Mapper:
     ) -> None:
         """Finish the map, and optimise it for all keyframes alike. More frames may follow.
 
-        settings: all but its own number of steps. progress, done: see `pipelines.refinement.refine`. Raises ValueError for
-        an offline map, which has been.
+        settings: all but its own number of steps. progress, done: see `pipelines.refinement.refine`. Raises ValueError
+        for an offline map, which has been.
         """
         if isinstance(self.pipeline, OfflineMapper):
             raise ValueError("an offline map is not refined: give its settings more steps")

@@ -141,6 +141,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapsh
                 line.stop()
             if scores is not None:
                 ground_truth = getattr(tracker, "ground_truth", list)()
+                caught = mapper.pipeline.caught()
+                _say([caught.warning()] if caught.warning() else [], console, record)
                 metrics = {
                     "keyframes": len(keyframes),
                     "gaussians": len(mapper.pipeline.gaussians),
@@ -149,6 +151,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapsh
                     "frames_per_second": round(len(frames) / clock.mapping, 4),
                     "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
                     "snapshots": {"written": keeper.written, "failed": keeper.failed, "resumed": keeper.resumed},
+                    "guards": caught.counts(),
                     "lpips_note": no_lpips,
                     "breakdown_percent": breakdown,
                     **metrics_of(scores, versions, frames, watch.seconds | {"total": clock.total}),

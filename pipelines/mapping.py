@@ -23,6 +23,7 @@ from pipelines.contribution import Contribution
 from pipelines.corrections import CorrectionReport, lag_in_pixels, revise
 from pipelines.densification import dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.depth import DepthEstimator, build_depth
+from pipelines.guards import Guards
 from pipelines.keyframe_selection import KeyframeSelector
 from pipelines.map_state import MapState
 from pipelines.optimisation import MapOptimiser
@@ -258,6 +259,10 @@ class OnlineMapper:
             spacing = self.anchors[-1].spacing
             grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, len(self.anchors) - 1)
 
+    def caught(self) -> Guards:
+        """What the guards have caught so far. Waits for the device."""
+        return self.optimiser.caught()
+
     # ---- snapshots -------------------------------------------------------------------------------------------
 
     def state(self) -> MapState:
@@ -280,6 +285,7 @@ class OnlineMapper:
             "frames": self._frames,
             "view_renders": self.renderer.view_renders,
             "random": self.rng.bit_generator.state,
+            "guards": self.optimiser.caught().counts(),
         }
         if self.voxels is not None:
             places, words = self.voxels.marks()
@@ -319,6 +325,7 @@ class OnlineMapper:
         self._frames = int(state.numbers["frames"])
         self.renderer.view_renders = int(state.numbers["view_renders"])
         self.rng.bit_generator.state = state.numbers["random"]
+        self.optimiser.guards.restore(state.numbers["guards"])
 
     # ---- compiling -------------------------------------------------------------------------------------------
 
