@@ -74,7 +74,8 @@ def _run(scene: Path | None, resume: Path | None, overrides: list[str], quiet: b
 
     from modp_ti.session import run_scene
 
-    return run_scene(config, progress_console(quiet), snapshot)
+    console = progress_console(quiet)
+    return run_scene(config, console) if snapshot is None else run_scene(config, console, snapshot)
 
 
 if __name__ == "__main__":

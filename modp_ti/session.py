@@ -30,7 +30,7 @@ from modp_ti.results import Results, metrics_of
 from modp_ti.run_clock import RunClock
 from modp_ti.settings import SceneConfig
 from modp_ti.snapshots import Keeper, Snapshot, replay
-from modp_ti.trackers import close, events, frame_count, may_read_ahead, open_tracker
+from modp_ti.trackers import Tracker, close, events, frame_count, may_read_ahead, open_tracker
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
@@ -99,6 +99,12 @@ def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapsh
         clock.end_mapping(observer.waited)
     # How a live tracker's frames ended.
     _say([note for note in tracker.notes if note not in notes], console, record)
+    refused = {
+        reason: count for reason, count in _left_out(tracker, mapper).items() if count and reason != "unreadable"
+    }
+    if refused:
+        text = ", ".join(f"{count} {reason}" for reason, count in refused.items())
+        _say([f"frames that did not touch the map (mapping.gate): {text}"], console, record)
     breakdown = breakdown_percent(watch.seconds, clock.mapping)
     frames, keyframes = mapper.frames, mapper.pipeline.keyframes
     if len(keyframes) == 0:
@@ -152,6 +158,7 @@ def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapsh
                     "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
                     "snapshots": {"written": keeper.written, "failed": keeper.failed, "resumed": keeper.resumed},
                     "guards": caught.counts(),
+                    "frames_left_out": _left_out(tracker, mapper),
                     "lpips_note": no_lpips,
                     "breakdown_percent": breakdown,
                     **metrics_of(scores, versions, frames, watch.seconds | {"total": clock.total}),
@@ -170,6 +177,12 @@ def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapsh
     keeper.remove()
     line.summary(metrics)
     return config.output
+
+
+def _left_out(tracker: Tracker, mapper: Mapper) -> dict[str, int]:
+    """How many frames did not touch the map because something is wrong with them, by what."""
+    gate = getattr(mapper.pipeline, "gate", None)
+    return {"unreadable": len(getattr(tracker, "unreadable", ())), **({} if gate is None else gate.refused)}
 
 
 def _stopped(config: SceneConfig, mapper: Mapper, keeper: Keeper) -> KeyboardInterrupt:

@@ -23,6 +23,7 @@ from pipelines.contribution import Contribution
 from pipelines.corrections import CorrectionReport, lag_in_pixels, revise
 from pipelines.densification import dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.depth import DepthEstimator, build_depth
+from pipelines.frame_gate import FrameGate
 from pipelines.guards import Guards
 from pipelines.keyframe_selection import KeyframeSelector
 from pipelines.map_state import MapState
@@ -88,6 +89,7 @@ class OnlineMapper:
         self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side)
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
+        self.gate = FrameGate(settings.gate)
         self.selector = KeyframeSelector(settings.keyframes)
         self.depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
@@ -112,7 +114,10 @@ class OnlineMapper:
         if self._frames % self.settings.densify.prune_every == 0:
             self.prune()
         with self.stopwatch.measure("select"):
-            is_keyframe = self.selector.is_keyframe(frame, self.keyframes[-1] if len(self.keyframes) else None)
+            last = self.keyframes[-1] if len(self.keyframes) else None
+            if self.gate.refuses(frame, last, self.renderer, self.near):
+                return FrameReport(frame.index, False, len(self.keyframes), len(self.gaussians), None)
+            is_keyframe = self.selector.is_keyframe(frame, last)
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
@@ -140,6 +145,7 @@ class OnlineMapper:
             motion = revise(self.keyframes, self._tracked, correction)
             self._tracked = {index: motion.of(index, T)[0] for index, T in self._tracked.items()}
             self.selector.correct(motion)
+            self.gate.correct(motion)
             lags = np.array([lag_in_pixels(view) for view in self.keyframes])
             if not (settings.enabled and (lags > settings.min_pixels).any()):
                 return CorrectionReport(motion, moved=False)
@@ -285,6 +291,7 @@ class OnlineMapper:
             "frames": self._frames,
             "view_renders": self.renderer.view_renders,
             "random": self.rng.bit_generator.state,
+            "gate": self.gate.state(),
             "guards": self.optimiser.caught().counts(),
         }
         if self.voxels is not None:
@@ -325,6 +332,7 @@ class OnlineMapper:
         self._frames = int(state.numbers["frames"])
         self.renderer.view_renders = int(state.numbers["view_renders"])
         self.rng.bit_generator.state = state.numbers["random"]
+        self.gate.restore(state.numbers["gate"])
         self.optimiser.guards.restore(state.numbers["guards"])
 
     # ---- compiling -------------------------------------------------------------------------------------------
