@@ -25,7 +25,8 @@ EXAMPLES = examples(
     "modp-ti run scene.yaml",
     "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
-    "modp-ti run scene.yaml --set snapshot_every=50   (then, after a crash: modp-ti run --resume OUT)",
+    "modp-ti run scene.yaml --set snapshot_every=50",
+    "modp-ti run --resume OUT   (goes on after a crash or Ctrl-C; OUT: the output folder)",
     "modp-ti run scene.yaml --quiet --json > result.json",
 )
 
@@ -47,6 +48,8 @@ def run(
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
     """Map a posed sequence while its frames arrive, and write splats, poses, metrics, pictures and a report."""
+    if scene is None and resume is None:
+        raise typer.BadParameter("name a scene file, or the output folder of a run to go on with (--resume OUT)")
     with outcome(as_json) as result:
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
         folder = _run(scene, resume, overrides, quiet)
@@ -65,9 +68,8 @@ def _run(scene: Path | None, resume: Path | None, overrides: list[str], quiet: b
         from modp_ti.snapshots import load_resumed
 
         config, snapshot = load_resumed(resume, scene, overrides)
-    elif scene is None:
-        raise InputError("nothing to run: name a scene file, or an output folder to go on with (--resume OUT)")
     else:
+        assert scene is not None, "run() asks for one of them"
         config = load_scene(scene, overrides)
     if config.output.exists() and not config.output.is_dir():
         raise InputError(f"{config.output}: output must be a folder, this is a file")

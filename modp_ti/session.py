@@ -87,6 +87,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapsh
             with line.working(f"reading again what {resumed.path} was made of"):
                 replay(resumed, mapper, rest, keeper.digest)
             keeper.go_on_from(resumed)
+        elif keeper.path.exists():
+            _say([f"{keeper.path} is of an earlier run: the first one of this run takes its place"], console, record)
         observer.begin(mapper, frame_count(tracker))
         held.enter_context(stop)
         clock.begin_mapping()

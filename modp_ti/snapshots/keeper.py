@@ -81,20 +81,22 @@ class Keeper:
         """What to add to a message about outputs that could not be written: how not to lose the work; "" for no way."""
         if not self.possible or not self.path.is_file():
             return ""
-        return f"; make room, then `modp-ti run --resume {self.path.parent}` goes on from {self.path.name}"
+        return f"; `modp-ti run --resume {self.path.parent}` goes on from its snapshot, once that is mended"
 
     def remove(self) -> None:
-        """The run is finished and needs it no longer."""
-        self.path.unlink(missing_ok=True)
+        """The run is finished and needs it no longer, nor what a kill may have left half written."""
+        for name in (FILE, FILE + ".partial"):
+            self.path.with_name(name).unlink(missing_ok=True)
 
     def go_on_from(self, snapshot: Snapshot) -> None:
-        """Take over what the snapshot knows of the run, the map apart."""
-        self.online = snapshot.online()
-        self.refined = snapshot.position.refined
-        self.resumed = int(snapshot.numbers["resumed"]) + 1
-        self.written = int(snapshot.numbers["written"])
-        self._clock.resume(float(snapshot.numbers["total"]), float(snapshot.numbers["mapping"]))
-        snapshot.record(self._record)
+        """Take over what the snapshot knows of the run, the map apart. Raises InputError where it is not whole."""
+        with snapshot.fitting():
+            self.online = snapshot.online()
+            self.refined = snapshot.position.refined
+            self.resumed = int(snapshot.numbers["resumed"]) + 1
+            self.written = int(snapshot.numbers["written"])
+            self._clock.resume(float(snapshot.numbers["total"]), float(snapshot.numbers["mapping"]))
+            snapshot.record(self._record)
 
     def _snapshot(self, position: Position) -> Snapshot:
         version, frames = version_state(self.online), frames_state(self._mapper.frames)

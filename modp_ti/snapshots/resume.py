@@ -89,12 +89,9 @@ def replay(
             if isinstance(event, TrackedFrame) and not event.held_out:
                 yield event
 
-    try:
+    with snapshot.fitting():
         mapper.restore(snapshot.map, snapshot.frames(), frames(), position.finished)
         mapper.pipeline.stopwatch.seconds |= snapshot.numbers["watch"]
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{snapshot.path}: does not fit together ({reason}); start the run from its scene") from None
     if digest.value != position.digest:
         raise _changed(snapshot, "its images, poses or points are others")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from modp_ti.delivered_frames import DeliveredFrames
+from modp_ti.errors import InputError
 from modp_ti.evaluation import MapVersion
 from modp_ti.report.record import FrameNote, RunRecord, StepNote
 from modp_ti.snapshots.file import read_arrays, write_arrays
@@ -60,7 +63,19 @@ class Snapshot:
     def read(cls, path: Path) -> Snapshot:
         """The snapshot of that file. Raises InputError (one line) where it cannot be used."""
         arrays, about = read_arrays(path)
-        return cls(path, about["settings"], Position(**about["position"]), arrays, about["numbers"])
+        try:
+            position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise _unfit(path, error) from None
+        return cls(path, settings, position, arrays, numbers)
+
+    @contextmanager
+    def fitting(self) -> Iterator[None]:
+        """While its parts are put to use: what does not fit together is refused in one line, as InputError."""
+        try:
+            yield
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise _unfit(self.path, error) from None
 
     def frames(self) -> DeliveredFrames:
         """What had been kept of the frames. Raises KeyError or ValueError where it is not whole."""
@@ -100,6 +115,11 @@ class Snapshot:
         pairs = zip(steps["step"].tolist(), steps["psnr"].tolist(), strict=True)
         record.steps = [StepNote(step, value) for step, value in pairs]
         record.started = float(self.numbers["started"])
+
+
+def _unfit(path: Path, error: Exception) -> InputError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return InputError(f"{path}: does not fit together ({reason}); start the run from its scene")
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:
