@@ -175,7 +175,8 @@ def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapsh
         raise InputError(f"{error}{keeper.way_on()}") from None
     if metrics is None:
         results.remove_figures()
-        raise KeyboardInterrupt(f"interrupted: the finished map is in {config.output}, without its scores")
+        more = f"; modp-ti run --resume {config.output} scores it" if keeper.path.is_file() else ""
+        raise KeyboardInterrupt(f"interrupted: the finished map is in {config.output}, without its scores{more}")
     keeper.remove()
     line.summary(metrics)
     return config.output

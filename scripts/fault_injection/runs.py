@@ -13,7 +13,7 @@ from typing import Any
 
 from modp_ti.errors import InputError
 
-__all__ = ["COMPARED", "Ended", "contents", "finished", "metrics", "run_until"]
+__all__ = ["COMPARED", "Ended", "contents", "finished", "metrics", "require_success", "run_until"]
 
 # What must be the same after an interrupted run.
 COMPARED = ("splats.ply", "trajectory.txt")
@@ -65,9 +65,14 @@ def _stamp(file: Path) -> int:
 def finished(arguments: list[str], output: Path) -> Ended:
     """The same, to its end. Raises InputError with what it said where that is not a good one."""
     ended = run_until(arguments, output / "snapshot.npz")
+    require_success(ended, output)
+    return ended
+
+
+def require_success(ended: Ended, output: Path) -> None:
+    """Raises InputError for a run that ended badly by itself."""
     if ended.code:
         raise InputError(f"the run into {output} ended with {ended.code}: {ended.said.strip()[-500:]}")
-    return ended
 
 
 def contents(output: Path) -> dict[str, bytes]:
