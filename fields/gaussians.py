@@ -15,6 +15,8 @@ __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
 SH_C0 = 0.28209479177387814
 BLOCK = 1024
 NO_ANCHOR = -1
+# Ends of the names of Adam's first and second moments.
+MOMENTS = ("_m", "_v")
 
 
 @ti.data_oriented
@@ -51,6 +53,7 @@ class GaussianField:
         self.steps = ti.field(ti.i32)
         self.anchor = ti.field(ti.i32)
         self.touched = ti.field(ti.i32)
+        self._caught = ti.field(ti.i32)
 
         builder = ti.FieldsBuilder()
         blocks = growing(builder, self.capacity // BLOCK)
@@ -66,8 +69,9 @@ class GaussianField:
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
         blocks.dense(ti.i, BLOCK).place(self.steps, self.anchor, self.touched)
+        builder.dense(ti.i, 2).place(self._caught)
         builder.finalize()
-        refuse_too_many_fields(self.touched)
+        refuse_too_many_fields(self._caught)
 
     def __len__(self) -> int:
         return self.count
@@ -136,7 +140,7 @@ class GaussianField:
         """The anchor of every Gaussian (N,)."""
         out = np.zeros(self.count, dtype=np.int32)
         if self.count:
-            self._read_anchors(out)
+            self._read_numbers(self.anchor, out)
         return out
 
     def gradients_to_numpy(self) -> dict[str, NDArray]:
@@ -151,16 +155,57 @@ class GaussianField:
         return dict(zip(_NAMES, arrays, strict=True))
 
     def load(self, state: dict[str, NDArray]) -> None:
-        """Replace the content by the values of `state`, as `to_numpy` gives them; they have no anchors.
+        """Replace the content by the values of `state`, as `to_numpy` gives them.
 
-        Raises as `append` does, the content then being what it was.
+        Their anchors are those of its entry `anchor` (N,), without one they have none. Raises as `append` does, the
+        content then being what it was.
         """
         before, self.count = self.count, 0
         try:
+            anchor = state.get("anchor")
+            if anchor is not None and np.shape(anchor) != np.shape(state["opacity_logit"]):
+                raise ValueError(f"anchor has shape {np.shape(anchor)}, expected {np.shape(state['opacity_logit'])}")
             self.append(**{name: state[name] for name in _NAMES})
         except ValueError:
             self.count = before
             raise
+        if anchor is not None and self.count:
+            self._write_numbers(self.anchor, np.ascontiguousarray(anchor, dtype=np.int32))
+
+    def history(self) -> dict[str, NDArray]:
+        """What the Gaussians remember beside their values: `NAME_m` and `NAME_v` of each value, `steps` and `anchor`.
+
+        With the values of `to_numpy` it is all that they are between two steps.
+        """
+        moments = {
+            name + end: array
+            for end in MOMENTS
+            for name, array in self._to_numpy([getattr(self, name + end) for name in _NAMES]).items()
+        }
+        steps = np.zeros(self.count, dtype=np.int32)
+        if self.count:
+            self._read_numbers(self.steps, steps)
+        return moments | {"steps": steps, "anchor": self.anchors()}
+
+    def restore(self, state: dict[str, NDArray]) -> None:
+        """Replace the content by values and history, as `to_numpy` and `history` gave them.
+
+        Raises KeyError for what is missing, and ValueError as `append` does and for moments that are not of the values'
+        shapes or not finite.
+        """
+        for name in (name + end for end in MOMENTS for name in _NAMES):
+            if state[name].shape != state[name[:-2]].shape or not np.isfinite(state[name]).all():
+                raise ValueError(f"{name} must be finite and {state[name[:-2]].shape}, not {state[name].shape}")
+        for name in ("steps", "anchor"):
+            if state[name].shape != state["opacity_logit"].shape:
+                raise ValueError(f"{name} has shape {state[name].shape}, expected {state['opacity_logit'].shape}")
+        self.load(state)
+        if self.count == 0:
+            return
+        for end in MOMENTS:
+            arrays = [np.ascontiguousarray(state[name + end], dtype=self.dtype) for name in _NAMES]
+            self._write_moments(*(getattr(self, name + end) for name in _NAMES), *arrays)
+        self._write_numbers(self.steps, np.ascontiguousarray(state["steps"], dtype=np.int32))
 
     def take(self, tensors: Sequence[torch.Tensor]) -> None:
         """Replace the content by tensors in the order and shapes of `append`, without a way over the host.
@@ -184,6 +229,12 @@ class GaussianField:
         """Drop what the views rendered since the last Adam step have added to the gradients."""
         if self.count:
             self._clear_gradients(self.count)
+
+    def take_caught(self) -> tuple[int, int]:
+        """Steps that were left out and Gaussians that had exploded (see `Adam`), since this was asked last."""
+        caught = self._caught[0], self._caught[1]
+        self._caught.fill(0)
+        return caught
 
     def opacities(self) -> NDArray:
         """Opacity in (0, 1) of all Gaussians (N,)."""
@@ -249,9 +300,39 @@ class GaussianField:
             self.anchor[i] = anchor
 
     @ti.kernel
-    def _read_anchors(self, out: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+    def _read_numbers(self, field: ti.template(), out: ti.types.ndarray(dtype=ti.i32, ndim=1)):
         for i in range(out.shape[0]):
-            out[i] = self.anchor[i]
+            out[i] = field[i]
+
+    @ti.kernel
+    def _write_numbers(self, field: ti.template(), values: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+        for i in range(values.shape[0]):
+            field[i] = values[i]
+
+    @ti.kernel
+    def _write_moments(
+        self,
+        position: ti.template(),
+        log_scale: ti.template(),
+        quaternion: ti.template(),
+        opacity_logit: ti.template(),
+        sh: ti.template(),
+        of_position: ti.types.ndarray(),
+        of_log_scale: ti.types.ndarray(),
+        of_quaternion: ti.types.ndarray(),
+        of_opacity_logit: ti.types.ndarray(),
+        of_sh: ti.types.ndarray(),
+    ):
+        for i in range(of_opacity_logit.shape[0]):
+            for c in ti.static(range(3)):
+                position[i][c] = of_position[i, c]
+                log_scale[i][c] = of_log_scale[i, c]
+            for c in ti.static(range(4)):
+                quaternion[i][c] = of_quaternion[i, c]
+            opacity_logit[i] = of_opacity_logit[i]
+            for k in range(self.sh_count):
+                for c in ti.static(range(3)):
+                    sh[i, k][c] = of_sh[i, k, c]
 
     @ti.kernel
     def _read(

@@ -72,6 +72,8 @@ class OccupancyVoxels:
             node = node.pointer(ti.ijk, (fan_out,) * 3)
         node.dense(ti.l, WORDS).place(self.words)
         self._bricks = node
+        self._next = ti.field(ti.i32)
+        builder.place(self._next)
         builder.finalize()
         refuse_too_many_fields(self.words)
 
@@ -85,6 +87,33 @@ class OccupancyVoxels:
     def clear(self) -> None:
         """Forget all marks. The memory of the places stays, for those around them."""
         self._clear()
+
+    def marks(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
+        """All marks: places (M, 4) of words that have any, in their order, and the words (M,). For `restore`."""
+        count = self._count_bricks()
+        corners, words = np.zeros((count, 3), dtype=np.int32), np.zeros((count, WORDS), dtype=np.uint64)
+        if count:
+            self._next[None] = 0
+            self._read_bricks(corners, words)
+        brick, word = np.nonzero(words)
+        places = np.column_stack([corners[brick], word]).astype(np.int32)
+        order = np.lexsort(places.T[::-1])
+        return places[order], words[brick, word][order]
+
+    def restore(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
+        """Replace all marks by those that `marks` gave, of voxels with as many levels.
+
+        Raises ValueError for places that there are not.
+        """
+        limit = [BRICKS * -(-self.levels // BRICK_LEVELS), BRICKS, BRICKS, WORDS]
+        if places.shape != (len(words), 4) or words.ndim != 1:
+            raise ValueError(f"marks have places {places.shape} and words {words.shape}, expected (M, 4) and (M,)")
+        if ((places < 0) | (places >= limit)).any():
+            raise ValueError("marks lie outside the voxels")
+        self._clear()
+        if len(words):
+            places = np.ascontiguousarray(places, dtype=np.int32)
+            self._write_words(places, np.ascontiguousarray(words, dtype=np.uint64))
 
     def level_of(self, size: ArrayLike) -> NDArray[np.int32]:
         """The finest level whose cells are at least `size` wide; 0, the coarsest, for sizes beyond all of them."""
@@ -173,6 +202,28 @@ class OccupancyVoxels:
         for i, j, k in self._bricks:
             for word in range(WORDS):
                 self.words[i, j, k, word] = ti.u64(0)
+
+    @ti.kernel
+    def _count_bricks(self) -> ti.i32:
+        count = 0
+        for _i, _j, _k in self._bricks:
+            count += 1
+        return count
+
+    @ti.kernel
+    def _read_bricks(
+        self, corners: ti.types.ndarray(dtype=ti.i32, ndim=2), words: ti.types.ndarray(dtype=ti.u64, ndim=2)
+    ):
+        for i, j, k in self._bricks:
+            row = ti.atomic_add(self._next[None], 1)
+            corners[row, 0], corners[row, 1], corners[row, 2] = i, j, k
+            for word in range(WORDS):
+                words[row, word] = self.words[i, j, k, word]
+
+    @ti.kernel
+    def _write_words(self, places: CELLS, words: ti.types.ndarray(dtype=ti.u64, ndim=1)):
+        for m in range(words.shape[0]):
+            self.words[places[m, 0], places[m, 1], places[m, 2], places[m, 3]] = words[m]
 
     @ti.kernel
     def _query(self, cells: CELLS, level: LEVELS, out: FLAGS):

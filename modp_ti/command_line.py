@@ -86,8 +86,8 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
             yield result
     except InputError as error:
         _end(BAD_INPUT, " ".join(str(error).split()), as_json)
-    except KeyboardInterrupt:
-        _end(INTERRUPTED, "interrupted", as_json)
+    except KeyboardInterrupt as stop:
+        _end(INTERRUPTED, str(stop) or "interrupted", as_json)
     except Exception as error:
         traceback.print_exc()
         _end(FAULT, f"a fault of the program, not of your input; please report what stands above ({error!r})", as_json)

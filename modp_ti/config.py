@@ -17,11 +17,12 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from modp_ti.atomic import replace_text
 from modp_ti.config_keys import as_yaml, documented_keys, markdown_of_keys, sections_of
 from modp_ti.errors import InputError
 from modp_ti.settings import SceneConfig
 
-__all__ = ["dump_scene", "load_scene"]
+__all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneConfig:
@@ -52,15 +53,25 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     return _with_absolute_paths(config, file.resolve().parent)
 
 
+def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = ()) -> SceneConfig:
+    """The settings that a run has kept as plain data, `name` being the file; overrides as of `load_scene`.
+
+    Raises InputError for settings that this version does not have, and as `load_scene` does.
+    """
+    where: dict[str, str] = {}
+    _refuse_unknown_keys(data, SceneConfig, where, name)
+    data = json.loads(json.dumps(data))
+    for override in overrides:
+        _apply_override(data, override, where)
+    return _with_absolute_paths(_validated(data, where, name), Path.cwd())
+
+
 def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
     """Writes every setting with absolute paths, so that the file gives the same run from wherever it lies."""
     resolved = _with_absolute_paths(config, Path.cwd())
     text = "# Every setting of this run: `modp-ti run` on this file gives the same map.\n"
     text += yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, target)
+    replace_text(path, text)
 
 
 def _with_absolute_paths(model: Any, base: Path) -> Any:

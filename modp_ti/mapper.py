@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from modp_ti.evaluation import MapVersion
 from modp_ti.exports.colmap_model import image_names
 from modp_ti.exports.map_folder import appearing, write_map
 from modp_ti.exports.splats_ply import write_splats
+from pipelines.map_state import MapState
 from pipelines.mapping import FrameReport, OnlineMapper
 from pipelines.offline import OfflineMapper
 from pipelines.refinement import refine
@@ -99,17 +100,32 @@ class Mapper:
         steps: int,
         settings: RefineSettings | None = None,
         progress: Callable[[int, float], None] | None = None,
+        done: int = 0,
     ) -> None:
         """Finish the map, and optimise it for all keyframes alike. More frames may follow.
 
-        settings: all but its own number of steps. progress: see `pipelines.refinement.refine`. Raises ValueError for
-        an offline map, which has been.
+        settings: all but its own number of steps. progress, done: see `pipelines.refinement.refine`. Raises ValueError
+        for an offline map, which has been.
         """
         if isinstance(self.pipeline, OfflineMapper):
             raise ValueError("an offline map is not refined: give its settings more steps")
         self.finish()
         settings = RefineSettings() if settings is None else settings
-        refine(self.pipeline, settings.model_copy(update={"steps": steps}), progress)
+        refine(self.pipeline, settings.model_copy(update={"steps": steps}), progress, done)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the frames so far have had what follows the last one."""
+        return self._finished
+
+    def restore(self, state: MapState, frames: DeliveredFrames, again: Iterable[TrackedFrame], finished: bool) -> None:
+        """Become what another mapper of the same settings was: `pipeline.state()`, `frames` and `finished` of it.
+
+        again: the same frames as it took in, held-out ones left out. Raises as `OnlineMapper.restore`.
+        """
+        self.pipeline.restore(state, again)
+        self.frames = frames
+        self._finished = finished
 
     def trajectory(self) -> list[NDArray[np.float64]]:
         """Refined T_camera_world (4, 4) of every frame so far."""

@@ -55,8 +55,8 @@ class ProgressLine:
         finally:
             self.stop()
 
-    def start_mapping(self, frames: int | None, what: str = "mapping") -> None:
-        self._begin(what, frames)
+    def start_mapping(self, frames: int | None, what: str = "mapping", done: int = 0) -> None:
+        self._begin(what, frames, done)
 
     def frame(self, report: FrameReport | None) -> None:
         """Show a frame that is done; None for one that is held out."""
@@ -68,8 +68,8 @@ class ProgressLine:
         speed = f"  {task.speed:.2f} frames/s" if task.speed else ""
         self._update(advance=1, state=self._state + speed)
 
-    def start_refining(self, steps: int) -> None:
-        self._begin("refining", steps)
+    def start_refining(self, steps: int, done: int = 0) -> None:
+        self._begin("refining", steps, done)
 
     def refined(self, step: int, psnr: float) -> None:
         self._update(completed=step, state=f"{psnr:.2f} dB")
@@ -118,7 +118,7 @@ class ProgressLine:
         line = f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}"
         self.console.print(line, highlight=False, soft_wrap=True)
 
-    def _begin(self, what: str, total: int | None) -> None:
+    def _begin(self, what: str, total: int | None, done: int = 0) -> None:
         self.stop()
         self._state = ""
         self._logged = time.monotonic()
@@ -130,5 +130,5 @@ class ProgressLine:
             TextColumn("{task.fields[state]}"),
             console=self.console,
         )
-        self._task = self._progress.add_task(what, total=total, state="")
+        self._task = self._progress.add_task(what, total=total, completed=done, state="")
         self._progress.start()

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.keyframes import KeyframeStore
 from fields.tracked_frame import TrackedFrame
+from modp_ti.atomic import replace_text, write_picture
 from modp_ti.config import dump_scene
 from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.evaluation import FrameScore, MapVersion, summary
@@ -31,6 +31,10 @@ __all__ = ["Results", "metrics_of"]
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Versions of a map that metrics.json has room for; null where a run does not make one.
 MAPS = ("online", "refined", "offline")
+
+
+# What is written of a finished map alone.
+FIGURES = ("metrics.json", "scores.csv", "report.html")
 
 
 class Results:
@@ -73,7 +77,12 @@ class Results:
     def write_scores(self, scores: list[FrameScore], metrics: dict) -> None:
         """Write the scores of all frames, and the run's figures."""
         write_scores(self.folder / "scores.csv", scores)
-        (self.folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        replace_text(self.folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+
+    def remove_figures(self) -> None:
+        """Take away what an earlier run has left in the output folder that this one, stopped, has not made."""
+        for name in FIGURES:
+            (self.config.output / name).unlink(missing_ok=True)
 
     def write_report(
         self,
@@ -146,7 +155,7 @@ def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[
 def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
     """A PNG with the frame on the left and the render on the right."""
     pair = np.hstack([image, render])
-    cv2.imwrite(str(path), np.round(pair[..., ::-1] * 255.0).astype(np.uint8))
+    write_picture(path, np.round(pair * 255.0).astype(np.uint8))
 
 
 def _seconds(stages: dict[str, float]) -> dict[str, float]:

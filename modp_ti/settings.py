@@ -303,6 +303,12 @@ class SceneConfig(StrictModel):
         description="`online` maps while frames arrive and then refines; `offline` is 3DGS on all frames at once",
     )
     seed: int = Field(0, ge=0, description="seed of all randomness")
+    snapshot_every: int | None = Field(
+        None,
+        ge=0,
+        description="frames after which everything is kept in `snapshot.npz`, for `modp-ti run --resume` after a crash "
+        "or a power cut; empty or 0 for none. Ctrl-C keeps it in any case",
+    )
     threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
@@ -310,6 +316,21 @@ class SceneConfig(StrictModel):
     evaluation: EvaluationSettings = EvaluationSettings()
     export: ExportSettings = ExportSettings()
     view: ViewSettings = ViewSettings()
+
+    @property
+    def can_be_resumed(self) -> bool:
+        """Whether a snapshot is of use: what arrives live is gone when the process is."""
+        return self.mode == "online" and self.source.stream is None and self.tracker.kind != "socket"
+
+    @model_validator(mode="after")
+    def _snapshots_are_of_use(self) -> SceneConfig:
+        if self.snapshot_every and not self.can_be_resumed:
+            if self.mode != "online":
+                raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; take it out")
+            raise ValueError(
+                "snapshot_every: frames that come live are gone when the run is; record them, or take it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _images_are_named(self) -> SceneConfig:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,39 @@ class TrackedPoints:
             places[seen] = moved_points(motions[frame], places[seen])
         rows = np.array([self._row_of.get(i, -1) for i in ids.tolist()], dtype=np.int64)
         places[rows[rows >= 0]] = xyz[rows >= 0]
+
+    def state(self) -> dict[str, NDArray]:
+        """All of it as arrays, for `restore`."""
+        return {
+            "counts": np.array([len(rows) for rows in self.rows], dtype=np.int64),
+            "rows": np.concatenate([*self.rows, np.zeros(0, dtype=np.int64)]),
+            "pixels": np.concatenate([*self.pixels, np.zeros((0, 2), dtype=np.float32)]),
+            "ids": self.ids,
+            "xyz": self.xyz,
+            "colours": self._colours[: len(self)],
+            "last": self._last[: len(self)],
+        }
+
+    def restore(self, state: Mapping[str, NDArray], held_out: Sequence[bool]) -> None:
+        """Become what `state` was taken of. held_out: which frames are.
+
+        Raises KeyError or ValueError for what is no such state.
+        """
+        count, frames = len(state["ids"]), len(held_out)
+        shapes = {"xyz": (count, 3), "colours": (count, 4), "last": (count, 1), "counts": (frames,)}
+        seen = int(state["counts"].sum())
+        for name, shape in (shapes | {"rows": (seen,), "pixels": (seen, 2)}).items():
+            if state[name].shape != shape:
+                raise ValueError(f"{name} of the points has shape {state[name].shape}, expected {shape}")
+        for name, limit in (("rows", count), ("last", frames)):
+            if ((state[name] < 0) | (state[name] >= limit)).any():
+                raise ValueError(f"{name} of the points names some that there are not")
+        cuts = np.cumsum(state["counts"])[:-1] if frames else []
+        self.rows = np.split(state["rows"], cuts) if frames else []
+        self.pixels = np.split(state["pixels"], cuts) if frames else []
+        self._held_out = list(held_out)
+        self._row_of = {i: row for row, i in enumerate(state["ids"].tolist())}
+        self._xyz, self._colours, self._last = state["xyz"], state["colours"], state["last"]
 
     def _grow(self, count: int) -> None:
         if count <= len(self._xyz):

@@ -10,6 +10,12 @@ from fields.launch import LoopLaunch
 
 __all__ = ["Adam", "LearningRates"]
 
+# Bits of 1e18 in float32: its square, a second moment, is finite still.
+BOUND = int(np.float32(1e18).view(np.int32))
+LARGEST_LOG = 80.0
+# Logit of an opacity below that of any pruning.
+TRANSPARENT = -20.0
+
 
 @dataclass(frozen=True)
 class LearningRates:
@@ -20,6 +26,15 @@ class LearningRates:
     quaternion: float
     opacity_logit: float
     colour: float
+
+
+@ti.func
+def _size(x):
+    """The bits of |x| as float32, which are in the order of the numbers, infinity and NaN above all.
+
+    A comparison of the numbers would be left to a compiler that is told that there is no NaN.
+    """
+    return ti.bit_cast(ti.cast(x, ti.f32), ti.i32) & 0x7FFFFFFF
 
 
 @ti.func
@@ -35,7 +50,11 @@ class Adam:
 
     With a batch of B views the rates follow the square-root rule of the paper's settings: lr * sqrt(B), betas
     1 - 0.1 B and 1 - 0.001 B, eps / sqrt(B). A Gaussian that no view saw keeps its value, moments and count, so that
-    looking elsewhere does not move it. Gradients that are not finite are taken as zero.
+    looking elsewhere does not move it.
+
+    Two guards look at every Gaussian on the way. One whose gradient has a component that is no number, or beyond
+    1e18, keeps value, moments and count as well. One that comes out larger than it may be is made transparent, so that
+    the next pruning removes it. Both are counted, see `GaussianField.take_caught`.
     """
 
     def __init__(self, gaussians: GaussianField) -> None:
@@ -43,10 +62,11 @@ class Adam:
         self.real = gaussians.real
         self._update_all = LoopLaunch(self._step, 60)
 
-    def step(self, rates: LearningRates, batch: int = 1, sh_degree: int | None = None) -> None:
+    def step(self, rates: LearningRates, batch: int = 1, sh_degree: int | None = None, largest: float = np.inf) -> None:
         """Update and clear the gradients of every touched Gaussian.
 
-        sh_degree: harmonics above it keep value and moments; None for all that the Gaussians have.
+        sh_degree: harmonics above it keep value and moments; None for all that the Gaussians have. largest: standard
+        deviation that one may reach [scene units].
         """
         if self.gaussians.count == 0:
             return
@@ -58,13 +78,13 @@ class Adam:
         # beta^t is exp(t log beta), cheaper than a power. A beta of 0 counts as 1e-30, whose powers vanish too.
         logs = (float(np.log(max(beta, 1e-30))) for beta in (beta1, beta2))
         n = self.gaussians.count
-        self._update_all(n, n, active, *steps, float(beta1), float(beta2), *logs, 1e-15 / root)
+        limit = float(min(np.log(largest), LARGEST_LOG))
+        self._update_all(n, n, active, *steps, float(beta1), float(beta2), *logs, 1e-15 / root, limit)
 
     @ti.func
     def _update(self, value, gradient, m: ti.template(), v: ti.template(), lr, betas, corrections, eps):
-        g = ti.select(ti.abs(gradient) < 1e18, gradient, 0.0)
-        m = betas[0] * m + (1.0 - betas[0]) * g
-        v = betas[1] * v + (1.0 - betas[1]) * g * g
+        m = betas[0] * m + (1.0 - betas[0]) * gradient
+        v = betas[1] * v + (1.0 - betas[1]) * gradient * gradient
         return value - lr * (m * corrections[0]) / (ti.sqrt(v * corrections[1]) + eps)
 
     @ti.kernel
@@ -83,11 +103,18 @@ class Adam:
         log_beta1: ti.f32,
         log_beta2: ti.f32,
         eps: ti.f32,
+        largest: ti.f32,
     ):
         ti.loop_config(serialize=alone)
         for i in range(count):
+            sound = False
             if self.gaussians.touched[i] != 0:
                 self.gaussians.touched[i] = 0
+                sound = self._worst(i, active) < BOUND
+                if not sound:
+                    ti.atomic_add(self.gaussians._caught[0], 1)
+                    self._forget_gradient(i)
+            if sound:
                 self.gaussians.steps[i] = self.gaussians.steps[i] + 1
                 t = ti.cast(self.gaussians.steps[i], ti.f32)
                 betas = ti.Vector([beta1, beta2])
@@ -130,3 +157,30 @@ class Adam:
                         self.gaussians.sh.grad[i, k][c] = 0.0
                 for k in range(active, self.gaussians.sh_count):
                     self.gaussians.sh.grad[i, k].fill(0.0)
+                if self.gaussians.log_scale[i].max() > largest:
+                    self.gaussians.log_scale[i] = ti.min(self.gaussians.log_scale[i], largest)
+                    self.gaussians.opacity_logit[i] = TRANSPARENT
+                    ti.atomic_add(self.gaussians._caught[1], 1)
+
+    @ti.func
+    def _worst(self, i, active):
+        """The largest component of a Gaussian's gradient, as bits: see `_size`."""
+        g = self.gaussians
+        worst = _size(g.opacity_logit.grad[i])
+        for c in ti.static(range(3)):
+            worst = ti.max(worst, _size(g.position.grad[i][c]), _size(g.log_scale.grad[i][c]))
+        for c in ti.static(range(4)):
+            worst = ti.max(worst, _size(g.quaternion.grad[i][c]))
+        for k in range(active):
+            for c in ti.static(range(3)):
+                worst = ti.max(worst, _size(g.sh.grad[i, k][c]))
+        return worst
+
+    @ti.func
+    def _forget_gradient(self, i):
+        self.gaussians.position.grad[i].fill(0.0)
+        self.gaussians.log_scale.grad[i].fill(0.0)
+        self.gaussians.quaternion.grad[i].fill(0.0)
+        self.gaussians.opacity_logit.grad[i] = 0.0
+        for k in range(self.gaussians.sh_count):
+            self.gaussians.sh.grad[i, k].fill(0.0)

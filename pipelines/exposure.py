@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fields.keyframes import Keyframe
 from pipelines.development import IDENTITY
+from pipelines.guards import Guards
 from pipelines.rendering import Renderer
 from pipelines.settings import ExposureSettings
 
@@ -73,8 +74,10 @@ class ExposureRefinement:
 
     BETAS = (0.9, 0.999)
 
-    def __init__(self, settings: ExposureSettings) -> None:
+    def __init__(self, settings: ExposureSettings, guards: Guards | None = None) -> None:
+        """guards: where steps that are left out are counted."""
         self.settings = settings
+        self.guards = Guards() if guards is None else guards
 
     def begin(self, view: Keyframe, renderer: Renderer, near: float) -> None:
         """Give a new keyframe its exposure, before the map changes for it: fitted to what the map shows there.
@@ -102,6 +105,7 @@ class ExposureRefinement:
         A gradient that is not finite moves nothing.
         """
         if not np.isfinite(gradient).all():
+            self.guards.exposure_steps += 1
             return
         gradient = gradient + 2.0 * weight * self.settings.regularisation * (view.exposure - IDENTITY)
         beta1, beta2 = self.BETAS

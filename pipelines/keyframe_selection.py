@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,18 +64,19 @@ class KeyframeSelector:
 
     def __init__(self, settings: KeyframeSettings) -> None:
         self.settings = settings
-        self._previous: TrackedFrame | None = None
+        # Index and tracked T_camera_world of the frame before.
+        self.previous: tuple[int, NDArray[np.float64]] | None = None
 
     def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
         """Whether `frame` becomes a keyframe, `last` being the latest one."""
-        previous, self._previous = self._previous, frame
+        previous, self.previous = self.previous, (frame.index, frame.T_camera_world)
         if len(frame.points) < self.settings.min_points:
             return False
         if last is None or previous is None:
             return True
         if frame.index - last.index > self.settings.max_gap:
             return True
-        if rotation_per_frame(previous, frame) > self.settings.max_rotation and self._is_blurred(frame, last):
+        if rotation_per_frame(*previous, frame) > self.settings.max_rotation and self._is_blurred(frame, last):
             return False
         moved = np.linalg.norm(camera_centre(frame.T_camera_world) - camera_centre(last.T_camera_world))
         if moved > self.settings.baseline * last.median_depth:
@@ -84,19 +85,19 @@ class KeyframeSelector:
 
     def correct(self, motion: WorldMotion) -> None:
         """The tracker has revised its poses: that of the latest frame as well."""
-        if self._previous is not None:
-            T, _ = motion.of(self._previous.index, self._previous.T_camera_world)
-            self._previous = replace(self._previous, T_camera_world=T)
+        if self.previous is not None:
+            index, T = self.previous
+            self.previous = index, motion.of(index, T)[0]
 
     def _is_blurred(self, frame: TrackedFrame, last: Keyframe) -> bool:
         return sharpness(frame.rgba) < self.settings.min_sharpness * sharpness(last.rgba)
 
 
-def rotation_per_frame(a: TrackedFrame, b: TrackedFrame) -> float:
-    """Degrees that the camera turned from frame a to frame b, per frame between them."""
-    R = b.T_camera_world[:3, :3] @ a.T_camera_world[:3, :3].T
+def rotation_per_frame(index: int, T_camera_world: NDArray[np.float64], frame: TrackedFrame) -> float:
+    """Degrees that the camera turned from frame `index`, taken there, to a later `frame`, per frame between them."""
+    R = frame.T_camera_world[:3, :3] @ T_camera_world[:3, :3].T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0)))
-    return float(angle) / max(b.index - a.index, 1)
+    return float(angle) / max(frame.index - index, 1)
 
 
 def camera_centre(T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:

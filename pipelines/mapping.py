@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from fields.gaussian_motion import GaussianMotion
 from fields.gaussians import GaussianField
+from fields.keyframe_state import KeyframeRows, keyframe_arrays
 from fields.keyframes import Keyframe, KeyframeStore
 from fields.occupancy import OccupancyVoxels
 from fields.pose_correction import PoseCorrection
@@ -20,7 +23,10 @@ from pipelines.contribution import Contribution
 from pipelines.corrections import CorrectionReport, lag_in_pixels, revise
 from pipelines.densification import dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.depth import DepthEstimator, build_depth
+from pipelines.frame_gate import FrameGate
+from pipelines.guards import Guards
 from pipelines.keyframe_selection import KeyframeSelector
+from pipelines.map_state import MapState
 from pipelines.optimisation import MapOptimiser
 from pipelines.rendering import Renderer
 from pipelines.settings import MappingSettings
@@ -83,6 +89,7 @@ class OnlineMapper:
         self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side)
         v = settings.voxels
         self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
+        self.gate = FrameGate(settings.gate)
         self.selector = KeyframeSelector(settings.keyframes)
         self.depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
@@ -107,7 +114,10 @@ class OnlineMapper:
         if self._frames % self.settings.densify.prune_every == 0:
             self.prune()
         with self.stopwatch.measure("select"):
-            is_keyframe = self.selector.is_keyframe(frame, self.keyframes[-1] if len(self.keyframes) else None)
+            last = self.keyframes[-1] if len(self.keyframes) else None
+            if self.gate.refuses(frame, last, self.renderer, self.near):
+                return FrameReport(frame.index, False, len(self.keyframes), len(self.gaussians), None)
+            is_keyframe = self.selector.is_keyframe(frame, last)
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
@@ -135,6 +145,7 @@ class OnlineMapper:
             motion = revise(self.keyframes, self._tracked, correction)
             self._tracked = {index: motion.of(index, T)[0] for index, T in self._tracked.items()}
             self.selector.correct(motion)
+            self.gate.correct(motion)
             lags = np.array([lag_in_pixels(view) for view in self.keyframes])
             if not (settings.enabled and (lags > settings.min_pixels).any()):
                 return CorrectionReport(motion, moved=False)
@@ -253,6 +264,76 @@ class OnlineMapper:
                 self.voxels.settle(v.coarsest * view.view_scale, centre)
             spacing = self.anchors[-1].spacing
             grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, len(self.anchors) - 1)
+
+    def caught(self) -> Guards:
+        """What the guards have caught so far. Waits for the device."""
+        return self.optimiser.caught()
+
+    # ---- snapshots -------------------------------------------------------------------------------------------
+
+    def state(self) -> MapState:
+        """All that the next frame or step depends on, but for the keyframes' images. Between two steps."""
+        self.optimiser.settle()
+        groups = {
+            "gaussians": self.gaussians.to_numpy() | self.gaussians.history(),
+            "keyframes": keyframe_arrays(self.keyframes),
+            "tracked": {
+                "index": np.array(list(self._tracked), dtype=np.int64),
+                "T": np.array(list(self._tracked.values())).reshape(-1, 4, 4),
+            },
+        }
+        place = {view.index: row for row, view in enumerate(self.keyframes)}
+        groups["anchors"] = {
+            "keyframe": np.array([place[anchor.keyframe.index] for anchor in self.anchors], dtype=np.int64),
+            "spacing": np.array([anchor.spacing for anchor in self.anchors]),
+        }
+        numbers: dict[str, Any] = {
+            "frames": self._frames,
+            "view_renders": self.renderer.view_renders,
+            "random": self.rng.bit_generator.state,
+            "gate": self.gate.state(),
+            "guards": self.optimiser.caught().counts(),
+        }
+        if self.voxels is not None:
+            places, words = self.voxels.marks()
+            groups["voxels"] = {"places": places, "words": words}
+            numbers |= {"coarsest": self.voxels.coarsest, "origin": self.voxels.origin.tolist()}
+        if self.selector.previous is not None:
+            index, T = self.selector.previous
+            groups["previous"] = {"index": np.array(index), "T": T}
+        return MapState.of(groups, numbers)
+
+    def restore(self, state: MapState, frames: Iterable[TrackedFrame]) -> None:
+        """Become the mapper that `state` was taken of. This one must be fresh, and of the same settings.
+
+        frames: the same as those it had taken in, held-out ones left out: the keyframes take their images from them.
+        Raises KeyError, TypeError or ValueError for a state that does not fit; the mapper is of no use then.
+        """
+        rows = KeyframeRows(state.group("keyframes"))
+        for frame in frames:
+            if frame.index in rows.rows:
+                rows.put(frame, self.keyframes)
+        if len(self.keyframes) != len(rows.rows):
+            raise ValueError(f"{len(self.keyframes)} of the {len(rows.rows)} keyframes are among the frames")
+        self.keyframes.take_in_depths()
+        self.gaussians.restore(state.group("gaussians"))
+        anchors = state.group("anchors")
+        pairs = zip(anchors["keyframe"].tolist(), anchors["spacing"].tolist(), strict=True)
+        self.anchors = [Anchor(self.keyframes[row], spacing) for row, spacing in pairs]
+        if len(self.gaussians) and self.gaussians.anchors().max() >= len(self.anchors):
+            raise ValueError("Gaussians have anchors that there are not")
+        tracked = state.group("tracked")
+        self._tracked = dict(zip(tracked["index"].tolist(), list(tracked["T"]), strict=True))
+        if self.voxels is not None:
+            self.voxels.settle(state.numbers["coarsest"], state.numbers["origin"])
+            self.voxels.restore(**state.group("voxels"))
+        previous = state.group("previous")
+        self.selector.previous = (int(previous["index"]), previous["T"]) if previous else None
+        self._frames = int(state.numbers["frames"])
+        self.renderer.view_renders = int(state.numbers["view_renders"])
+        self.rng.bit_generator.state = state.numbers["random"]
+        self.gate.restore(state.numbers["gate"])
+        self.optimiser.guards.restore(state.numbers["guards"])
 
     # ---- compiling -------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from pipelines.adam import Adam, LearningRates
 from pipelines.adaptive_density import AdaptiveDensity
 from pipelines.corrections import CorrectionReport, revise
 from pipelines.gpu.losses import photometric_loss
+from pipelines.guards import EXPLODED, Guards
 from pipelines.losses import LossValues
 from pipelines.mapping import FrameReport
 from pipelines.point_initialisation import initialise, union_of_points
@@ -113,6 +114,7 @@ class OfflineMapper:
         self.loss = photometric_loss(self.renderer.images)
         self._last: LossValues | None = None
         self.adam = Adam(self.gaussians)
+        self.guards = Guards()
         self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
         self.keyframes = KeyframeStore()
 
@@ -159,6 +161,13 @@ class OfflineMapper:
             if progress is not None:
                 progress(step, len(self.gaussians), psnr)
 
+    def caught(self) -> Guards:
+        """What the guards have caught so far. Waits for the device."""
+        steps, exploded = self.gaussians.take_caught()
+        self.guards.gaussian_steps += steps
+        self.guards.exploded_gaussians += exploded
+        return self.guards
+
     def _rates(self, position_unit: float) -> LearningRates:
         s = self.settings
         return LearningRates(
@@ -179,7 +188,7 @@ class OfflineMapper:
         self.loss.send()
         self.loss.backward(self.settings.ssim_weight)
         renderer.backward(observe=self.density.statistics.observe)
-        self.adam.step(rates, sh_degree=sh_degree)
+        self.adam.step(rates, sh_degree=sh_degree, largest=EXPLODED * self.keyframes.scene_depth)
         known = values if self.loss.lag == 0 or self._last is None else self._last
         self._last = values
         return known.psnr

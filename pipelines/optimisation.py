@@ -14,6 +14,7 @@ from fields.late import Late
 from pipelines.adam import Adam, LearningRates
 from pipelines.exposure import ExposureRefinement
 from pipelines.gpu.losses import photometric_loss
+from pipelines.guards import EXPLODED, Guards
 from pipelines.losses import AspectPenalty, LossValues
 from pipelines.pose_refinement import PoseRefinement
 from pipelines.rendering import Renderer
@@ -32,8 +33,9 @@ class MapOptimiser:
         self.loss = photometric_loss(renderer.images)
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
-        self.poses = PoseRefinement()
-        self.exposure = ExposureRefinement(settings.exposure)
+        self.guards = Guards()
+        self.poses = PoseRefinement(self.guards)
+        self.exposure = ExposureRefinement(settings.exposure, self.guards)
         # What steps have found that has not been taken in: values of their views, and by index of the keyframe how it
         # is to move. On the CPU empty between steps.
         self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
@@ -88,11 +90,21 @@ class MapOptimiser:
         self._move()
         return self._psnr
 
+    def caught(self) -> Guards:
+        """What the guards have caught so far. Waits for the device."""
+        steps, exploded = self.gaussians.take_caught()
+        self.guards.gaussian_steps += steps
+        self.guards.exploded_gaussians += exploded
+        return self.guards
+
     def _read(self, seen: list[tuple[Keyframe, LossValues]]) -> None:
         """Take in the values of a step's views."""
-        for view, values in seen:
+        sound = [(view, values) for view, values in seen if np.isfinite(values.l1)]
+        self.guards.views += len(seen) - len(sound)
+        for view, values in sound:
             view.error = values.l1
-        self._psnr = float(np.mean([values.psnr for _, values in seen]))
+        if sound:
+            self._psnr = float(np.mean([values.psnr for _, values in sound]))
 
     def _move(self, view: Keyframe | None = None) -> None:
         """Step pose and exposure of a keyframe by the gradients of the last batch that it was in; None for all."""
@@ -119,7 +131,7 @@ class MapOptimiser:
             if view.exposure is not None and j > 0:
                 exposure_gradients.setdefault(j, []).append(self.renderer.late_exposure_gradient())
         self.aspect.backward(o.aspect_weight, store.scene_depth)
-        self.adam.step(rates, len(views))
+        self.adam.step(rates, len(views), largest=EXPLODED * store.scene_depth)
         for j, gradients in pose_gradients.items():
             move = partial(self._move_pose, store[j], gradients, pose_rate)
             self._moves.setdefault(store[j].index, []).append(move)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from fields.keyframes import Keyframe
 from fields.se3 import exp_se3, log_se3, orthonormalised
+from pipelines.guards import Guards
 
 __all__ = ["PoseRefinement", "pixel_jacobian", "pixel_metric", "reprojection"]
 
@@ -75,24 +76,48 @@ class PoseRefinement:
     # Gauss-Newton steps of an alignment, and its weight of half the squared movement from the tracked pose [px^2].
     ITERATIONS = 5
     PRIOR = 0.01
+    # Share of the image's diagonal by which refinement may move it: beyond, the camera shows something else.
+    FARTHEST = 0.5
+
+    def __init__(self, guards: Guards | None = None) -> None:
+        """guards: where steps that are undone are counted."""
+        self.guards = Guards() if guards is None else guards
 
     def align(self, view: Keyframe) -> None:
         """Move `view` to where its tracked points project to where they were tracked, by Gauss-Newton.
 
         A tracker's poses and points agree; where they do not, the points, of which there are many, know better. The
-        prior holds what they leave open.
+        prior holds what they leave open. Where it runs away the view stays where it was.
         """
-        W = pixel_metric(view)
-        for _ in range(self.ITERATIONS):
-            gradient, H = reprojection(view, W)
-            moved = np.linalg.solve(W, log_se3(view.correction))
-            u = np.linalg.solve(H + self.PRIOR * np.eye(6), -gradient - self.PRIOR * moved)
-            view.T_camera_world = orthonormalised(exp_se3(W @ u) @ view.T_camera_world)
+        W, before = pixel_metric(view), view.T_camera_world
+        try:
+            for _ in range(self.ITERATIONS):
+                gradient, H = reprojection(view, W)
+                moved = np.linalg.solve(W, log_se3(view.correction))
+                u = np.linalg.solve(H + self.PRIOR * np.eye(6), -gradient - self.PRIOR * moved)
+                view.T_camera_world = orthonormalised(exp_se3(W @ u) @ view.T_camera_world)
+            runs_away = self._runs_away(view, W)
+        except (np.linalg.LinAlgError, FloatingPointError):
+            runs_away = True
+        if runs_away:
+            self.guards.camera_steps += 1
+            view.T_camera_world = before
+
+    def _runs_away(self, view: Keyframe, W: NDArray[np.float64]) -> bool:
+        """Whether the view stands nowhere, or so far from its tracked pose that it must see something else."""
+        moved = np.linalg.norm(np.linalg.solve(W, log_se3(view.correction)))
+        return not moved <= self.FARTHEST * np.hypot(view.camera.width, view.camera.height)
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], rate: float) -> None:
-        """Move `view` by about `rate` px against d loss / d xi (6,); a gradient that is not finite moves nothing."""
+        """Move `view` by about `rate` px against d loss / d xi (6,).
+
+        A gradient that is not finite moves nothing. A step that carries the view away is undone, and what had gathered
+        for it is forgotten.
+        """
         if not np.isfinite(gradient).all():
+            self.guards.camera_steps += 1
             return
+        before = view.T_camera_world
         beta1, beta2 = self.BETAS
         W = pixel_metric(view)
         g = W.T @ gradient
@@ -103,3 +128,7 @@ class PoseRefinement:
         v = view.pose_v / (1 - beta2**view.pose_steps)
         xi = W @ (-rate * m / (np.sqrt(v) + 1e-15))
         view.T_camera_world = orthonormalised(exp_se3(xi) @ view.T_camera_world)
+        if self._runs_away(view, W):
+            self.guards.camera_steps += 1
+            view.T_camera_world = before
+            view.pose_m, view.pose_v, view.pose_steps = np.zeros(6), np.zeros(6), 0

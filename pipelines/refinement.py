@@ -17,23 +17,27 @@ def decay(step: int, steps: int, final: float) -> float:
 
 
 def refine(
-    mapper: OnlineMapper, settings: RefineSettings, progress: Callable[[int, float], None] | None = None
+    mapper: OnlineMapper,
+    settings: RefineSettings,
+    progress: Callable[[int, float], None] | None = None,
+    done: int = 0,
 ) -> None:
     """Run `settings.steps` steps on error-weighted draws of keyframes; positions, scales and poses slow down.
 
     Gaussians that show next to nothing in every keyframe are removed before the first.
 
-    progress: called after every step with (steps done, mean PSNR of its views).
+    progress: called after every step with (steps done, mean PSNR of its views). done: steps that the map has had when
+    it was restored; those that follow are the same as ever.
     """
     store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
     pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0
     if len(store) == 0 or len(mapper.gaussians) == 0:
         return
-    if settings.steps and settings.min_contribution > 0:
+    if settings.steps and not done and settings.min_contribution > 0:
         with mapper.stopwatch.measure("refine"):
             shown = mapper.contribution.measure(store, mapper.near)
             mapper.gaussians.remove(shown >= settings.min_contribution)
-    for step in range(settings.steps):
+    for step in range(done, settings.steps):
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0)
             batch = [int(j) for j in mapper.rng.choice(len(store), settings.views, p=p)]

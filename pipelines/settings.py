@@ -20,6 +20,7 @@ __all__ = [
     "DepthSettings",
     "EpipolarSettings",
     "ExposureSettings",
+    "GateSettings",
     "KeyframeSettings",
     "LevelSettings",
     "MappingSettings",
@@ -205,6 +206,19 @@ class ExposureSettings(StrictModel):
     )
 
 
+class GateSettings(StrictModel):
+    """Frames that must not touch the map: blank ones, repeated ones, and those whose pose cannot be right."""
+
+    enabled: bool = Field(True, description="leave such frames out; they keep their place in the outputs")
+    min_contrast: float = Field(
+        2.0, ge=0, description="standard deviation of the colours [of 255] below which an image shows nothing"
+    )
+    jump: float = Field(
+        8.0, gt=1, description="motion of the camera, as a factor on the usual one, from which on the map is asked"
+    )
+    min_jump: float = Field(0.15, gt=0, description="motion that is never a jump [share of the image's diagonal]")
+
+
 class OptimiseSettings(StrictModel):
     """Loss and learning rates."""
 
@@ -239,6 +253,7 @@ class MappingSettings(StrictModel):
     image_cache: float = Field(
         2.0, ge=0, description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed"
     )
+    gate: GateSettings = GateSettings()
     keyframes: KeyframeSettings = KeyframeSettings()
     densify: DensifySettings = DensifySettings()
     depth: DepthSettings = DepthSettings()

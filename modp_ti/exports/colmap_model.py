@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from fields.tracked_frame import TrackedFrame
+from modp_ti.atomic import write_picture
 from modp_ti.tracked_points import TrackedPoints
 
 __all__ = ["image_names", "write_colmap", "write_image"]
@@ -76,12 +77,10 @@ def write_image(folder: Path, name: str, frame: TrackedFrame) -> None:
 
     Masks are COLMAP's: black where a pixel is ignored.
     """
-    import cv2
-
     target = folder / "images" / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(target), np.round(frame.image[..., ::-1] * 255.0).astype(np.uint8))
+    write_picture(target, np.round(frame.image * 255.0).astype(np.uint8))
     if frame.mask is not None:
         target = folder / "masks" / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(target), frame.mask.astype(np.uint8) * 255)
+        write_picture(target, frame.mask.astype(np.uint8) * 255)

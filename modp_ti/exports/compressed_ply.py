@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.gaussians import SH_C0
-from modp_ti.exports.quantised import opacities, replace_file, smallest_three, to_bits, unit_quaternions
+from modp_ti.atomic import replace_file
+from modp_ti.exports.quantised import opacities, smallest_three, to_bits, unit_quaternions
 from modp_ti.exports.splats_ply import COMMENT
 
 __all__ = ["write_compressed_ply"]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.atomic import replace_text
 from modp_ti.errors import InputError
 
 __all__ = ["read_exposures", "write_exposures"]
@@ -35,7 +36,7 @@ def write_exposures(
         for index, timestamp, exposure in zip(indices, timestamps, exposures, strict=True)
     ]
     lines = ",\n".join("  " + json.dumps(frame) for frame in frames)
-    path.write_text(f'{{"frames": [\n{lines}\n]}}\n', encoding="utf-8")
+    replace_text(path, f'{{"frames": [\n{lines}\n]}}\n')
 
 
 def read_exposures(path: Path) -> dict[int, NDArray[np.float64]]:

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+from modp_ti.atomic import replace_text
 from modp_ti.errors import InputError
 
 __all__ = ["FramesRecord", "read_frames", "write_frames"]
@@ -32,7 +33,7 @@ def write_frames(
     lists = {"keyframes": sorted(keyframes), "held_out": sorted(held_out)}
     lines = [f'"{name}": {json.dumps(value)}' for name, value in lists.items()]
     text = ",\n ".join([f'"near": {float(near)!r}', f'"scene_depth": {float(scene_depth)!r}', *lines])
-    path.write_text(f"{{{text}}}\n", encoding="utf-8")
+    replace_text(path, f"{{{text}}}\n")
 
 
 def read_frames(path: Path, count: int) -> FramesRecord:

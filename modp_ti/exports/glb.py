@@ -18,7 +18,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.exports.quantised import replace_file
+from modp_ti.atomic import replace_file
 
 __all__ = ["write_glb"]
 

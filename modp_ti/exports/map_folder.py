@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fields.keyframes import KeyframeStore
+from modp_ti.atomic import sync_folder
 from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.errors import InputError
 from modp_ti.evaluation import MapVersion
@@ -20,12 +21,15 @@ from modp_ti.exports.trajectory import write_trajectory
 
 __all__ = ["appearing", "write_map"]
 
+LAST = "metrics.json"
+
 
 @contextmanager
 def appearing(output: Path) -> Iterator[Path]:
     """An empty folder to write into; what it holds goes into `output`, over what is there, once all went well.
 
-    Raises InputError where it cannot be written.
+    `metrics.json`, where there is one, goes last: a folder that has it has all the rest. Raises InputError where it
+    cannot be written.
     """
     folder = output.with_name(output.name + ".partial")
     shutil.rmtree(folder, ignore_errors=True)
@@ -33,10 +37,13 @@ def appearing(output: Path) -> Iterator[Path]:
         folder.mkdir(parents=True)
         yield folder
         output.mkdir(exist_ok=True)
-        for item in folder.iterdir():
+        if (folder / LAST).exists():
+            (output / LAST).unlink(missing_ok=True)
+        for item in sorted(folder.iterdir(), key=lambda item: (item.name == LAST, item.name)):
             if item.is_dir():
                 shutil.rmtree(output / item.name, ignore_errors=True)
             os.replace(item, output / item.name)
+        sync_folder(output)
     except OSError as error:
         raise InputError(f"{output}: cannot be written: {error.strerror}") from None
     finally:

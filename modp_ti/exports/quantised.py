@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["opacities", "replace_file", "smallest_three", "to_bits", "unit_quaternions"]
+__all__ = ["opacities", "smallest_three", "to_bits", "unit_quaternions"]
 
 
 def opacities(state: Mapping[str, NDArray]) -> NDArray[np.float64]:
@@ -39,11 +37,3 @@ def to_bits(values: NDArray, bits: int) -> NDArray[np.uint32]:
     """Values in [0, 1], clipped to it, as the nearest of 2^bits - 1 steps."""
     most = (1 << bits) - 1
     return np.round(np.clip(values, 0.0, 1.0) * most).astype(np.uint32)
-
-
-def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a file that appears whole or not at all."""
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_bytes(content)
-    os.replace(partial, target)

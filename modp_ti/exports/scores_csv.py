@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from modp_ti.atomic import replacing
 from modp_ti.errors import InputError
 from modp_ti.evaluation import FrameScore
 
@@ -21,7 +22,7 @@ def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> 
 
     Numbers have the digits that give them back exactly.
     """
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
+    with replacing(path, "w") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for score in scores:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.atomic import replacing
 from modp_ti.errors import InputError
 
 __all__ = ["read_splats", "write_splats"]
@@ -45,12 +46,9 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
     ).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}", f"element vertex {n}"]
     header += [f"property float {name}" for name in _names(sh_count)]
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    with partial.open("wb") as file:
+    with replacing(path) as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
         file.write(table.tobytes())
-    os.replace(partial, target)
 
 
 def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:

@@ -18,8 +18,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.atomic import replace_file
 from modp_ti.errors import InputError
-from modp_ti.exports.quantised import opacities, replace_file, smallest_three, to_bits, unit_quaternions
+from modp_ti.exports.quantised import opacities, smallest_three, to_bits, unit_quaternions
 
 __all__ = ["write_spz"]
 

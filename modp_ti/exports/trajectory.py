@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.atomic import replace_text
 from modp_ti.errors import InputError
 
 __all__ = ["read_trajectory", "write_trajectory"]
@@ -30,10 +31,7 @@ def write_trajectory(
         centre = -rotation @ T_camera_world[:3, 3]
         numbers = [float(time), *centre.tolist(), *_quaternion(rotation).tolist()]
         lines.append(" ".join(repr(number + 0.0) for number in numbers))  # + 0.0: no minus before a zero
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    os.replace(partial, target)
+    replace_text(path, "\n".join(lines) + "\n")
 
 
 def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

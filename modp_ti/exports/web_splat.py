@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.gaussians import SH_C0
-from modp_ti.exports.quantised import opacities, replace_file, to_bits, unit_quaternions
+from modp_ti.atomic import replace_file
+from modp_ti.exports.quantised import opacities, to_bits, unit_quaternions
 
 __all__ = ["write_web_splat"]
 

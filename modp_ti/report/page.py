@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.se3 import inverse_se3
+from modp_ti.atomic import replace_text
 from modp_ti.evaluation import FrameScore, MapVersion, umeyama
 from modp_ti.report import facts, plots
 from modp_ti.report.pictures import FULL_SCALE, Comparison, error_colours
@@ -67,7 +68,7 @@ def write_report(path: Path, run: ReportedRun) -> None:
         scale=_scale(),
         full_scale=FULL_SCALE,
     )
-    path.write_text(page, encoding="utf-8")
+    replace_text(path, page)
 
 
 def _drawings(run: ReportedRun) -> dict[str, str]:

@@ -54,8 +54,8 @@ class RunRecord:
     _first: float = 0.0
 
     def begin(self) -> None:
-        """The first frame is about to be taken in."""
-        self._first = self.clock()
+        """The first frame is about to be taken in, or the next one of a resumed run."""
+        self._first = self.clock() - (self.frames[-1].done if self.frames else 0.0)
 
     def frame(self, index: int, report: FrameReport | None) -> None:
         """Note a frame that is done; report: None for one that is held out."""

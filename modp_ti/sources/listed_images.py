@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.errors import InputError
+from modp_ti.errors import UnreadableImageError
 from modp_ti.sources.image_header import read_image_header
 from modp_ti.sources.intrinsics import Intrinsics
 from modp_ti.sources.known_frames import IMAGE_SUFFIXES, KnownFrames
@@ -63,7 +63,7 @@ class ListedImages(KnownFrames):
         return self._by_stem.get(stem)
 
     def size(self, name: str) -> tuple[int, int]:
-        """(width, height) as stored. Raises InputError for an image that is unreadable or cut off."""
+        """(width, height) as stored. Raises UnreadableImageError for one that is unreadable or cut off."""
         try:
             with (self.path / name).open("rb") as file:
                 header = read_image_header(file)
@@ -79,7 +79,7 @@ class ListedImages(KnownFrames):
     def read(self, name: str) -> NDArray[np.uint8]:
         """Decoded image (H, W, 3) uint8 RGB, without EXIF rotation: intrinsics belong to the stored pixels.
 
-        Raises InputError for an image that is unreadable or cut off.
+        Raises UnreadableImageError for one that is unreadable or cut off.
         """
         try:
             data = (self.path / name).read_bytes()
@@ -98,8 +98,10 @@ class ListedImages(KnownFrames):
     def close(self) -> None:
         """Nothing stays open."""
 
-    def _unreadable(self, name: str, reason: str) -> InputError:
-        return InputError(f"{self.path / name}: unreadable image: {reason}; replace it or take it out of the folder")
+    def _unreadable(self, name: str, reason: str) -> UnreadableImageError:
+        return UnreadableImageError(
+            f"{self.path / name}: unreadable image: {reason}; replace it or take it out of the folder"
+        )
 
 
 def decoded(data: bytes) -> NDArray[np.uint8] | None:

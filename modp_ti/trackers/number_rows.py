@@ -21,6 +21,7 @@ class NumberRows:
     path: Path
     values: NDArray[np.float64]
     lines: NDArray[np.int64]
+    left_out: int = 0
 
     def __len__(self) -> int:
         return len(self.values)
@@ -42,15 +43,17 @@ def read_text(path: Path, setting: str) -> str:
 
 
 def read_number_rows(
-    path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False
+    path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False, few: float = 0.0
 ) -> NumberRows:
     """The rows of a file whose lines hold `columns` finite numbers each; with `more`, what follows them is ignored.
 
-    meaning: the columns in words, for messages. Raises InputError with file and line for anything else, and for a file
+    meaning: the columns in words, for messages. few: share of the rows that may hold NaN or infinity, and are then left
+    out. Raises InputError with file and line for anything else, and for a file
     without a row.
     """
     rows: list[list[float]] = []
     lines: list[int] = []
+    bad: list[int] = []
     for number, line in enumerate(read_text(path, setting).splitlines(), start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
         if not words:
@@ -62,9 +65,12 @@ def read_number_rows(
         except ValueError:
             raise InputError(f"{path}:{number}: not a row of numbers: {meaning}") from None
         if not all(map(math.isfinite, row)):
-            raise InputError(f"{path}:{number}: holds NaN or infinite numbers; take the line out")
+            bad.append(number)
+            continue
         rows.append(row)
         lines.append(number)
+    if len(bad) > few * (len(rows) + len(bad)):
+        raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers; take the line out")
     if not rows:
         raise InputError(f"{path}: holds no row of {meaning} ({setting})")
-    return NumberRows(path, np.array(rows, dtype=np.float64), np.array(lines, dtype=np.int64))
+    return NumberRows(path, np.array(rows, dtype=np.float64), np.array(lines, dtype=np.int64), len(bad))

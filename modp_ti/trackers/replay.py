@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.errors import InputError
+from modp_ti.errors import FEW, InputError, UnreadableImageError
 from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
 
@@ -19,8 +19,10 @@ __all__ = [
     "checked_pose",
     "is_held_out",
     "points_inside",
+    "require_few",
     "require_fitting_sizes",
     "unmasked",
+    "unreadable_note",
 ]
 
 # A rotation this far from orthonormal was not meant as one; below it lies the rounding of text files.
@@ -41,7 +43,11 @@ class PosedImage:
 
 
 class ReplayedTracker:
-    """A `Tracker` over posed images, in the order given. Points on masked pixels are left out."""
+    """A `Tracker` over posed images, in the order given. Points on masked pixels are left out.
+
+    So are images that turn out damaged, if they are few. unreadable: their names with what is wrong, as far as they
+    have been come to. Which frames are held out goes by their place among all that were given.
+    """
 
     reads_ahead = True
 
@@ -54,6 +60,8 @@ class ReplayedTracker:
     ) -> None:
         self.frames = tuple(frames)
         self.notes = [*notes, *reader.images.notes]
+        self.unreadable: dict[str, UnreadableImageError] = {}
+        self._noted = False
         self._reader = reader
         self._source = source
 
@@ -65,8 +73,15 @@ class ReplayedTracker:
         self._reader.images.close()
 
     def __iter__(self) -> Iterator[TrackedFrame]:
-        for index, frame in enumerate(self.frames):
-            picture = self._reader.read(frame.name, frame.undistorter)
+        index = -1
+        for place, frame in enumerate(self.frames):
+            try:
+                picture = self._reader.read(frame.name, frame.undistorter)
+            except UnreadableImageError as error:
+                self.unreadable[frame.name] = error
+                require_few(list(self.unreadable.values()), len(self.frames))
+                continue
+            index += 1
             yield TrackedFrame(
                 index=index,
                 timestamp=self._reader.images.timestamp(frame.name),
@@ -77,8 +92,23 @@ class ReplayedTracker:
                 points=unmasked(frame.points, picture.mask),
                 mask=picture.mask,
                 vignette=picture.vignette,
-                held_out=is_held_out(index, self._source),
+                held_out=is_held_out(place, self._source),
             )
+        if self.unreadable and not self._noted:
+            self._noted = True
+            self.notes.append(unreadable_note(list(self.unreadable.values()), len(self.frames)))
+
+
+def require_few(unreadable: Sequence[UnreadableImageError], count: int) -> None:
+    """Raises the first of them where they are more than a few of `count` images."""
+    if len(unreadable) > FEW * count:
+        raise unreadable[0]
+
+
+def unreadable_note(unreadable: Sequence[UnreadableImageError], count: int) -> str:
+    """A remark on images that were left out."""
+    first = str(unreadable[0]).partition(";")[0]
+    return f"{len(unreadable)} of {count} images are damaged: left out (the first: {first})"
 
 
 def unmasked(points: SparsePoints, mask: NDArray[np.bool_] | None) -> SparsePoints:
@@ -118,14 +148,20 @@ def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
 
 
 def require_fitting_sizes(images: ImageSource, frames: Sequence[tuple[str, Undistorter]], intrinsics: str) -> None:
-    """Raises InputError for the first image that is unreadable or not of its camera's size.
+    """Raises InputError for the first image that is not of its camera's size, and where many are unreadable.
 
     intrinsics: where the cameras come from, for the message. Reads the headers only, so that a run fails at
     its start.
     """
+    unreadable = []
     for name, undistorter in frames:
         raw = undistorter.raw
-        width, height = images.size(name)
+        try:
+            width, height = images.size(name)
+        except UnreadableImageError as error:
+            unreadable.append(error)
+            require_few(unreadable, len(frames))
+            continue
         if (width, height) == (raw.width, raw.height):
             continue
         advice = "give source.path the images that belong to these intrinsics"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.errors import InputError
+from modp_ti.errors import FEW, InputError
 from modp_ti.settings import TrackerSettings
 from modp_ti.sources import ImageSource
 from modp_ti.sources.association import associate
@@ -33,11 +34,15 @@ NANOSECONDS_FROM = 1e14
 
 @dataclass(frozen=True)
 class Trajectory:
-    """times: (N,) seconds, rising. T_camera_world: (N, 4, 4). path: where they come from, for messages."""
+    """times: (N,) seconds, rising. T_camera_world: (N, 4, 4). path: where they come from, for messages.
+
+    left_out: lines of the file that are no pose.
+    """
 
     path: Path
     times: NDArray[np.float64]
     T_camera_world: NDArray[np.float64]
+    left_out: int = 0
 
     def __len__(self) -> int:
         return len(self.times)
@@ -46,14 +51,36 @@ class Trajectory:
 def read_trajectory_file(path: Path) -> Trajectory:
     """A trajectory in TUM's format: `time tx ty tz qx qy qz qw` a line, camera to world, in the order of time.
 
-    Times are seconds, or, in ORB-SLAM3's EuRoC flavour, nanoseconds: their size tells. Raises InputError with file and
-    line for a wrong number of columns, NaN, a quaternion that is not of unit length and times that do not rise.
+    Times are seconds, or, in ORB-SLAM3's EuRoC flavour, nanoseconds: their size tells. A few lines may hold NaN, as
+    trackers write it where they are lost, or a time out of order: they are left out. Raises InputError with file and
+    line for a wrong number of columns, a quaternion that is not of unit length, and where more lines are like that.
     """
-    rows = read_number_rows(path, 8, TUM_COLUMNS)
+    rows = read_number_rows(path, 8, TUM_COLUMNS, few=FEW)
+    rising, left_out = _rising(rows.values[:, 0]), rows.left_out
+    if len(rows) - len(rising) <= FEW * len(rows):
+        left_out += len(rows) - len(rising)
+        rows = replace(rows, values=rows.values[rising], lines=rows.lines[rising])
     T_world_camera = poses_of_quaternions(rows.values[:, 1:4], rows.values[:, 4:8], rows.where)
     require_rising(rows.values[:, 0], rows.where)
     times = rows.values[:, 0] * (1e-9 if rows.values[-1, 0] >= NANOSECONDS_FROM else 1.0)
-    return Trajectory(path, times, inverse_poses(T_world_camera))
+    return Trajectory(path, times, inverse_poses(T_world_camera), left_out)
+
+
+def _rising(times: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Places of the most times that rise from one to the next: those before and behind a leap of the clock."""
+    ends: list[float] = []  # the least end of a rising sequence of each length, and where it is
+    places: list[int] = []
+    before = np.full(len(times), -1)
+    for i, time in enumerate(times.tolist()):
+        length = bisect_left(ends, time)
+        before[i] = places[length - 1] if length else -1
+        ends[length : length + 1] = [time]
+        places[length : length + 1] = [i]
+    chain, i = [], places[-1]
+    while i >= 0:
+        chain.append(i)
+        i = int(before[i])
+    return np.array(chain[::-1], dtype=np.int64)
 
 
 def poses_of_quaternions(

@@ -40,4 +40,7 @@ def replay_trajectory(
     rows = rows_at_frames(images, selected, file, trajectory.times, tracker)
     poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
     notes = missing_frames_note(selected, poses, file)
+    if trajectory.left_out:
+        of = trajectory.left_out + len(trajectory)
+        notes.insert(0, f"{trajectory.left_out} of {of} lines of {file.name} hold NaN or a time out of order: left out")
     return replay_poses(images, source, tracker, poses, notes, progress)

@@ -13,7 +13,7 @@ from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.errors import InputError
+from modp_ti.errors import InputError, UnreadableImageError
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
 from modp_ti.sources.exif import focal_length_35mm
@@ -22,7 +22,7 @@ from modp_ti.trackers.klt.lens import Lens
 from modp_ti.trackers.klt.odometry import Odometry, View
 from modp_ti.trackers.klt.pose import ray_errors
 from modp_ti.trackers.protocol import Progress
-from modp_ti.trackers.replay import is_held_out, points_inside, unmasked
+from modp_ti.trackers.replay import is_held_out, points_inside, require_few, unmasked, unreadable_note
 
 __all__ = ["KltTracker", "open_klt"]
 
@@ -100,9 +100,15 @@ class _Arrived:
 
 
 def _require_one_size(images: ImageSource, names: Sequence[str], width: int, height: int) -> None:
+    unreadable = []
     for name in names:
-        if images.size(name) != (width, height):
+        try:
             w, h = images.size(name)
+        except UnreadableImageError as error:
+            unreadable.append(error)
+            require_few(unreadable, len(names))
+            continue
+        if (w, h) != (width, height):
             raise InputError(
                 f"{images.path / name} is {w}x{h}, the first image {width}x{height}: all images of a scene must have "
                 "one size"
@@ -196,6 +202,7 @@ class KltTracker:
         self._delivered = intrinsics.undistorter(source.scale)
         self._odometry = Odometry([Lens.pinhole(self._followed.camera)], seed)
         self._told: list[_Told] = []
+        self.unreadable: dict[str, UnreadableImageError] = {}  # images that were left out
         self._told_keyframes: dict[int, NDArray[np.float64]] = {}
         self._told_xyz = np.zeros((0, 3))
         self._progress = self._tracked()
@@ -228,7 +235,12 @@ class KltTracker:
         raw_camera = self.intrinsics.camera
         for number, name in enumerate(self._names):
             names.append(name)
-            raw = _read(self._reader.images, name, raw_camera.width, raw_camera.height)
+            try:
+                raw = _read(self._reader.images, name, raw_camera.width, raw_camera.height)
+            except UnreadableImageError as error:
+                self.unreadable[name] = error
+                require_few(list(self.unreadable.values()), max(len(names), len(self._known())))
+                continue
             grey, valid = self._followed.grey(raw, self._reader.valid(name, raw))
             keyframes = self._keyframe_count()
             views = self._odometry.process(number, grey, valid)
@@ -241,19 +253,24 @@ class KltTracker:
             yield from self._corrections(MOVED)
         self._sum_up(names)
 
+    def _known(self) -> Sequence[str]:
+        return self._names.there if isinstance(self._names, _Arrived) else self._names
+
     def _keyframe_count(self) -> int:
         return 0 if self._odometry.map is None else len(self._odometry.map.keyframes)
 
     def _sum_up(self, names: Sequence[str]) -> None:
         counts = self._odometry.counts
-        without = len(names) - len(self._told)
+        without = len(names) - len(self._told) - len(self.unreadable)
         if not self._told:
             raise InputError(
                 f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
                 "and a camera that moves sideways and does not only turn"
             )
+        if self.unreadable:
+            self._notes.append(unreadable_note(list(self.unreadable.values()), len(names)))
         if without:
-            placed = {told.name for told in self._told}
+            placed = {told.name for told in self._told} | set(self.unreadable)
             first = next(name for name in names if name not in placed)
             self._notes.append(
                 f"{without} of {len(names)} images could not be placed (the first is {first}): skipped; the camera was "

@@ -1,0 +1,96 @@
+"""A soak: the demo room again and again, as one long recording, and what memory the process holds meanwhile."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fields.backend import initialise
+from fields.tracked_frame import TrackedFrame
+from modp_ti.mapper import Mapper
+from modp_ti.synthetic import SyntheticTracker
+from pipelines.settings import MappingSettings, OptimiseSettings
+
+__all__ = ["Soak", "soak", "soak_table"]
+
+WIDTH, HEIGHT = 80, 60
+
+
+@dataclass(frozen=True)
+class Soak:
+    """frames: that were mapped. megabytes: resident memory after each tenth of them, the keyframes' own part apart.
+
+    kept: what a keyframe and the record of a frame must hold, in megabytes, after each tenth: it grows with the
+    recording, as it has to, and is reckoned with and not measured.
+    """
+
+    frames: int
+    keyframes: int
+    gaussians: list[int]
+    megabytes: list[float]
+    kept: list[float]
+
+    @property
+    def growth(self) -> float:
+        """Percent by which memory has grown after the first tenth, without what must be kept."""
+        first, last = (self.megabytes[i] - self.kept[i] for i in (0, -1))
+        return 100.0 * (last / first - 1.0)
+
+
+def soak(frames: int, say: Callable[[str], None]) -> Soak:
+    """Map so many frames: the demo's, there and back again without end."""
+    initialise("cpu")
+    tracker = list(SyntheticTracker(width=WIDTH, height=HEIGHT))
+    settings = MappingSettings(optimise=OptimiseSettings(steps=1, last_steps=1))
+    mapper = Mapper(WIDTH, HEIGHT, settings)
+    megabytes: list[float] = []
+    kept: list[float] = []
+    gaussians: list[int] = []
+    for frame in _there_and_back(tracker, frames):
+        mapper.add(frame)
+        if (frame.index + 1) % max(frames // 10, 1) == 0:
+            megabytes.append(_resident())
+            kept.append(_must_be_kept(mapper) / 1e6)
+            gaussians.append(len(mapper.pipeline.gaussians))
+            say(f"{frame.index + 1} frames, {gaussians[-1]} Gaussians: {megabytes[-1]:.1f} MB")
+    return Soak(frames, len(mapper.pipeline.keyframes), gaussians, megabytes, kept)
+
+
+def _there_and_back(frames: list[TrackedFrame], count: int) -> Iterator[TrackedFrame]:
+    turn = [*frames, *frames[-2:0:-1]]
+    for index in range(count):
+        frame = turn[index % len(turn)]
+        yield replace(frame, index=index, timestamp=index / 10)
+
+
+def _must_be_kept(mapper: Mapper) -> int:
+    """Bytes of keyframes' images and points, and of what every frame saw."""
+    images = sum(level.rgba.nbytes for view in mapper.pipeline.keyframes for level in view.pyramid)
+    points = sum(
+        p.xyz.nbytes + p.pixels.nbytes + p.ids.nbytes for p in (view.points for view in mapper.pipeline.keyframes)
+    )
+    seen = mapper.frames.points
+    return images + points + sum(rows.nbytes + p.nbytes for rows, p in zip(seen.rows, seen.pixels, strict=True))
+
+
+def _resident() -> float:
+    """Megabytes of this process."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def soak_table(result: Soak) -> str:
+    """The result as Markdown."""
+    return "\n".join(
+        [
+            "| soak | after a tenth | at the end |",
+            "|---|---|---|",
+            f"| frames | {result.frames // 10:,} | {result.frames:,} |",
+            f"| Gaussians | {result.gaussians[0]:,} | {result.gaussians[-1]:,} |",
+            f"| memory of the process [MB] | {result.megabytes[0]:.1f} | {result.megabytes[-1]:.1f} |",
+            f"| of that keyframes' images and frames' points [MB] | {result.kept[0]:.1f} | {result.kept[-1]:.1f} |",
+            f"| growth of the rest | | {result.growth:+.2f} % |",
+        ]
+    )

@@ -1,0 +1,164 @@
+"""A recording with faulty frames in its midst, beside the same one in order: how much the map suffers."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fault_injection.runs import finished, metrics
+from fields.backend import initialise
+from fields.se3 import exp_se3
+from modp_ti.exports.trajectory import read_trajectory, write_trajectory
+from modp_ti.synthetic import SyntheticTracker
+
+__all__ = ["FAULTS", "Stream", "map_both", "stream_table", "write_recording"]
+
+HOLDOUT = 8
+FPS = 10.0
+FAULTS = ("black image", "cut-off image", "repeated image", "pose that jumps", "pose of NaN", "clock that jumps")
+SCENE = """\
+source:
+  path: images
+  fps: {fps}
+  holdout: {holdout}
+  intrinsics: {{fx: {focal}, cx: {cx}, cy: {cy}}}
+tracker: {{kind: tum, path: poses.txt, points: points.txt}}
+output: out
+device: cpu
+mapping: {{optimise: {{steps: {steps}}}}}
+refine: {{steps: {refine}}}
+export: {{report: false}}
+"""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """frames: of the recording. faulty: frames by fault. clean, faults: metrics.json of the two runs."""
+
+    frames: int
+    faulty: dict[str, list[int]]
+    clean: dict
+    disturbed: dict
+
+    @property
+    def loss(self) -> float:
+        """Held-out PSNR [dB] that the faults cost."""
+        return held_out(self.clean) - held_out(self.disturbed)
+
+
+def held_out(figures: dict) -> float:
+    """PSNR [dB] of the held-out frames."""
+    return figures["refined"]["held_out"]["psnr"]
+
+
+def write_recording(folder: Path, frames: int, scale: float, steps: int, refine: int) -> None:
+    """The demo room as a folder of images with a trajectory in TUM's format, and the points that its tracker has."""
+    initialise("cpu")
+    tracker = SyntheticTracker(width=round(320 * scale), height=round(240 * scale), frames=frames)
+    (folder / "images").mkdir(parents=True)
+    poses, points = [], {}
+    for frame in tracker:
+        picture = np.round(frame.image[..., ::-1] * 255.0).astype(np.uint8)
+        cv2.imwrite(str(folder / "images" / f"{frame.index:06d}.png"), picture)
+        poses.append(frame.T_camera_world)
+        points |= dict(zip(frame.points.ids.tolist(), frame.points.xyz.tolist(), strict=True))
+    write_trajectory(folder / "poses.txt", np.arange(frames) / FPS, poses)
+    text = "\n".join(" ".join(map(repr, xyz)) for xyz in points.values())
+    (folder / "points.txt").write_text(text + "\n", encoding="utf-8")
+    camera = tracker.camera
+    scene = SCENE.format(
+        fps=FPS, holdout=HOLDOUT, focal=camera.fx, cx=camera.cx, cy=camera.cy, steps=steps, refine=refine
+    )
+    (folder / "scene.yaml").write_text(scene, encoding="utf-8")
+
+
+def disturb(folder: Path, share: float, seed: int) -> dict[str, list[int]]:
+    """Spoil so many frames of a recording, none of them held out; the frames by what befell them."""
+    chance = random.Random(seed)
+    images = sorted((folder / "images").iterdir())
+    times, poses = read_trajectory(folder / "poses.txt")
+    # Not the first ones: a recording that begins with rubbish is another matter.
+    places = [i for i in range(HOLDOUT, len(images)) if i % HOLDOUT]
+    chosen = sorted(chance.sample(places, round(share * len(images))))
+    kinds = [FAULTS[i % len(FAULTS)] for i in range(len(chosen))]
+    chance.shuffle(kinds)
+    for i, kind in zip(chosen, kinds, strict=True):
+        _spoil(kind, i, images, times, poses, chance)
+    write_trajectory(folder / "poses.txt", times, poses)
+    faulty = {kind: [i for i, of in zip(chosen, kinds, strict=True) if of == kind] for kind in FAULTS}
+    lines = (folder / "poses.txt").read_text(encoding="utf-8").splitlines()
+    for i in faulty["pose of NaN"]:
+        lines[i + 1] = " ".join([lines[i + 1].split()[0], *["nan"] * 7])  # + 1: the heading
+    (folder / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return faulty
+
+
+def _spoil(
+    kind: str,
+    i: int,
+    images: list[Path],
+    times: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    chance: random.Random,
+) -> None:
+    if kind == "black image":
+        cv2.imwrite(str(images[i]), np.zeros_like(cv2.imread(str(images[i]))))
+    elif kind == "cut-off image":
+        data = images[i].read_bytes()
+        images[i].write_bytes(data[: len(data) // 2])
+    elif kind == "repeated image":
+        images[i].write_bytes(images[i - 1].read_bytes())
+    elif kind == "pose that jumps":
+        away = [chance.choice((-1.0, 1.0)) * value for value in (0.8, 0.3, 0.6, 0.3, 0.6, 0.2)]
+        poses[i] = exp_se3(away) @ poses[i]
+    elif kind == "clock that jumps":
+        times[i] += chance.choice((-2.0, 1000.0))
+
+
+def map_both(
+    folder: Path,
+    seed: int,
+    say: Callable[[str], None],
+    frames: int = 80,
+    scale: float = 0.5,
+    steps: int = 8,
+    refine: int = 100,
+) -> Stream:
+    """Map the recording in order, and with a tenth of its frames spoilt."""
+    shutil.rmtree(folder, ignore_errors=True)
+    clean, spoilt = folder / "clean", folder / "spoilt"
+    write_recording(clean, frames, scale, steps, refine)
+    shutil.copytree(clean, spoilt)
+    faulty = disturb(spoilt, 0.1, seed)
+    say(f"{frames} frames, {sum(map(len, faulty.values()))} of them spoilt")
+    for run in (clean, spoilt):
+        ended = finished([str(run / "scene.yaml")], run / "out")
+        say(f"{run.name}: {held_out(metrics(run / 'out')):.2f} dB on held-out frames after {ended.seconds:.0f} s")
+        for line in ended.said.splitlines():
+            if "left out" in line or "did not touch" in line or "no pose" in line:
+                say("  " + line)
+    return Stream(frames, faulty, metrics(clean / "out"), metrics(spoilt / "out"))
+
+
+def stream_table(result: Stream) -> str:
+    """The result as Markdown."""
+    spoilt = ", ".join(f"{len(places)} {kind}" for kind, places in result.faulty.items())
+    left_out = ", ".join(f"{count} {why}" for why, count in result.disturbed["frames_left_out"].items())
+    return "\n".join(
+        [
+            "| a recording with faulty frames | in order | spoilt |",
+            "|---|---|---|",
+            f"| frames | {result.frames} | {sum(map(len, result.faulty.values()))} spoilt: {spoilt} |",
+            f"| frames mapped | {result.clean['frames']} | {result.disturbed['frames']} |",
+            f"| left out by the run | | {left_out} |",
+            f"| held-out PSNR [dB] | {held_out(result.clean):.2f} | {held_out(result.disturbed):.2f} |",
+            f"| lost [dB] | | {result.loss:+.2f} |",
+        ]
+    )

@@ -1,0 +1,78 @@
+"""Faults, made on purpose, and what became of the run: tables for docs/reliability.md.
+
+kills   a small run is killed at random moments and resumed; its map must be that of a run in peace, byte for byte
+stream  a recording with a tenth of its frames spoilt, beside the same one in order
+soak    a long recording, and the memory that the process holds meanwhile
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from experiments import write_report
+
+from modp_ti.errors import InputError
+
+Say = Callable[[str], None]
+Part = Callable[[argparse.Namespace, Say], str]
+
+
+def kills(arguments: argparse.Namespace, say: Say) -> str:
+    """Table of the kills."""
+    from fault_injection.kills import kill_and_resume, kills_table
+
+    return kills_table(kill_and_resume(arguments.output / "kills", arguments.kills, arguments.seed, say))
+
+
+def stream(arguments: argparse.Namespace, say: Say) -> str:
+    """Table of the recording with faulty frames."""
+    from fault_injection.stream import map_both, stream_table
+
+    return stream_table(map_both(arguments.output / "stream", arguments.seed, say))
+
+
+def soak(arguments: argparse.Namespace, say: Say) -> str:
+    """Table of the soak."""
+    from fault_injection.soak import soak as run_soak
+    from fault_injection.soak import soak_table
+
+    return soak_table(run_soak(arguments.frames, say))
+
+
+PARTS: dict[str, Part] = {"kills": kills, "stream": stream, "soak": soak}
+
+
+def main() -> None:
+    """Make the faults, then print and write the tables; exit code 2 where a run fails that should not."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/faults kills --kills 10 -o out/faults",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all without")
+    parser.add_argument("-o", "--output", required=True, type=Path, help="folder of the runs and of faults.md")
+    parser.add_argument("--kills", type=int, default=50, metavar="N", help="how many (default 50)")
+    parser.add_argument("--frames", type=int, default=20_000, metavar="N", help="of the soak (default 20,000)")
+    parser.add_argument("--seed", type=int, default=0, help="of all chance (default 0)")
+    arguments = parser.parse_args()
+    unknown = [part for part in arguments.parts if part not in PARTS]
+    if unknown:
+        parser.error(f"{unknown[0]} is none of {', '.join(PARTS)}")
+    arguments.output = arguments.output.resolve()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    try:
+        tables = {part: PARTS[part](arguments, say) for part in arguments.parts or PARTS}
+    except InputError as error:
+        parser.exit(2, f"error: {error}\n")
+    write_report(arguments.output, "faults", "\n\n".join(tables.values()), tables)
+
+
+if __name__ == "__main__":
+    main()

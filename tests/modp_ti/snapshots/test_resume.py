@@ -1,0 +1,184 @@
+"""A run that was stopped goes on as if it had not been: real processes, killed and interrupted, and real files."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from modp_ti.errors import InputError
+from modp_ti.snapshots import load_resumed
+from modp_ti.snapshots.file import FILE, read_arrays, write_arrays
+from tests.modp_ti.runs import finished_run
+
+# Exposure, drift with a correction and pruning: all that a snapshot must hold.
+SCENE = """
+source:  {scale: 0.2, holdout: 4, step: 6, fps: 10}
+tracker: {kind: synthetic, drift: 0.05, correction: true, exposure_change: 0.5}
+output:  out
+device:  cpu
+seed:    3
+mapping: {optimise: {steps: 3, last_steps: 4}, densify: {warm_up: 3, prune_every: 4}, exposure: {enabled: true}}
+refine:  {steps: 9}
+export:  {report: false}
+snapshot_every: 2
+"""
+SAME = ("splats.ply", "trajectory.txt", "exposure.json", "frames.json", "scores.csv")
+FIGURES = ("frames", "keyframes", "gaussians", "corrections", "online", "refined", "guards", "frames_left_out")
+
+
+@pytest.fixture(scope="module")
+def in_peace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return finished_run(tmp_path_factory.mktemp("peace"), SCENE, "device: CPU")
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "modp_ti.run", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Where the tests run in a shell's background, children inherit that Ctrl-C is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
+def position(file: Path) -> tuple[int, int]:
+    """Frames and corrections taken in, and steps of refinement, of the snapshot; (-1, -1) without one."""
+    if not file.exists():
+        return -1, -1
+    about = read_arrays(file)[1]["position"]
+    return about["events"], about["refined"]
+
+
+def wait_for(process: subprocess.Popen[str], file: Path, least: tuple[int, int]) -> None:
+    while process.poll() is None and position(file) < least:
+        time.sleep(0.01)
+    assert process.poll() is None, process.communicate()
+
+
+def assert_the_same(out: Path, peace: Path) -> None:
+    for name in SAME:
+        assert (out / name).read_bytes() == (peace / name).read_bytes(), name
+    figures, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (out, peace))
+    assert {name: figures[name] for name in FIGURES} == {name: expected[name] for name in FIGURES}
+    assert expected["snapshots"]["resumed"] == 0 < figures["snapshots"]["resumed"]
+
+
+def test_a_finished_run_keeps_no_snapshot(in_peace: Path) -> None:
+    assert not (in_peace / FILE).exists()
+    assert json.loads((in_peace / "metrics.json").read_text())["snapshots"]["written"] >= 7
+    with pytest.raises(InputError, match="the run there is finished, there is nothing to resume"):
+        load_resumed(in_peace, None, [])
+
+
+def test_a_run_that_is_killed_and_interrupted_on_its_way_ends_as_one_in_peace(tmp_path: Path, in_peace: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    out = tmp_path / "out"
+    process = start(str(tmp_path / "scene.yaml"))
+    wait_for(process, out / FILE, (6, 0))
+    process.kill()
+    process.communicate()
+    before = position(out / FILE)
+
+    process = start("--resume", str(out), "--json")
+    wait_for(process, out / FILE, (before[0] + 1, 0))
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert f"modp-ti run --resume {out} goes on" in json.loads(said)["error"], errors
+    assert position(out / FILE) > before
+    assert {"splats.ply", "trajectory.txt", "frames.json", "colmap", "config.yaml"} <= set(os.listdir(out))
+    assert not (out / "metrics.json").exists()
+
+    process = start("--resume", str(out))
+    wait_for(process, out / FILE, (0, 1)) if position(out / FILE)[1] == 0 else None
+    process.kill()
+    process.communicate()
+
+    process = start("--resume", str(out))
+    said, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert_the_same(out, in_peace)
+    assert not (out / FILE).exists()
+
+
+@pytest.fixture
+def stopped(tmp_path: Path) -> Path:
+    """The output folder of a run of which nothing but a snapshot is known: its settings are real, its map is not."""
+    from modp_ti.config import load_scene
+
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    config = load_scene(tmp_path / "scene.yaml")
+    (tmp_path / "out").mkdir()
+    about = {
+        "settings": config.model_dump(mode="json"),
+        "position": {"events": 1, "digest": 5, "finished": False, "refined": 0},
+        "numbers": {},
+    }
+    write_arrays(tmp_path / "out" / FILE, {"a": np.zeros(1)}, about)
+    return tmp_path / "out"
+
+
+def test_the_settings_come_from_the_snapshot_and_some_may_change(stopped: Path) -> None:
+    config, snapshot = load_resumed(stopped, None, ["threads=1", "snapshot_every=5", "export.report=true"])
+    assert (config.seed, config.threads, config.snapshot_every, config.export.report) == (3, 1, 5, True)
+    assert config.output == stopped and snapshot.position.digest == 5
+
+
+def test_an_output_folder_that_was_moved_is_written_where_it_is_now(stopped: Path) -> None:
+    moved = stopped.rename(stopped.with_name("moved"))
+    assert load_resumed(moved, None, [])[0].output == moved
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("mapping.optimise.steps=5", "its mapping.optimise.steps is 3, here it is 5"),
+        ("seed=4", "its seed is 3, here it is 4"),
+        ("source.scale=0.5", "its source.scale is 0.2, here it is 0.5"),
+        ("refine.steps=10", "its refine.steps is 9, here it is 10"),
+    ],
+)
+def test_a_snapshot_of_another_scene_is_refused_with_what_differs(stopped: Path, change: str, said: str) -> None:
+    with pytest.raises(InputError, match=f"is of another scene: {said}"):
+        load_resumed(stopped, stopped.parent / "scene.yaml", [change])
+
+
+def test_settings_that_this_version_does_not_have_are_refused(stopped: Path) -> None:
+    arrays, about = read_arrays(stopped / FILE)
+    del about["version"]
+    about["settings"]["mapping"]["magic"] = 1
+    write_arrays(stopped / FILE, arrays, about)
+    with pytest.raises(InputError, match=r"unknown key `mapping\.magic`"):
+        load_resumed(stopped, None, [])
+
+
+def test_a_folder_without_a_snapshot_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        load_resumed(tmp_path / "gone", None, [])
+    with pytest.raises(InputError, match="there is no snapshot: start the run from its scene"):
+        load_resumed(tmp_path, None, [])
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("tracker.kind=socket", "frames that come live are gone"),
+        ("mode=offline", "snapshot_every is for mode: online"),
+    ],
+)
+def test_what_cannot_be_resumed_is_said_at_once(tmp_path: Path, settings: str, said: str) -> None:
+    from modp_ti.config import load_scene
+
+    text = "tracker: {kind: synthetic}\noutput: out\nsnapshot_every: 3\n"
+    (tmp_path / "scene.yaml").write_text(text)
+    with pytest.raises(InputError, match=said):
+        load_scene(tmp_path / "scene.yaml", [settings])

@@ -1,0 +1,100 @@
+"""Faults on purpose: what is spoilt is what was said, and what the tables say is what came of it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import faults
+import numpy as np
+import pytest
+from fault_injection.kills import KILLS_SCENE, Kills, kills_table
+from fault_injection.runs import finished, run_until
+from fault_injection.soak import Soak, soak_table
+from fault_injection.stream import FAULTS, HOLDOUT, Stream, disturb, stream_table, write_recording
+
+from modp_ti.config import load_scene
+from modp_ti.errors import InputError
+from modp_ti.exports.trajectory import write_trajectory
+from modp_ti.trackers import open_tracker
+
+FRAMES = 60
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """As `write_recording` leaves it, but of noise."""
+    rng = np.random.default_rng(0)
+    (tmp_path / "images").mkdir()
+    for i in range(FRAMES):
+        picture = rng.integers(0, 255, (36, 48, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / f"{i:06d}.png"), picture)
+    write_trajectory(tmp_path / "poses.txt", np.arange(FRAMES) / 10, [np.eye(4)] * FRAMES)
+    return tmp_path
+
+
+def test_a_tenth_of_the_frames_is_spoilt_each_in_its_way_and_no_other(recording: Path) -> None:
+    images = sorted((recording / "images").iterdir())
+    before = [image.read_bytes() for image in images]
+    lines = (recording / "poses.txt").read_text().splitlines()
+    faulty = disturb(recording, 0.1, seed=3)
+    assert list(faulty) == list(FAULTS) and all(len(places) == 1 for places in faulty.values())
+    spoilt = {kind: places[0] for kind, places in faulty.items()}
+    assert not any(i % HOLDOUT == 0 or i < HOLDOUT for i in spoilt.values())
+    changed = {i for i, image in enumerate(images) if image.read_bytes() != before[i]}
+    assert changed == {spoilt[kind] for kind in FAULTS[:3]}
+    assert (cv2.imread(str(images[spoilt["black image"]])) == 0).all()
+    cut = spoilt["cut-off image"]
+    assert images[cut].read_bytes() == before[cut][: len(before[cut]) // 2]
+    after = (recording / "poses.txt").read_text().splitlines()
+    assert {i for i in range(FRAMES) if after[i + 1] != lines[i + 1]} == {spoilt[kind] for kind in FAULTS[3:]}
+    assert after[spoilt["pose of NaN"] + 1].count("nan") == 7
+
+
+def test_the_recording_is_one_that_a_run_takes(tmp_path: Path) -> None:
+    write_recording(tmp_path, frames=12, scale=0.2, steps=2, refine=3)
+    frames = list(open_tracker(load_scene(tmp_path / "scene.yaml")))
+    assert [frame.index for frame in frames] == list(range(12))
+    assert frames[0].image.shape == (48, 64, 3) and frames[8].held_out
+    assert min(len(frame.points) for frame in frames) > 50
+    load_scene_text = tmp_path / "kills.yaml"
+    load_scene_text.write_text(KILLS_SCENE)
+    assert load_scene(load_scene_text).can_be_resumed
+
+
+def test_a_run_is_killed_when_it_is_time(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(KILLS_SCENE)
+    ended = run_until([str(tmp_path / "scene.yaml")], tmp_path / "reference" / "snapshot.npz", kill_after=0.2)
+    assert ended.killed and ended.code == -9 and ended.first_snapshot is None
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.yaml"]
+
+
+def test_a_run_that_fails_by_itself_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"ended with 2: error: .*gone\.yaml: no such scene file"):
+        finished([str(tmp_path / "gone.yaml")], tmp_path)
+
+
+def test_the_tables_say_what_came_of_it() -> None:
+    kills = kills_table(Kills([1.0, 2.0], {"before the first snapshot": 0, "after one": 2}, 1, 1, 0))
+    assert "| kills | 2 (0 before the first snapshot, 2 after one) |" in kills
+    stage = {"held_out": {"psnr": 30.0}}
+    clean = {"frames": 60, "refined": stage, "frames_left_out": {}}
+    spoilt = {"frames": 55, "refined": {"held_out": {"psnr": 29.75}}, "frames_left_out": {"blank": 1}}
+    stream = Stream(60, {"black image": [9]}, clean, spoilt)
+    assert stream.loss == pytest.approx(0.25)
+    assert "| lost [dB] | | +0.25 |" in stream_table(stream) and "| left out by the run | | 1 blank |" in stream_table(
+        stream
+    )
+    soak = Soak(100, 5, [10, 20], [110.0, 131.0], [10.0, 30.0])
+    assert soak.growth == pytest.approx(1.0)
+    assert "| growth of the rest | | +1.00 % |" in soak_table(soak)
+
+
+def test_an_unknown_part_gets_one_line_and_code_two(tmp_path: Path) -> None:
+    command = [sys.executable, faults.__file__, "thunder", "-o", str(tmp_path / "out")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 2
+    assert "thunder is none of kills, stream, soak" in result.stderr
+    assert not (tmp_path / "out").exists()
