@@ -10,13 +10,60 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from modp_ti.errors import InputError
+from modp_ti.reading import read_bytes, text_lines
 
-__all__ = ["require_whole_binary_model"]
+if TYPE_CHECKING:
+    import pycolmap
+
+__all__ = ["read_colmap_model"]
 
 # Parameters of each camera model, by COLMAP's model number.
 CAMERA_PARAMS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
+
+
+STEMS = ("cameras", "images", "points3D")
+# Characters of a line of a text model: an image's observations stand in one.
+MAX_TEXT_LINE = 1 << 24
+
+
+def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
+    """The model in a folder, binary or text. Raises InputError for one that is incomplete, damaged or empty."""
+    import pycolmap
+
+    if not any(all((folder / f"{stem}{suffix}").exists() for stem in STEMS) for suffix in (".bin", ".txt")):
+        missing = [stem for stem in STEMS if not any((folder / f"{stem}{s}").exists() for s in (".bin", ".txt"))]
+        raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
+    if all((folder / f"{stem}.bin").exists() for stem in STEMS):
+        _require_whole_binary_model(folder)
+    else:
+        _require_text_model(folder)
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+        for image in model.images.values():
+            image.name.encode()  # a name need not be UTF-8 in the file
+    except Exception as error:  # pycolmap throws what its C++ does: ValueError, IndexError, MemoryError, RuntimeError
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{folder}: not a readable COLMAP model ({reason}); export it again") from None
+    if not model.images:
+        raise InputError(f"{folder}: the COLMAP model holds no image")
+    return model
+
+
+def _require_text_model(folder: Path) -> None:
+    """Raises InputError where a .txt file of the model is no text file."""
+    for stem in RECORDS:
+        file = folder / f"{stem}.txt"
+        if not file.exists():
+            continue
+        try:
+            for _ in text_lines(file, longest=MAX_TEXT_LINE):
+                pass
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+            raise InputError(f"{file}: cannot be read as text: {reason}; export the COLMAP model again") from None
 
 
 class _CutOffError(Exception):
@@ -94,14 +141,14 @@ RECORDS: dict[str, Callable[[_Cursor], None]] = {
 }
 
 
-def require_whole_binary_model(folder: Path) -> None:
+def _require_whole_binary_model(folder: Path) -> None:
     """Raises InputError where a .bin file of the model is cut off, damaged or followed by other data."""
     for stem, skip_record in RECORDS.items():
         file = folder / f"{stem}.bin"
         if not file.exists():
             continue
         try:
-            cursor = _Cursor(file.read_bytes())
+            cursor = _Cursor(read_bytes(file))
         except OSError as error:
             raise InputError(f"{file}: cannot be read: {error.strerror}") from None
         try:

@@ -1,0 +1,1 @@
+"""Trouble made on purpose: malformed files, killed runs, disturbed streams."""
