@@ -7,6 +7,7 @@ the end exactly rules that out.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -52,6 +53,13 @@ def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise _DamagedError(f"{word[:40]!r} stands where a number should") from None
+
+
 def _require_text_model(folder: Path) -> None:
     """Raises InputError where a .txt file of the model is no text file."""
     for stem in RECORDS:
@@ -59,8 +67,14 @@ def _require_text_model(folder: Path) -> None:
         if not file.exists():
             continue
         try:
-            for _ in text_lines(file, longest=MAX_TEXT_LINE):
-                pass
+            lines = text_lines(file, longest=MAX_TEXT_LINE)
+            for line in lines:
+                words = line.split(maxsplit=5)
+                if stem == "images" and words and not words[0].startswith("#"):
+                    _require_quaternion([_number(word) for word in words[1:5]])
+                    next(lines, None)  # its observations
+        except _DamagedError as error:
+            raise InputError(f"{file}: {error}; the file is damaged") from None
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
             raise InputError(f"{file}: cannot be read as text: {reason}; export the COLMAP model again") from None
@@ -89,11 +103,22 @@ class _Cursor:
         self.skip(size)
         return int(struct.unpack_from(form, self.data, self.at - size)[0])
 
+    def read_float(self) -> float:
+        self.skip(8)
+        return float(struct.unpack_from("<d", self.data, self.at - 8)[0])
+
     def skip_text(self) -> None:
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise _CutOffError
         self.at = end + 1
+
+
+def _require_quaternion(q: list[float]) -> None:
+    """Raises _DamagedError for one that is no rotation: COLMAP makes one of unit length of any, and says nothing."""
+    length = math.hypot(*q)
+    if not 0.9 < length < 1.1:
+        raise _DamagedError(f"the quaternion of an image has length {length:.4g} instead of 1")
 
 
 def _camera(cursor: _Cursor) -> None:
@@ -106,7 +131,9 @@ def _camera(cursor: _Cursor) -> None:
 
 
 def _image(cursor: _Cursor) -> None:
-    cursor.skip(4 + 7 * 8 + 4)  # id, pose, camera
+    cursor.skip(4)  # id
+    _require_quaternion([cursor.read_float() for _ in range(4)])
+    cursor.skip(3 * 8 + 4)  # position, camera
     cursor.skip_text()
     cursor.skip(24 * cursor.read("<Q"))  # x, y, point
 

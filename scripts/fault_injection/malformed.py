@@ -1,4 +1,4 @@
-"""Malformed inputs, each through the command line in this process: one line, exit code 2, nothing written, memory bounded.
+"""Malformed inputs through the command line, in this process: one line, exit code 2, nothing written, memory bounded.
 
 `python scripts/fault_injection/malformed.py [READER ...]` prints a table by reader, and what went wrong.
 """
@@ -13,7 +13,7 @@ import sys
 import tempfile
 import tracemalloc
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +29,8 @@ BASE = 16 << 20
 """Bytes that a command may take however small its input is; beyond, twice the input's size."""
 # Of what native libraries take, which the operating system counts in its own units, this much more.
 NATIVE_BASE = 96 << 20
-SECONDS = 120  # after which a command hangs
+# After which a command hangs: seconds of the clock, and of the processor.
+SECONDS, PROCESSOR_SECONDS = 900, 30
 
 
 @dataclass(frozen=True)
@@ -42,19 +43,21 @@ class Outcome:
     allocated: int
 
 
-def malformed_inputs(readers: Iterable[str] = ()) -> list[Outcome]:
-    """Run every case, or those of some readers."""
+def malformed_inputs(readers: Iterable[str] = ()) -> Iterator[Outcome]:
+    """Run every case, or those of some readers, one after the other."""
     wanted = set(readers)
     cases = [case for case in CASES if not wanted or case.reader in wanted]
-    with tempfile.TemporaryDirectory(prefix="modp-ti-malformed-") as folder, _tracing():
-        outcomes = []
+    with tempfile.TemporaryDirectory(prefix="modp-ti-malformed-") as folder:
         for reader in dict.fromkeys(case.reader for case in cases):
             sample = Path(folder) / reader
             write_sample(reader, sample)
             fault = _accepted(sample, SAMPLES[reader][0].arguments)
             assert not fault, f"the valid sample of {reader} is refused: {fault}"
-            outcomes += [run_case(case, sample, Path(folder) / "case") for case in cases if case.reader == reader]
-        return outcomes
+            for case in cases:
+                if case.reader == reader:
+                    with _tracing():
+                        outcome = run_case(case, sample, Path(folder) / "case")
+                    yield outcome
 
 
 def run_case(case: Case, sample: Path, folder: Path) -> Outcome:
@@ -102,13 +105,13 @@ def markdown(outcomes: list[Outcome]) -> str:
 def _accepted(folder: Path, arguments: tuple[str, ...]) -> str:
     """Why a command refuses a valid sample; this also imports what it needs, before memory is measured."""
     kept = _listing(folder)
-    code, text = _command(folder, arguments)
+    code, text = _command(folder, arguments, impatient=False)
     for name in _listing(folder) - kept:
         (folder / name).unlink()
     return "" if code in (0, 1) else text
 
 
-def _command(folder: Path, arguments: tuple[str, ...]) -> tuple[int, str]:
+def _command(folder: Path, arguments: tuple[str, ...], impatient: bool = True) -> tuple[int, str]:
     """Exit code and all output, of native libraries too, of `modp-ti` in the folder."""
     from modp_ti.cli import app
 
@@ -116,7 +119,7 @@ def _command(folder: Path, arguments: tuple[str, ...]) -> tuple[int, str]:
     with tempfile.TemporaryFile() as output:
         try:
             os.chdir(folder)
-            with _everything_to(output.fileno()), _impatient():
+            with _everything_to(output.fileno()), _impatient() if impatient else nullcontext():
                 app(list(arguments))
             code = 0
         except SystemExit as end:
@@ -152,15 +155,18 @@ def _impatient() -> Iterator[None]:
     """Raises where the command hangs."""
 
     def late(*_: object) -> None:
-        raise TimeoutError(f"hangs: {SECONDS} s have passed")
+        raise TimeoutError(f"hangs: {PROCESSOR_SECONDS} s of the processor, or {SECONDS} s, have passed")
 
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(SECONDS)
+    timers = {signal.SIGALRM: (signal.ITIMER_REAL, SECONDS), signal.SIGPROF: (signal.ITIMER_PROF, PROCESSOR_SECONDS)}
+    before = {number: signal.signal(number, late) for number in timers}
+    for timer, seconds in timers.values():
+        signal.setitimer(timer, seconds)
     try:
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+        for number, (timer, _) in timers.items():
+            signal.setitimer(timer, 0)
+            signal.signal(number, before[number])
 
 
 @contextmanager
@@ -201,9 +207,15 @@ def _status(key: str) -> int:
 
 
 if __name__ == "__main__":
-    found = malformed_inputs(sys.argv[1:])
-    print(markdown(found))
-    for outcome in found:
+    found = []
+    for outcome in malformed_inputs(sys.argv[1:]):
+        found.append(outcome)
         if outcome.fault:
-            print(f"\n{outcome.case.reader}: {outcome.case.name}: {outcome.fault}\n{outcome.line}")
+            case = outcome.case
+            print(
+                f"{case.reader}: {case.file}: {case.name}: {outcome.fault}\n{outcome.line}\n",
+                file=sys.stderr,
+                flush=True,
+            )
+    print(markdown(found))
     sys.exit(any(outcome.fault for outcome in found))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from threading import Event
 
@@ -17,7 +18,7 @@ import numpy as np
 from fault_injection.samples import SAMPLES, write_sample
 from modp_ti.errors import InputError
 
-__all__ = ["READERS", "Reader", "seeds"]
+__all__ = ["READERS", "Reader", "import_readers", "seeds"]
 
 
 @dataclass(frozen=True)
@@ -248,6 +249,18 @@ READERS: dict[str, Reader] = {
         Reader("door", "door", ("wire",), _door),
     )
 }
+
+
+def import_readers() -> None:
+    """Import every module that the readers use, once and for all processes that are forked off."""
+    kinds = ("aria", "colmap", "door", "modp", "replica", "stella_vslam", "transforms", "tum")
+    for name in (
+        *("config", "exports.exposure", "exports.scores_csv", "exports.splats_ply", "exports.trajectory"),
+        *("playback.finished_run", "sources.exif", "sources.tum_rgbd", "sources.video_file", "sources.vignette"),
+        *(f"trackers.{kind}" for kind in kinds),
+    ):
+        import_module(f"modp_ti.{name}")
+    import_module("pipelines.weights")
 
 
 def seeds(reader: Reader, folder: Path) -> list[bytes]:
