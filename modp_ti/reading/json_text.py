@@ -13,8 +13,8 @@ from modp_ti.reading.files import read_text
 __all__ = ["parse_json", "read_json"]
 
 MAX_DEPTH = 64
-# Strings, so that brackets in them do not count, and brackets. A string without an end goes to the end of the text.
-TOKEN = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*(?:"|\Z)|[\[{\]}]', re.DOTALL)
+# Brackets, what opens and closes strings, in which brackets do not count, and what is escaped there.
+TOKEN = re.compile(r'\\.|["\[{\]}]', re.DOTALL)
 # What half a character of UTF-16 looks like; whole ones are pairs of them.
 HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 CLOSES = {"]": "[", "}": "{"}
@@ -55,15 +55,22 @@ def parse_json(text: str, name: str, line: int | None = None) -> Any:
 
 def _require_structure(text: str, name: str, first: int) -> None:
     open_brackets: list[str] = []
+    in_string = False
     for token in TOKEN.finditer(text):
-        kind = token[0][0]
-        if kind in "[{":
+        kind = token[0]
+        if kind == '"':
+            in_string = not in_string
+        elif in_string:
+            continue
+        elif kind in "[{":
             open_brackets.append(kind)
             if len(open_brackets) > MAX_DEPTH:
                 raise _invalid(name, first + text.count("\n", 0, token.start()), f"nested deeper than {MAX_DEPTH}")
         elif kind in CLOSES:
             if not open_brackets or open_brackets.pop() != CLOSES[kind]:
                 raise _invalid(name, first + text.count("\n", 0, token.start()), f"a {kind} that closes nothing")
+    if in_string:
+        raise _invalid(name, first + text.count("\n"), "it ends before its last string is closed")
     if open_brackets:
         raise _invalid(name, first + text.count("\n"), f"it ends before its last {open_brackets[-1]} is closed")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,8 @@ DECODED_BYTES = 12
 # Deflate makes 1032 bytes of one at most; JPEG spends a bit at least on a block of 64 pixels, in the channel that has
 # the most of them, which is at least a quarter of the image's size.
 MOST_INFLATED = 1032
+INFLATED_AT_A_TIME = 1 << 18
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's kind of colour
 MOST_JPEG_PIXELS = 2048  # a byte
 
 
@@ -57,6 +60,8 @@ def why_undecodable(data: bytes) -> str | None:
         return f"its {claim.width}x{claim.height} pixels do not fit into this machine's memory"
     if claim.least > len(data):
         return f"the file is cut off: {claim.width}x{claim.height} pixels cannot be in {len(data)} bytes"
+    if read is _png and not _inflates(data):
+        return "its pixels are damaged or missing"
     return None
 
 
@@ -64,10 +69,29 @@ def _png(data: bytes) -> _Claim:
     if data[12:16] != b"IHDR":
         raise _UnknownError
     width, height, depth, kind = struct.unpack_from(">IIBB", data, 16)
-    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(kind, 0)
+    channels = PNG_CHANNELS.get(kind, 0)
     if channels == 0 or depth not in (1, 2, 4, 8, 16):
         raise _UnknownError
     return _Claim(width, height, height * (1 + width * channels * depth // 8) // MOST_INFLATED)
+
+
+def _inflates(data: bytes) -> bool:
+    """Whether a PNG's content unpacks to all of its rows. The decoder would find out too, and write to the terminal."""
+    width, height, depth, kind, _, _, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
+    wanted = 0 if interlaced else height * (1 + (width * PNG_CHANNELS[kind] * depth + 7) // 8)
+    inflater, found, at = zlib.decompressobj(), 0, 8
+    try:
+        while at + 12 <= len(data) and not inflater.eof:
+            (length,) = struct.unpack_from(">I", data, at)
+            if data[at + 4 : at + 8] == b"IDAT":
+                rest = memoryview(data)[at + 8 : at + 8 + length]
+                while rest and not inflater.eof:
+                    found += len(inflater.decompress(rest, INFLATED_AT_A_TIME))
+                    rest = inflater.unconsumed_tail
+            at += 12 + length
+    except zlib.error:
+        return False
+    return inflater.eof and found >= wanted
 
 
 def _jpeg(data: bytes) -> _Claim:

@@ -168,7 +168,7 @@ def read_points(
             & (rows["inv_dist_std"] <= max_inv_dist_std)
             & (rows["dist_std"] <= max_dist_std)
         ]
-        uid.append(kept["uid"])
+        uid.append(kept["uid"].copy())  # a column alone holds the whole table
         xyz.append(np.stack([kept[name] for name in ("px_world", "py_world", "pz_world")], axis=1))
     numbers, first = np.unique(np.concatenate(uid), return_index=True)
     if len(numbers) == 0:

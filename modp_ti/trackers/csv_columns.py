@@ -21,8 +21,8 @@ __all__ = ["read_csv_blocks"]
 
 BLOCK, BLOCK_CHARACTERS = 20_000, 1 << 21  # rows
 # A gzip file may unpack to so many bytes, and beyond that to so many times its size; those of MPS do to 3 to 10 times.
-UNPACKED_AT_LEAST = 1 << 24
-MOST_SHRUNK = 50
+UNPACKED_AT_LEAST = 1 << 22
+MOST_SHRUNK = 25
 
 
 def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:

@@ -140,8 +140,12 @@ def _cloud_files(folder: Path) -> dict[int, Path]:
 def _read_cloud(path: Path) -> NDArray[np.float64]:
     """World points (N, 3); a text file without a line has none."""
     if path.suffix.lower() == ".txt":
-        if path.stat().st_size == 0:
-            return np.zeros((0, 3))
+        try:
+            with open_file(path) as file:
+                if not file.read(1):
+                    return np.zeros((0, 3))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
         return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
     try:
         with open_file(path) as file:  # np.load takes archives, pickles and pipes too; an .npy file alone is meant here

@@ -12,7 +12,7 @@ import signal
 import sys
 import tempfile
 import tracemalloc
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,10 +43,10 @@ class Outcome:
     allocated: int
 
 
-def malformed_inputs(readers: Iterable[str] = ()) -> Iterator[Outcome]:
-    """Run every case, or those of some readers, one after the other."""
+def malformed_inputs(readers: Iterable[str] = (), cases: Sequence[Case] = CASES) -> Iterator[Outcome]:
+    """Run the cases, or those of some readers, one after the other."""
     wanted = set(readers)
-    cases = [case for case in CASES if not wanted or case.reader in wanted]
+    cases = [case for case in cases if not wanted or case.reader in wanted]
     with tempfile.TemporaryDirectory(prefix="modp-ti-malformed-") as folder:
         for reader in dict.fromkeys(case.reader for case in cases):
             sample = Path(folder) / reader
