@@ -75,7 +75,7 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     column = {name: i for i, name in enumerate(names)}
     rest = sum(name.startswith("f_rest_") for name in names)
     missing = [name for name in _names(1 + rest // 3) if name not in column and not name.startswith("n")]
-    if missing or 1 + rest // 3 not in (1, 4, 9, 16):
+    if missing or rest not in (0, 9, 24, 45):
         raise InputError(f"{file}: not 3DGS splats; {missing[0] if missing else f'{rest} f_rest'} does not fit")
 
     def columns(*wanted: str) -> NDArray[np.float32]:

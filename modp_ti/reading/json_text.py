@@ -69,10 +69,11 @@ def _require_structure(text: str, name: str, first: int) -> None:
         elif kind in CLOSES:
             if not open_brackets or open_brackets.pop() != CLOSES[kind]:
                 raise _invalid(name, first + text.count("\n", 0, token.start()), f"a {kind} that closes nothing")
+    last = first + text.count("\n", 0, len(text.rstrip()))
     if in_string:
-        raise _invalid(name, first + text.count("\n"), "it ends before its last string is closed")
+        raise _invalid(name, last, "it ends before its last string is closed")
     if open_brackets:
-        raise _invalid(name, first + text.count("\n"), f"it ends before its last {open_brackets[-1]} is closed")
+        raise _invalid(name, last, f"it ends before its last {open_brackets[-1]} is closed")
 
 
 def _invalid(name: str, line: int, reason: str) -> InputError:

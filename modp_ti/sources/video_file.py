@@ -202,7 +202,8 @@ class _Decoder:
         with quiet_decoder():
             threads = [] if in_threads else [cv2.CAP_PROP_N_THREADS, 1]
             self._capture: cv2.VideoCapture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, threads)
-            if not self._capture.isOpened():
+            # Where OpenCV was built without FFmpeg; its other readers write to the terminal.
+            if not self._capture.isOpened() and cv2.CAP_FFMPEG not in cv2.videoio_registry.getBackends():
                 self._capture = cv2.VideoCapture(str(path))
         if not self._capture.isOpened():
             raise OSError(str(path))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -301,6 +302,7 @@ def _write_mask(folder: Path) -> None:
 
 
 def _write_video(folder: Path) -> None:
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once, by whoever comes first
     writer = cv2.VideoWriter(str(folder / "room.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (WIDTH, HEIGHT))
     for i in range(FRAMES):
         writer.write(picture(i))
