@@ -9,6 +9,7 @@ there. --keep adds the smallest of the inputs that reach what the corpus did not
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import re
 import shutil
@@ -115,7 +116,11 @@ def fuzz(name: str, folder: Path, kept: Path, options: argparse.Namespace) -> No
     places = [str(folder / "found"), str(kept), str(start)]
 
     def read(data: bytes) -> None:
-        reader(sample, data)
+        try:
+            reader(sample, data)
+        except BaseException:
+            (kept / f"crash-new-{hashlib.sha1(data).hexdigest()}").write_bytes(data)
+            raise
 
     atheris.Setup([sys.argv[0], *limits, *more, *places], read)
     atheris.Fuzz()

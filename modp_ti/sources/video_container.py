@@ -82,6 +82,8 @@ def _end_of_matroska(stream: BinaryIO, size: int) -> int | None:
     header, _ = _variable_length(stream)
     if header is None:
         return None
+    if header > size:
+        return stream.tell() + header
     stream.seek(header, 1)
     if stream.read(4) != MATROSKA_SEGMENT:
         return size + 1 if stream.tell() >= size else None

@@ -19,7 +19,7 @@ from modp_ti.reading import LARGEST, limited_lines, open_file
 
 __all__ = ["read_csv_blocks"]
 
-BLOCK, BLOCK_CHARACTERS = 20_000, 1 << 21  # rows
+BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows
 # A gzip file may unpack to so many bytes, and beyond that to so many times its size; those of MPS do to 3 to 10 times.
 UNPACKED_AT_LEAST = 1 << 22
 MOST_SHRUNK = 25

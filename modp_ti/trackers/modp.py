@@ -27,6 +27,15 @@ POSES_ORB = "trajectory_orb.json"
 CLOUDS = {POSES: "point_cloud", POSES_ORB: "orb_point_clouds"}
 
 
+# What np.save writes before the numbers; its length stands in two bytes, or in four.
+NPY_START = 4096
+NPY_HEADER = re.compile(
+    rb"\x93NUMPY[\1-\3]\0(?:..|....)\{\s*'descr':\s*'[<>|=]?[a-zA-Z]\d{1,3}',\s*'fortran_order':\s*(?:True|False),"
+    rb"\s*'shape':\s*\((?:\d{1,12},? ?){0,4}\),?\s*\}\s*\n",
+    re.DOTALL,
+)
+
+
 def open_modp(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTracker:
     """The images that the JSON has poses for, in the source's order, each with the points of its own file.
 
@@ -148,8 +157,10 @@ def _read_cloud(path: Path) -> NDArray[np.float64]:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from None
         return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
     try:
-        with open_file(path) as file:  # np.load takes archives, pickles and pipes too; an .npy file alone is meant here
-            np.lib.format.read_magic(file)
+        with open_file(path) as file:
+            start = file.read(NPY_START)
+        if NPY_HEADER.match(start) is None:  # np.load takes archives and pickles too, and code for a header
+            raise ValueError
         xyz = np.load(path, allow_pickle=False, mmap_mode="r")  # mapped: its header is held against the file's size
     except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TypeError):
         raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None

@@ -474,6 +474,7 @@ MODP: dict[str, dict[str, Spoil]] = {
         "text": _npy("{'descr': '<U4', 'fortran_order': False, 'shape': (2, 3), }"),
         "objects": _npy("{'descr': '|O', 'fortran_order': False, 'shape': (2, 3), }"),
         "code for a header": _npy("__import__('os').system('true')"),
+        "a header without an end": _npy("{'descr': ('<f4'"),
         "a header cut off": _to(lambda data: data[:40]),
         "a pickle in it": _pickled_npy,
         "a pickle alone": _all(b"\x80\x04\x95\x0b\0\0\0\0\0\0\0\x8c\x02os\x94\x8c\x06system\x94\x93\x94."),
