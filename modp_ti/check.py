@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modp_ti.command_line import AsJson, Overrides, Quiet, examples, outcome, progress_console, standalone
+from modp_ti.command_line import AsJson, Overrides, Quiet, examples, one_line, outcome, progress_console, standalone
 from modp_ti.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def check(
         try:
             report = inspect_scene(load_scene(scene, set_ or []), progress_console(quiet))
         except InputError as error:
-            report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", " ".join(str(error).split()))])
+            report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", one_line(error))])
         result.code = verdict(report.findings)[1]
         result.data = reports.as_json(report)
         if not as_json:

@@ -27,6 +27,7 @@ __all__ = [
     "Overrides",
     "Quiet",
     "examples",
+    "one_line",
     "outcome",
     "picture_size",
     "progress_console",
@@ -35,6 +36,9 @@ __all__ = [
 
 # Exit codes; docs/commands.md has them all. 1 is `check`'s own: the input is usable, with warnings.
 BAD_INPUT, FAULT, INTERRUPTED = 2, 3, 130
+
+# Characters of a message, which may name what stands in a damaged file.
+MAX_MESSAGE = 1000
 
 
 class Device(str, Enum):
@@ -85,7 +89,7 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
         with _to_standard_error() if as_json else nullcontext():
             yield result
     except InputError as error:
-        _end(BAD_INPUT, " ".join(str(error).split()), as_json)
+        _end(BAD_INPUT, one_line(error), as_json)
     except KeyboardInterrupt as stop:
         _end(INTERRUPTED, str(stop) or "interrupted", as_json)
     except Exception as error:
@@ -115,6 +119,12 @@ def _to_standard_error() -> Iterator[None]:
         sys.stdout.flush()
         os.dup2(kept, 1)
         os.close(kept)
+
+
+def one_line(error: object) -> str:
+    """An error as one line of a terminal: of limited length, without what a terminal would take for a command."""
+    text = "".join(c if c.isprintable() else "?" for c in " ".join(str(error).split()))
+    return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE // 2]} ... {text[-MAX_MESSAGE // 2 :]}"
 
 
 def _end(code: int, message: str, as_json: bool) -> None:

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ValidationError
 from modp_ti.atomic import replace_text
 from modp_ti.config_keys import as_yaml, documented_keys, markdown_of_keys, sections_of
 from modp_ti.errors import InputError
+from modp_ti.reading import read_text
 from modp_ti.settings import SceneConfig
 
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
@@ -33,11 +34,14 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
+        text = read_text(file)
     except FileNotFoundError:
         raise InputError(f"{file}: no such scene file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read as text: {error}") from None
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+        raise InputError(f"{file}: cannot be read as text: {reason}") from None
+    if len(text) > MAX_TEXT:
+        raise InputError(f"{file}: has {len(text):,} characters, which is no scene file: at most {MAX_TEXT:,}")
 
     lines: dict[str, int] = {}
     data = _parse_yaml(text, str(file), lines)
@@ -79,10 +83,22 @@ def _with_absolute_paths(model: Any, base: Path) -> Any:
     for name in type(model).model_fields:
         value = getattr(model, name)
         if isinstance(value, Path):
-            update[name] = (base / value.expanduser()).resolve()
+            update[name] = _absolute_path(value, base, name)
         elif isinstance(value, BaseModel):
             update[name] = _with_absolute_paths(value, base)
     return model.model_copy(update=update)
+
+
+def _absolute_path(value: Path, base: Path, name: str) -> Path:
+    """Raises InputError for what no file can be called."""
+    longest = max(len(os.fsencode(part)) for part in (*value.parts, ""))
+    if "\0" in str(value) or longest > MAX_NAME or len(os.fsencode(value)) > MAX_PATH:
+        shown = f"{value}".replace("\0", "")[:40]
+        raise InputError(f"{name}: {shown}...: no file can be called that: it is too long, or holds a NUL character")
+    try:
+        return (base / value.expanduser()).resolve()
+    except (RuntimeError, OSError) as error:  # no such user, or links that lead in a circle
+        raise InputError(f"{name}: {value}: is no path: {error}") from None
 
 
 def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
@@ -104,6 +120,11 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         raise InputError(f"{where.get(place, name)}: {text}{more}") from None
 
 
+# Of a scene file: characters, values and marks between them, sections in sections; digits of a whole number.
+MAX_TEXT, MAX_EVENTS, MAX_DEPTH, MAX_DIGITS = 1 << 18, 20_000, 16, 19
+# Bytes that file systems take: of a name, of a path.
+MAX_NAME, MAX_PATH = 255, 4095
+
 _INT = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
@@ -114,6 +135,7 @@ def _parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
     lines: filled with the line (from 1) of every dotted key.
     """
     try:
+        _require_flat(text, name)
         node = yaml.compose(text, Loader=yaml.SafeLoader)
         return None if node is None else _plain(node, "", name, lines)
     except yaml.MarkedYAMLError as error:
@@ -122,8 +144,22 @@ def _parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
         raise InputError(f"{place}: not valid YAML: {error.problem or error.context}") from None
     except yaml.YAMLError as error:
         raise InputError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
-    except RecursionError:
-        raise InputError(f"{name}: not valid here: an alias that holds itself") from None
+
+
+def _require_flat(text: str, name: str) -> None:
+    """Raises InputError for YAML whose tree is deeper or larger than a scene's, before it is built.
+
+    Aliases, of which a few lines can make any number of values, are refused.
+    """
+    depth = count = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        count += 1
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{name}:{line}: an alias (*{event.anchor:.40}) is not taken here: write the value out")
+        if depth > MAX_DEPTH or count > MAX_EVENTS:
+            raise InputError(f"{name}:{line}: deeper or longer than any scene file")
 
 
 def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any:
@@ -150,7 +186,7 @@ def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any
         return None
     if value in ("true", "True", "TRUE", "false", "False", "FALSE"):
         return value[0] in "tT"
-    if _INT.fullmatch(value):
+    if _INT.fullmatch(value) and len(value) <= MAX_DIGITS:
         return int(value)
     number = None
     if _FLOAT.fullmatch(value):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from modp_ti.atomic import replace_text
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, read_json
 
 __all__ = ["read_exposures", "write_exposures"]
 
@@ -44,7 +45,10 @@ def read_exposures(path: Path) -> dict[int, NDArray[np.float64]]:
     if not path.is_file():
         return {}
     try:
-        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
-        return {int(frame["index"]): np.array(frame["matrix"], dtype=np.float64).reshape(3, 4) for frame in frames}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read as the exposures of a run: {error!r}") from None
+        frames = read_json(path, "of a finished run")["frames"]
+        found = {int(frame["index"]): np.array(frame["matrix"], dtype=np.float64).reshape(3, 4) for frame in frames}
+        if not all((np.abs(matrix) <= LARGEST).all() for matrix in found.values()):
+            raise ValueError("NaN or infinite numbers")
+        return found
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise InputError(f"{path}: cannot be read as the exposures of a run: {error!r:.80}") from None

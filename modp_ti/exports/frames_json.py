@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.atomic import replace_text
 from modp_ti.errors import InputError
+from modp_ti.reading import read_json
 
 __all__ = ["FramesRecord", "read_frames", "write_frames"]
 
@@ -39,15 +41,15 @@ def write_frames(
 def read_frames(path: Path, count: int) -> FramesRecord:
     """The record of a run of `count` frames. Raises InputError for a file that is none."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path, "of a finished run")
         record = FramesRecord(
             float(data["near"]), float(data["scene_depth"]), list(data["keyframes"]), list(data["held_out"])
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read as what a run says of its frames: {error!r}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as what a run says of its frames: {error!r:.80}") from None
     indices = [*record.keyframes, *record.held_out]
-    if not record.near > 0 or not record.scene_depth > 0 or not record.keyframes:
+    if not (0 < record.near < math.inf and 0 < record.scene_depth < math.inf and record.keyframes):
         raise InputError(f"{path}: near and scene_depth must be positive, and keyframes must name some")
-    if not all(isinstance(index, int) and 0 <= index < count for index in indices):
+    if not all(type(index) is int and 0 <= index < count for index in indices):
         raise InputError(f"{path}: names frames beyond the {count} that trajectory.txt has")
     return record

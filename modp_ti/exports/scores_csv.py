@@ -11,6 +11,7 @@ from pathlib import Path
 from modp_ti.atomic import replacing
 from modp_ti.errors import InputError
 from modp_ti.evaluation import FrameScore
+from modp_ti.reading import text_lines
 
 __all__ = ["read_scores", "write_scores"]
 
@@ -33,10 +34,10 @@ def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
     """The scores of a file that `write_scores` wrote. Raises InputError, with the line, for anything else."""
     file = Path(path)
     try:
-        with file.open(newline="", encoding="utf-8") as text:
-            rows = list(csv.reader(text))
+        rows = list(csv.reader(text_lines(file, "utf-8")))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: cannot be read as scores: {error}") from None
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{file}: cannot be read as scores: {reason}") from None
     if not rows or rows[0] != COLUMNS:
         raise InputError(f"{file}:1: the columns must be {','.join(COLUMNS)}")
     scores = []

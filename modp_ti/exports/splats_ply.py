@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from modp_ti.atomic import replacing
 from modp_ti.errors import InputError
+from modp_ti.reading import read_bytes
+from modp_ti.reading.ply import parse_ply_header
 
 __all__ = ["read_splats", "write_splats"]
 
@@ -58,29 +60,28 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     """
     file = Path(path)
     try:
-        data = file.read_bytes()
+        data = read_bytes(file)
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror}") from None
-    head, end, body = data.partition(b"end_header\n")
-    lines = head.decode("ascii", errors="replace").split("\n")
-    if lines[0].strip() != "ply" or not end or "format binary_little_endian 1.0" not in lines:
+    header = parse_ply_header(data, file)
+    names, count = header.names, header.count
+    if header.form != "binary_little_endian":
         raise InputError(f"{file}: not a binary little-endian PLY file, which 3DGS splats are")
-    properties = [line.split() for line in lines if line.startswith("property")]
-    if any(p[1] not in ("float", "float32") for p in properties):
+    if any(kind != "f4" for _, kind in header.properties):
         raise InputError(f"{file}: all properties of 3DGS splats are float")
-    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex")), 0)
-    names = [p[-1] for p in properties]
-    if len(body) < 4 * count * len(names):
-        raise InputError(f"{file}: cut short, {count} Gaussians are announced and fewer are there")
-    table = np.frombuffer(body, dtype="<f4", count=count * len(names)).reshape(count, len(names))
+    table = np.frombuffer(data, dtype="<f4", count=count * len(names), offset=header.start).reshape(count, len(names))
     column = {name: i for i, name in enumerate(names)}
     rest = sum(name.startswith("f_rest_") for name in names)
     missing = [name for name in _names(1 + rest // 3) if name not in column and not name.startswith("n")]
-    if missing or 1 + rest // 3 not in (1, 4, 9, 16):
+    if missing or rest not in (0, 9, 24, 45):
         raise InputError(f"{file}: not 3DGS splats; {missing[0] if missing else f'{rest} f_rest'} does not fit")
 
     def columns(*wanted: str) -> NDArray[np.float32]:
-        return np.ascontiguousarray(table[:, [column[name] for name in wanted]])
+        values = np.ascontiguousarray(table[:, [column[name] for name in wanted]])
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(bad):
+            raise InputError(f"{file}: Gaussian {bad[0]} holds NaN or infinite numbers; the file is damaged")
+        return values
 
     sh = np.empty((count, 1 + rest // 3, 3), dtype=np.float32)
     sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")

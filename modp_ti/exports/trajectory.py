@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+from array import array
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from modp_ti.atomic import replace_text
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, text_lines
 
 __all__ = ["read_trajectory", "write_trajectory"]
 
@@ -40,25 +43,25 @@ def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], 
     Raises InputError, with the line, for anything else.
     """
     file = Path(path)
+    rows = array("d")
     try:
-        text = file.read_text(encoding="utf-8")
+        for number, line in enumerate(text_lines(file), start=1):
+            words = line.split("#", 1)[0].replace(",", " ").split()
+            if not words:
+                continue
+            try:
+                row = [float(word) for word in words]
+            except ValueError:
+                row = []
+            if len(row) != 8 or not max(map(abs, row)) <= LARGEST or any(map(math.isnan, row)):
+                raise InputError(f"{file}:{number}: a line holds 8 numbers: time tx ty tz qx qy qz qw")
+            if not 0.5 < np.linalg.norm(row[4:]) < 2.0:
+                raise InputError(f"{file}:{number}: the quaternion is not of unit length")
+            rows.extend(row)
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read as a trajectory: {error}") from None
-    rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#", 1)[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != 8 or not np.isfinite(row).all():
-            raise InputError(f"{file}:{number}: a line holds 8 numbers: time tx ty tz qx qy qz qw")
-        if np.linalg.norm(row[4:]) < 0.5:
-            raise InputError(f"{file}:{number}: the quaternion is not of unit length")
-        rows.append(row)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+        raise InputError(f"{file}: cannot be read as a trajectory: {reason}") from None
+    table = np.frombuffer(rows).reshape(-1, 8)
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     for pose, row in zip(poses, table, strict=True):
         rotation = _rotation(row[4:])

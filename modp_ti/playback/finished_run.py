@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from modp_ti.errors import InputError
 from modp_ti.exports.frames_json import FramesRecord, read_frames
 from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory
+from modp_ti.sources import NO_DISTORTION
+from modp_ti.sources.intrinsics import require_plausible
+from modp_ti.trackers.colmap_files import read_colmap_model
 
 __all__ = ["FinishedRun", "open_run"]
 
@@ -77,15 +80,19 @@ def open_run(folder: Path) -> FinishedRun:
 
 def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
     """Names and cameras of the images in their order."""
-    import pycolmap
-
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-        images = [model.images[number] for number in sorted(model.images)]
-        of_id = {
-            number: PinholeCamera(*map(float, camera.params), camera.width, camera.height)
-            for number, camera in model.cameras.items()
-        }
-    except (ValueError, TypeError, RuntimeError, IndexError) as error:
-        raise InputError(f"{folder}: cannot be read as the COLMAP model of a run: {error}") from None
+    model = read_colmap_model(folder)
+    images = [model.images[number] for number in sorted(model.images)]
+    of_id = {}
+    for number, camera in model.cameras.items():
+        what = f"{folder}: camera {number}"
+        try:
+            pinhole = PinholeCamera(*map(float, camera.params), camera.width, camera.height)
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{what} is none of a run: {error}") from None
+        of_id[number], _ = require_plausible(pinhole, NO_DISTORTION, what)
+    for image in images:
+        # They name files to be read, and written in an export: none may lie elsewhere.
+        parts = PurePosixPath(image.name).parts
+        if not parts or parts[0] == "/" or ".." in parts or "\0" in image.name:
+            raise InputError(f"{folder}: image {image.name!r} is no name below the folder of images")
     return [image.name for image in images], [of_id[image.camera_id] for image in images]

@@ -11,6 +11,11 @@ MAX_DIFFERENCE = 0.02
 """Seconds by which the TUM benchmark lets the times of a pair differ."""
 
 
+# Pairs within reach up to which all are compared, and how many to each side of a time are beyond.
+MANY_PAIRS = 4_000_000
+NEAREST = 64
+
+
 def associate(times_a: ArrayLike, times_b: ArrayLike, max_difference: float = MAX_DIFFERENCE) -> NDArray[np.int64]:
     """Pairs (M, 2) of places in `times_a` (N,) and `times_b` (K,), increasing in the first.
 
@@ -24,6 +29,9 @@ def associate(times_a: ArrayLike, times_b: ArrayLike, max_difference: float = MA
     order = np.argsort(b, kind="stable")
     first = np.searchsorted(b[order], a - max_difference, side="left")
     behind = np.searchsorted(b[order], a + max_difference, side="right")
+    if (behind - first).sum() > MANY_PAIRS:  # such times would take all memory: the nearest ones of each will do
+        at = np.searchsorted(b[order], a)
+        first, behind = np.maximum(first, at - NEAREST), np.minimum(behind, at + NEAREST)
     count = np.maximum(behind - first, 0)
     # All pairs within reach: entry i of a with order[first[i]], order[first[i] + 1], ...
     of_a = np.repeat(np.arange(len(a)), count)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+from modp_ti.reading import open_file
+
 __all__ = ["focal_length_35mm"]
 
 EXIF_IFD = 0x8769
@@ -19,7 +21,7 @@ def focal_length_35mm(path: Path) -> float | None:
     JPEG files only.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             data = file.read(LONGEST_HEADER)
     except OSError:
         return None

@@ -19,6 +19,8 @@ JPEG_END = b"\xff\xd9"
 
 JPEG_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_START_OF_SCAN = 0xDA
+# Bytes between two segments, of which writers leave a few at most.
+MOST_PADDING = 1 << 16
 JPEG_WITHOUT_LENGTH = frozenset([0x01, *range(0xD0, 0xD9)])
 
 
@@ -57,10 +59,15 @@ def _jpeg(file: BinaryIO) -> ImageHeader:
     width = height = 0
     while True:
         byte = file.read(1)
-        while byte and byte != b"\xff":  # padding between segments
+        padding = 0  # between segments
+        while byte and byte != b"\xff" and padding < MOST_PADDING:
             byte = file.read(1)
-        while byte == b"\xff":
+            padding += 1
+        while byte == b"\xff" and padding < MOST_PADDING:
             byte = file.read(1)
+            padding += 1
+        if padding >= MOST_PADDING:
+            return ImageHeader(width, height, complete=False)
         if not byte:
             return ImageHeader(width, height, complete=False)
         marker = byte[0]

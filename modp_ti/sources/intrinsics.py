@@ -14,7 +14,13 @@ if TYPE_CHECKING:
     from modp_ti.settings import IntrinsicsSettings
     from modp_ti.sources.protocol import ImageSource
 
-__all__ = ["Intrinsics", "given_intrinsics", "require_intrinsics"]
+__all__ = ["MAX_SIDE", "Intrinsics", "given_intrinsics", "require_intrinsics", "require_plausible"]
+
+MAX_SIDE = 1 << 16
+"""Pixels on a side of an image; no camera has more."""
+# Numbers of a camera beyond these were damaged on their way: focal lengths and centres [px], coefficients of a lens.
+MAX_PIXELS_OF_FOCUS = 1e7
+MAX_COEFFICIENT = 1e6
 
 # A principal point this far from the middle, as a share of the image's side, is more likely of another image size.
 # Intrinsics of twice or half the size put it at 1 or at 0.25.
@@ -58,6 +64,19 @@ def given_intrinsics(given: IntrinsicsSettings, width: int, height: int) -> Intr
     if given.fisheye:
         return Intrinsics(camera, Distortion((given.k1, given.k2, given.k3, given.k4), fisheye=True))
     return Intrinsics(camera, Distortion((given.k1, given.k2, given.k3), tangential=(given.p1, given.p2)))
+
+
+def require_plausible(camera: PinholeCamera, lens: Distortion, what: str) -> tuple[PinholeCamera, Distortion]:
+    """The camera and its lens as a file states them. Raises InputError that starts with `what` where they cannot be."""
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise InputError(f"{what}: images of {camera.width:.6g}x{camera.height:.6g} pixels: at most {MAX_SIDE} a side")
+    if not (camera.fx > 1 / MAX_PIXELS_OF_FOCUS and camera.fy > 1 / MAX_PIXELS_OF_FOCUS):
+        raise InputError(f"{what}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are none")
+    if not all(abs(value) <= MAX_PIXELS_OF_FOCUS for value in (camera.fx, camera.fy, camera.cx, camera.cy)):
+        raise InputError(f"{what}: fx, fy, cx or cy is no number of pixels that a camera has")
+    if not all(abs(value) <= MAX_COEFFICIENT for value in (*lens.numerator, *lens.denominator, *lens.tangential)):
+        raise InputError(f"{what}: the lens's coefficients are none that a lens has")
+    return camera, lens
 
 
 def require_intrinsics(images: ImageSource) -> Intrinsics:

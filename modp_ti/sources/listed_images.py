@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import UnreadableImageError
+from modp_ti.reading import open_file, read_bytes
+from modp_ti.sources.image_bounds import why_undecodable
 from modp_ti.sources.image_header import read_image_header
 from modp_ti.sources.intrinsics import Intrinsics
 from modp_ti.sources.known_frames import IMAGE_SUFFIXES, KnownFrames
@@ -65,7 +67,7 @@ class ListedImages(KnownFrames):
     def size(self, name: str) -> tuple[int, int]:
         """(width, height) as stored. Raises UnreadableImageError for one that is unreadable or cut off."""
         try:
-            with (self.path / name).open("rb") as file:
+            with open_file(self.path / name) as file:
                 header = read_image_header(file)
         except OSError as error:
             raise self._unreadable(name, error.strerror or "it cannot be opened") from None
@@ -82,7 +84,7 @@ class ListedImages(KnownFrames):
         Raises UnreadableImageError for one that is unreadable or cut off.
         """
         try:
-            data = (self.path / name).read_bytes()
+            data = read_bytes(self.path / name)
         except OSError as error:
             raise self._unreadable(name, error.strerror or "it cannot be opened") from None
         header = read_image_header(io.BytesIO(data))
@@ -90,9 +92,10 @@ class ListedImages(KnownFrames):
             raise self._unreadable(name, "the file is empty")
         if header is not None and not header.complete:
             raise self._unreadable(name, "the file is cut off")
-        image = decoded(data)
+        reason = why_undecodable(data)
+        image = decoded(data) if reason is None else None
         if image is None:
-            raise self._unreadable(name, "it is damaged or no image")
+            raise self._unreadable(name, reason or "it is damaged or no image")
         return image
 
     def close(self) -> None:

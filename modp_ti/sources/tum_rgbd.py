@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, is_file, text_lines
 from modp_ti.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.sources.intrinsics import Intrinsics
 from modp_ti.sources.listed_images import ListedImages
@@ -33,7 +35,7 @@ def open_tum_rgbd(path: Path) -> ListedImages:
     """
     listing = path / "rgb.txt"
     entries = read_listing(listing)
-    there = [(time, name) for time, name in entries if (path / name).is_file()]
+    there = [(time, name) for time, name in entries if is_file(path / name)]
     if not there:
         raise InputError(
             f"{listing}: none of its {len(entries)} images is there, the first is {entries[0][1]}: "
@@ -62,14 +64,9 @@ def read_listing(file: Path) -> list[tuple[float, str]]:
 
     Raises InputError for a listing that is missing, empty or malformed, times out of order, a path listed twice.
     """
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise InputError(f"{file}: the listing of the images cannot be read: {reason}") from None
     entries: list[tuple[float, str]] = []
     first_line: dict[str, int] = {}
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(_lines(file), 1):
         words = line.partition("#")[0].split(maxsplit=1)
         if not words:
             continue
@@ -81,7 +78,7 @@ def read_listing(file: Path) -> list[tuple[float, str]]:
             time = float(words[0])
         except ValueError:
             time = math.nan
-        if not math.isfinite(time):
+        if not abs(time) <= LARGEST:
             raise InputError(f"{where}: the time stamp {words[0]!r} is no finite number of seconds")
         if entries and time <= entries[-1][0]:
             raise InputError(f"{where}: time stamp {words[0]} is not later than the one before; sort the listing")
@@ -94,10 +91,18 @@ def read_listing(file: Path) -> list[tuple[float, str]]:
     return entries
 
 
+def _lines(file: Path) -> Iterator[str]:
+    try:
+        yield from text_lines(file, "utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InputError(f"{file}: the listing of the images cannot be read: {reason}") from None
+
+
 def _camera_number(path: Path, listing: Path) -> int | None:
     """1, 2 or 3, from the folder's name, else from the recording that the listing's comments name."""
     found = CAMERA_NAME.search(path.resolve().name)
     if found is None:
-        comments = [line for line in listing.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+        comments = [line for line in _lines(listing) if line.startswith("#")]
         found = next(filter(None, map(CAMERA_NAME.search, comments)), None)
     return None if found is None else int(found.group(1))

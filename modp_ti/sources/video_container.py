@@ -9,10 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import BinaryIO
 
+from modp_ti.reading import open_file
+
 __all__ = ["missing_bytes"]
 
 EBML = b"\x1aE\xdf\xa3"
 MATROSKA_SEGMENT = b"\x18S\x80g"
+# Boxes that are followed; a recording has a handful at its top, a fragmented one two for each second.
+MAX_BOXES = 1_000_000
 # What an MP4 or QuickTime file may begin with.
 MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 
@@ -20,7 +24,7 @@ MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 def missing_bytes(file: Path) -> int | None:
     """How many bytes the file lacks to what its container states, 0 for a whole one; None where that is not known."""
     size = file.stat().st_size
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         start = stream.read(12)
         if start[4:8] in MP4_BOXES:
             end = _end_of_boxes(stream, size)
@@ -36,7 +40,9 @@ def missing_bytes(file: Path) -> int | None:
 def _end_of_boxes(stream: BinaryIO, size: int) -> int:
     """Where the last box ends: 4 bytes of length, 4 of type, 8 of length where the first is 1; 0 is up to the end."""
     here = 0
-    while here < size:
+    for _ in range(MAX_BOXES):
+        if here >= size:
+            break
         stream.seek(here)
         head = stream.read(16)
         length = int.from_bytes(head[:4], "big")
@@ -76,6 +82,8 @@ def _end_of_matroska(stream: BinaryIO, size: int) -> int | None:
     header, _ = _variable_length(stream)
     if header is None:
         return None
+    if header > size:
+        return stream.tell() + header
     stream.seek(header, 1)
     if stream.read(4) != MATROSKA_SEGMENT:
         return size + 1 if stream.tell() >= size else None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
+from modp_ti.sources.image_bounds import MAX_IMAGE_PIXELS
 from modp_ti.sources.intrinsics import Intrinsics
 from modp_ti.sources.known_frames import KnownFrames
 from modp_ti.sources.video_container import missing_bytes
@@ -56,7 +57,7 @@ class VideoFile(KnownFrames):
         if not self.path.exists():
             raise InputError(f"{self.path}: no such video file (source.path)")
         if not self.path.is_file():
-            raise InputError(f"{self.path}: a video must be a file, this is a folder (source.kind)")
+            raise InputError(f"{self.path}: a video must be a file, this is a folder or a pipe (source.kind)")
         try:
             missing = missing_bytes(self.path)
         except OSError as error:
@@ -201,9 +202,14 @@ class _Decoder:
         with quiet_decoder():
             threads = [] if in_threads else [cv2.CAP_PROP_N_THREADS, 1]
             self._capture: cv2.VideoCapture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, threads)
-            if not self._capture.isOpened():
+            # Where OpenCV was built without FFmpeg; its other readers write to the terminal.
+            if not self._capture.isOpened() and cv2.CAP_FFMPEG not in cv2.videoio_registry.getBackends():
                 self._capture = cv2.VideoCapture(str(path))
         if not self._capture.isOpened():
+            raise OSError(str(path))
+        sides = [self._capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if sides[0] * sides[1] > MAX_IMAGE_PIXELS:
+            self._capture.release()
             raise OSError(str(path))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         self.turned = int(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360

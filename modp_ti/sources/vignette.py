@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
+from modp_ti.reading import read_bytes
+from modp_ti.sources.image_bounds import why_undecodable
 
 __all__ = ["LEAST_LIGHT", "read_vignette"]
 
@@ -23,18 +25,21 @@ def read_vignette(path: Path) -> NDArray[np.float32]:
     import cv2
 
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        data = read_bytes(path)
     except OSError as error:
         raise InputError(f"{path}: the vignette cannot be opened: {error.strerror} (source.vignette)") from None
+    reason = why_undecodable(data)
+    if data and reason is not None:
+        raise InputError(f"{path}: the vignette is unreadable: {reason} (source.vignette)")
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:  # silent: the one line that the user gets is ours
-        image = cv2.imdecode(data, flags) if len(data) else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error:
         image = None
     finally:
         cv2.utils.logging.setLogLevel(log_level)
-    if image is None or image.max() <= 0:
+    if image is None or not 0 < image.max() < np.inf:
         raise InputError(f"{path}: the vignette is {'no image' if image is None else 'black'} (source.vignette)")
     image = image.astype(np.float32) / float(image.max())
     if image.ndim == 2:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, parse_json, text_lines
 from modp_ti.trackers.csv_columns import read_csv_blocks
 from modp_ti.trackers.trajectory import poses_of_quaternions, require_rising
 
@@ -91,15 +91,14 @@ def read_calibration(path: Path, label: str) -> CameraMounts:
     """`T_device_camera` of the camera of this label from online_calibration.jsonl."""
     times, translations, quaternions, lines = [], [], [], []
     try:
-        with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, start=1):
-                if not line.strip():
-                    continue
-                time, translation, quaternion = _mount(line, label, f"{path}:{number}")
-                times.append(time)
-                translations.append(translation)
-                quaternions.append(quaternion)
-                lines.append(number)
+        for number, line in enumerate(text_lines(path), start=1):
+            if not line.strip():
+                continue
+            time, translation, quaternion = _mount(line, label, path, number)
+            times.append(time)
+            translations.append(translation)
+            quaternions.append(quaternion)
+            lines.append(number)
     except UnicodeDecodeError:
         raise InputError(f"{path}: holds bytes that are no text") from None
     except OSError as error:
@@ -116,27 +115,24 @@ def read_calibration(path: Path, label: str) -> CameraMounts:
     )
 
 
-def _mount(line: str, label: str, what: str) -> tuple[float, list[float], list[float]]:
+def _mount(line: str, label: str, path: Path, number: int) -> tuple[float, list[float], list[float]]:
     """Time, translation and quaternion (x, y, z, w) of the camera in one line."""
-    try:
-        data = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{what}: not valid JSON: {error.msg}; the file is cut off or damaged") from None
+    data, what = parse_json(line, str(path), number), f"{path}:{number}"
     cameras = data.get("CameraCalibrations") if isinstance(data, Mapping) else None
     if not isinstance(cameras, list):
         raise InputError(f"{what}: holds no `CameraCalibrations`")
     labels = [camera.get("Label") if isinstance(camera, Mapping) else None for camera in cameras]
     if label not in labels:
-        known = ", ".join(str(each) for each in labels)
+        known = ", ".join(str(each)[:40] for each in labels[:20])
         raise InputError(f"{what}: holds no camera {label}, only {known} (tracker.camera)")
     try:
         mount = cameras[labels.index(label)]["T_Device_Camera"]
         real, imaginary = mount["UnitQuaternion"]
         time = float(data["tracking_timestamp_us"]) * MICROSECONDS
         translation, quaternion = _numbers(mount["Translation"], 3), [*_numbers(imaginary, 3), float(real)]
-        if not np.isfinite([time, *translation, *quaternion]).all():
+        if not (np.abs([time, *translation, *quaternion]) <= LARGEST).all():
             raise ValueError
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
         raise InputError(
             f"{what}: `tracking_timestamp_us` and T_Device_Camera of {label} must be numbers: Translation [x, y, z], "
             "UnitQuaternion [w, [x, y, z]]"
@@ -172,7 +168,7 @@ def read_points(
             & (rows["inv_dist_std"] <= max_inv_dist_std)
             & (rows["dist_std"] <= max_dist_std)
         ]
-        uid.append(kept["uid"])
+        uid.append(kept["uid"].copy())  # a column alone holds the whole table
         xyz.append(np.stack([kept[name] for name in ("px_world", "py_world", "pz_world")], axis=1))
     numbers, first = np.unique(np.concatenate(uid), return_index=True)
     if len(numbers) == 0:

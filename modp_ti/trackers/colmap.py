@@ -15,7 +15,8 @@ from modp_ti.errors import InputError
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.sources.distortion import colmap_intrinsics
-from modp_ti.trackers.colmap_files import require_whole_binary_model
+from modp_ti.sources.intrinsics import require_plausible
+from modp_ti.trackers.colmap_files import read_colmap_model
 from modp_ti.trackers.replay import (
     PosedImage,
     ReplayedTracker,
@@ -40,7 +41,7 @@ def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTra
     images = open_source(source)
     selected = set(images.selected(source.start, source.stop, source.step))
     folder = _model_folder(source.path, tracker.path)
-    model = _read_model(folder)
+    model = read_colmap_model(folder)
 
     posed: dict[str, pycolmap.Image] = {}
     absent: list[str] = []
@@ -102,25 +103,6 @@ def _model_folder(images: Path, given: Path | None) -> Path:
     raise InputError(f"{given}: holds no COLMAP model (cameras, images and points3D as .bin or .txt)")
 
 
-def _read_model(folder: Path) -> pycolmap.Reconstruction:
-    import pycolmap
-
-    stems = ("cameras", "images", "points3D")
-    if not any(all((folder / f"{stem}{suffix}").exists() for stem in stems) for suffix in (".bin", ".txt")):
-        missing = [stem for stem in stems if not any((folder / f"{stem}{s}").exists() for s in (".bin", ".txt"))]
-        raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
-    if all((folder / f"{stem}.bin").exists() for stem in stems):
-        require_whole_binary_model(folder)
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-    except Exception as error:  # pycolmap throws what its C++ does: ValueError, IndexError, MemoryError, RuntimeError
-        reason = " ".join(str(error).split())
-        raise InputError(f"{folder}: not a readable COLMAP model ({reason}); export it again") from None
-    if not model.images:
-        raise InputError(f"{folder}: the COLMAP model holds no image")
-    return model
-
-
 def _no_match(images: ImageSource, folder: Path, absent: Sequence[str]) -> str:
     if not absent:
         return f"{folder}: no image of the COLMAP model has a pose"
@@ -138,7 +120,8 @@ def _undistorter(camera: pycolmap.Camera, scale: float, folder: Path) -> Undisto
     fx, fy, cx, cy, distortion = intrinsics
     if not (np.isfinite(camera.params).all() and fx > 0 and fy > 0 and camera.width > 0 and camera.height > 0):
         raise InputError(f"{folder}: camera {camera.camera_id} has impossible intrinsics: {camera.params_to_string()}")
-    return Undistorter(PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height)), distortion, scale)
+    pinhole = PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height))
+    return Undistorter(*require_plausible(pinhole, distortion, f"{folder}: camera {camera.camera_id}"), scale)
 
 
 def _observed_points(

@@ -7,16 +7,77 @@ the end exactly rules that out.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from modp_ti.errors import InputError
+from modp_ti.reading import read_bytes, text_lines
 
-__all__ = ["require_whole_binary_model"]
+if TYPE_CHECKING:
+    import pycolmap
+
+__all__ = ["read_colmap_model"]
 
 # Parameters of each camera model, by COLMAP's model number.
 CAMERA_PARAMS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
+
+
+STEMS = ("cameras", "images", "points3D")
+# Characters of a line of a text model: an image's observations stand in one.
+MAX_TEXT_LINE = 1 << 24
+
+
+def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
+    """The model in a folder, binary or text. Raises InputError for one that is incomplete, damaged or empty."""
+    import pycolmap
+
+    if not any(all((folder / f"{stem}{suffix}").exists() for stem in STEMS) for suffix in (".bin", ".txt")):
+        missing = [stem for stem in STEMS if not any((folder / f"{stem}{s}").exists() for s in (".bin", ".txt"))]
+        raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
+    if all((folder / f"{stem}.bin").exists() for stem in STEMS):
+        _require_whole_binary_model(folder)
+    else:
+        _require_text_model(folder)
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+        for image in model.images.values():
+            image.name.encode()  # a name need not be UTF-8 in the file
+    except Exception as error:  # pycolmap throws what its C++ does: ValueError, IndexError, MemoryError, RuntimeError
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{folder}: not a readable COLMAP model ({reason}); export it again") from None
+    if not model.images:
+        raise InputError(f"{folder}: the COLMAP model holds no image")
+    return model
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise _DamagedError(f"{word[:40]!r} stands where a number should") from None
+
+
+def _require_text_model(folder: Path) -> None:
+    """Raises InputError where a .txt file of the model is no text file."""
+    for stem in RECORDS:
+        file = folder / f"{stem}.txt"
+        if not file.exists():
+            continue
+        try:
+            lines = text_lines(file, longest=MAX_TEXT_LINE)
+            for line in lines:
+                words = line.split(maxsplit=5)
+                if stem == "images" and words and not words[0].startswith("#"):
+                    _require_quaternion([_number(word) for word in words[1:5]])
+                    next(lines, None)  # its observations
+        except _DamagedError as error:
+            raise InputError(f"{file}: {error}; the file is damaged") from None
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+            raise InputError(f"{file}: cannot be read as text: {reason}; export the COLMAP model again") from None
 
 
 class _CutOffError(Exception):
@@ -42,11 +103,22 @@ class _Cursor:
         self.skip(size)
         return int(struct.unpack_from(form, self.data, self.at - size)[0])
 
+    def read_float(self) -> float:
+        self.skip(8)
+        return float(struct.unpack_from("<d", self.data, self.at - 8)[0])
+
     def skip_text(self) -> None:
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise _CutOffError
         self.at = end + 1
+
+
+def _require_quaternion(q: list[float]) -> None:
+    """Raises _DamagedError for one that is no rotation: COLMAP makes one of unit length of any, and says nothing."""
+    length = math.hypot(*q)
+    if not 0.9 < length < 1.1:
+        raise _DamagedError(f"the quaternion of an image has length {length:.4g} instead of 1")
 
 
 def _camera(cursor: _Cursor) -> None:
@@ -59,7 +131,9 @@ def _camera(cursor: _Cursor) -> None:
 
 
 def _image(cursor: _Cursor) -> None:
-    cursor.skip(4 + 7 * 8 + 4)  # id, pose, camera
+    cursor.skip(4)  # id
+    _require_quaternion([cursor.read_float() for _ in range(4)])
+    cursor.skip(3 * 8 + 4)  # position, camera
     cursor.skip_text()
     cursor.skip(24 * cursor.read("<Q"))  # x, y, point
 
@@ -94,14 +168,14 @@ RECORDS: dict[str, Callable[[_Cursor], None]] = {
 }
 
 
-def require_whole_binary_model(folder: Path) -> None:
+def _require_whole_binary_model(folder: Path) -> None:
     """Raises InputError where a .bin file of the model is cut off, damaged or followed by other data."""
     for stem, skip_record in RECORDS.items():
         file = folder / f"{stem}.bin"
         if not file.exists():
             continue
         try:
-            cursor = _Cursor(file.read_bytes())
+            cursor = _Cursor(read_bytes(file))
         except OSError as error:
             raise InputError(f"{file}: cannot be read: {error.strerror}") from None
         try:

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import gzip
+import io
+import os
 import zlib
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import TextIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, limited_lines, open_file
 
 __all__ = ["read_csv_blocks"]
 
-BLOCK = 200_000  # rows
+BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows
+# A gzip file may unpack to so many bytes, and beyond that to so many times its size; those of MPS do to 3 to 10 times.
+UNPACKED_AT_LEAST = 1 << 22
+MOST_SHRUNK = 25
 
 
 def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
@@ -27,8 +33,10 @@ def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[in
     file for one that is cut off.
     """
     try:
-        with gzip.open(path, "rt", encoding="utf-8") if path.suffix == ".gz" else path.open(encoding="utf-8") as file:
-            yield from _blocks(path, file, columns)
+        with open_file(path) as stored:
+            unpacked = _Unpacked(path, stored) if path.suffix == ".gz" else stored
+            with io.TextIOWrapper(unpacked, encoding="utf-8") as file:
+                yield from _blocks(path, limited_lines(file), columns)
     except (EOFError, zlib.error, gzip.BadGzipFile):
         raise InputError(f"{path}: the gzip file is cut off or damaged; copy it again") from None
     except UnicodeDecodeError:
@@ -37,15 +45,34 @@ def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[in
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _blocks(path: Path, file: TextIO, columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
-    header = [name.strip() for name in file.readline().lstrip("\ufeff").strip().split(",")]
+class _Unpacked(gzip.GzipFile):
+    """The content of a gzip file, up to what tables of numbers shrink by: a small file may unpack to any size."""
+
+    def __init__(self, path: Path, stored: BinaryIO) -> None:
+        super().__init__(fileobj=stored, mode="rb")
+        self._path = path
+        self._left = UNPACKED_AT_LEAST + MOST_SHRUNK * os.fstat(stored.fileno()).st_size
+
+    def read1(self, size: int = -1) -> bytes:
+        data = super().read1(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise InputError(
+                f"{self._path}: unpacks to more than {MOST_SHRUNK} times its size, which is no table of numbers; "
+                "copy it again"
+            )
+        return data
+
+
+def _blocks(path: Path, file: Iterator[str], columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
+    header = [name.strip() for name in next(file, "").lstrip("\ufeff").strip().split(",")]
     missing = [name for name in columns if name not in header]
     if missing:
         raise InputError(f"{path}:1: the header has no column {', '.join(missing)}")
     places = [header.index(name) for name in columns]
     kinds = np.dtype(list(columns.items()))
     line = 2
-    while rows := list(islice(file, BLOCK)):
+    while rows := _taken(file):
         # The last row of a file that was cut off is shorter, or has no end.
         for number, row in enumerate(rows, start=line):
             if row.count(",") != len(header) - 1:
@@ -55,15 +82,28 @@ def _blocks(path: Path, file: TextIO, columns: Mapping[str, str]) -> Iterator[tu
                 )
         try:
             table = np.loadtxt(rows, dtype=kinds, delimiter=",", usecols=places, comments=None, ndmin=1)
-        except ValueError:
+        except (ValueError, OverflowError):
             number, name, value = _first_bad_value(rows, columns, places)
             raise InputError(f"{path}:{line + number}: {name} is {value!r:.40}, not a number") from None
         for name in columns:
-            if table.dtype[name].kind == "f" and not np.isfinite(table[name]).all():
-                number = int(np.flatnonzero(~np.isfinite(table[name]))[0])
-                raise InputError(f"{path}:{line + number}: {name} is NaN or infinite; take the line out")
+            if table.dtype[name].kind == "f" and not (np.abs(table[name]) <= LARGEST).all():
+                number = int(np.flatnonzero(~(np.abs(table[name]) <= LARGEST))[0])
+                raise InputError(
+                    f"{path}:{line + number}: {name} is NaN or infinite, or beyond {LARGEST:g}; take the line out"
+                )
         yield line, table
         line += len(rows)
+
+
+def _taken(file: Iterator[str]) -> list[str]:
+    """The next rows: BLOCK of them, or fewer of long ones."""
+    rows, room = [], BLOCK_CHARACTERS
+    for row in islice(file, BLOCK):
+        rows.append(row)
+        room -= len(row)
+        if room < 0:
+            break
+    return rows
 
 
 def _first_bad_value(rows: list[str], columns: Mapping[str, str], places: list[int]) -> tuple[int, str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,12 @@ from numpy.typing import NDArray
 
 from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, open_file, read_json
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import Undistorter, open_source
 from modp_ti.sources.intrinsics import require_intrinsics
 from modp_ti.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
-from modp_ti.trackers.number_rows import read_number_rows, read_text
+from modp_ti.trackers.number_rows import read_number_rows
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
 
 __all__ = ["open_modp"]
@@ -25,6 +25,15 @@ POSES = "trajectory.json"
 # With ORB-SLAM3 as its tracker the release writes other names.
 POSES_ORB = "trajectory_orb.json"
 CLOUDS = {POSES: "point_cloud", POSES_ORB: "orb_point_clouds"}
+
+
+# What np.save writes before the numbers; its length stands in two bytes, or in four.
+NPY_START = 4096
+NPY_HEADER = re.compile(
+    rb"\x93NUMPY[\1-\3]\0(?:..|....)\{\s*'descr':\s*'[<>|=]?[a-zA-Z]\d{1,3}',\s*'fortran_order':\s*(?:True|False),"
+    rb"\s*'shape':\s*\((?:\d{1,12},? ?){0,4}\),?\s*\}\s*\n",
+    re.DOTALL,
+)
 
 
 def open_modp(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTracker:
@@ -101,12 +110,7 @@ def _projected(
 
 def _cameras(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
     """Image and `T_camera_world` of each entry."""
-    try:
-        data = json.loads(read_text(file, "tracker.path"))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{file}:{error.lineno}: not valid JSON: {error.msg}") from None
-    except RecursionError:
-        raise InputError(f"{file}: not a trajectory of the release: its JSON is nested too deeply") from None
+    data = read_json(file, "tracker.path")
     entries = data.get("cameras") if isinstance(data, dict) else None
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{file}: holds no list of `cameras`; it is not a trajectory of the release")
@@ -119,7 +123,7 @@ def _camera(file: Path, number: int, entry: Any) -> tuple[str, NDArray[np.float6
         raise InputError(f"{file}: camera {number} has no `image`")
     try:
         matrix = np.array(entry.get("T_camera_world"), dtype=np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4):
         raise InputError(f"{file}: camera {number} ({image}): `T_camera_world` must be 4 rows of 4 numbers")
@@ -145,17 +149,25 @@ def _cloud_files(folder: Path) -> dict[int, Path]:
 def _read_cloud(path: Path) -> NDArray[np.float64]:
     """World points (N, 3); a text file without a line has none."""
     if path.suffix.lower() == ".txt":
-        if path.stat().st_size == 0:
-            return np.zeros((0, 3))
+        try:
+            with open_file(path) as file:
+                if not file.read(1):
+                    return np.zeros((0, 3))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
         return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
     try:
-        xyz = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (OSError, ValueError, EOFError):
+        with open_file(path) as file:
+            start = file.read(NPY_START)
+        if NPY_HEADER.match(start) is None:  # np.load takes archives and pickles too, and code for a header
+            raise ValueError
+        xyz = np.load(path, allow_pickle=False, mmap_mode="r")  # mapped: its header is held against the file's size
+    except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TypeError):
         raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
     if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
         raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
     xyz = np.array(xyz[:, :3], dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(xyz) <= LARGEST).all(axis=1))
     if len(bad):
-        raise InputError(f"{path}: point {bad[0]} holds NaN or infinite numbers")
+        raise InputError(f"{path}: point {bad[0]} holds NaN or infinite numbers, or such beyond {LARGEST:g}")
     return xyz

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, text_lines
 
-__all__ = ["NumberRows", "read_number_rows", "read_text"]
+__all__ = ["NumberRows", "read_number_rows"]
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,10 @@ class NumberRows:
         return f"{self.path}:{self.lines[row]}"
 
 
-def read_text(path: Path, setting: str) -> str:
-    """Content of a text file. setting: the key that named it, for the message of the InputError where it cannot be."""
+def _lines(path: Path, setting: str) -> Iterator[str]:
+    """Lines of a text file. setting: the key that named it, for the message of the InputError where it cannot be."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        yield from text_lines(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file ({setting})") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -51,10 +54,9 @@ def read_number_rows(
     out. Raises InputError with file and line for anything else, and for a file
     without a row.
     """
-    rows: list[list[float]] = []
-    lines: list[int] = []
+    values, lines = array("d"), array("q")
     bad: list[int] = []
-    for number, line in enumerate(read_text(path, setting).splitlines(), start=1):
+    for number, line in enumerate(_lines(path, setting), start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
         if not words:
             continue
@@ -67,10 +69,13 @@ def read_number_rows(
         if not all(map(math.isfinite, row)):
             bad.append(number)
             continue
-        rows.append(row)
+        if max(map(abs, row)) > LARGEST:
+            raise InputError(f"{path}:{number}: holds a number beyond {LARGEST:g}; the file is damaged")
+        values.extend(row)
         lines.append(number)
-    if len(bad) > few * (len(rows) + len(bad)):
+    if len(bad) > few * (len(lines) + len(bad)):
         raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers; take the line out")
-    if not rows:
+    if not lines:
         raise InputError(f"{path}: holds no row of {meaning} ({setting})")
-    return NumberRows(path, np.array(rows, dtype=np.float64), np.array(lines, dtype=np.int64), len(bad))
+    rows = np.frombuffer(values).reshape(-1, columns)
+    return NumberRows(path, rows, np.frombuffer(lines, dtype=np.int64), len(bad))

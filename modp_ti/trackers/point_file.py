@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
+from modp_ti.reading import open_file
 from modp_ti.trackers.number_rows import read_number_rows
 from modp_ti.trackers.point_cloud import read_ply_points
 
@@ -20,7 +21,7 @@ def read_point_file(path: Path) -> NDArray[np.float64]:
     Raises InputError, with the line where there is one, for a file that is neither or holds no point.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             is_ply = file.read(3) == b"ply"
     except FileNotFoundError:
         raise InputError(f"{path}: no such file (tracker.points)") from None

@@ -14,6 +14,7 @@ from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
 
 __all__ = [
+    "FARTHEST",
     "PosedImage",
     "ReplayedTracker",
     "checked_pose",
@@ -27,6 +28,9 @@ __all__ = [
 
 # A rotation this far from orthonormal was not meant as one; below it lies the rounding of text files.
 MAX_ROTATION_DEFECT = 1e-2
+
+FARTHEST = 1e12
+"""A place [scene units] beyond this is none: its squares must fit the map's float32."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +136,8 @@ def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
         raise InputError(f"{what}: the pose holds NaN or infinite numbers")
     if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
         raise InputError(f"{what}: the last row of the pose must be 0 0 0 1")
+    if np.abs(matrix).max() > FARTHEST:
+        raise InputError(f"{what}: the pose holds numbers beyond {FARTHEST:g}; the file is damaged")
     defect = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if defect > MAX_ROTATION_DEFECT:
         raise InputError(

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST, open_file
 from modp_ti.sources import Distortion, Intrinsics
+from modp_ti.sources.intrinsics import require_plausible
 from modp_ti.trackers.trajectory import poses_of_quaternions
 
 __all__ = ["StellaKeyframe", "StellaMap", "read_stella_map"]
@@ -67,12 +69,14 @@ def read_stella_map(path: Path) -> StellaMap:
     Descriptors and the graph between keyframes are skipped, not held.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             if file.read(16).startswith(b"SQLite format 3"):
                 raise InputError(
                     f"{path}: an SQLite map; let stella_vslam write MessagePack: MapFormat: msgpack in its "
                     "configuration, and --map-db-out map.msg"
                 )
+            file.seek(0)
+            _unpacker(file).skip()  # makes nothing: every length in the file is backed by as much content
             file.seek(0)
             return _read(path, file)
     except FileNotFoundError:
@@ -84,11 +88,12 @@ def read_stella_map(path: Path) -> StellaMap:
     except _DamagedError as error:
         raise InputError(f"{path}: {error}; the file is damaged or of another version of stella_vslam") from None
     except (ValueError, msgpack.UnpackException) as error:
-        raise InputError(f"{path}: not a map of stella_vslam in MessagePack ({error})") from None
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        raise InputError(f"{path}: not a map of stella_vslam in MessagePack ({reason})") from None
 
 
-def _read(path: Path, file: BinaryIO) -> StellaMap:
-    unpacker = msgpack.Unpacker(
+def _unpacker(file: BinaryIO) -> msgpack.Unpacker:
+    return msgpack.Unpacker(
         file,
         read_size=READ_SIZE,
         max_buffer_size=MAX_BUFFER,
@@ -99,6 +104,10 @@ def _read(path: Path, file: BinaryIO) -> StellaMap:
         max_ext_len=0,
         raw=False,
     )
+
+
+def _read(path: Path, file: BinaryIO) -> StellaMap:
+    unpacker = _unpacker(file)
     cameras: dict[str, Intrinsics] = {}
     keyframes: list[StellaKeyframe] = []
     landmarks: dict[int, NDArray[np.float64]] = {}
@@ -158,10 +167,10 @@ def _floats(value: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64
     """Finite numbers of this shape; -1 as its first is any."""
     try:
         array = np.array(value, dtype=np.float64).reshape(shape)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise _DamagedError(f"{what} must be {' x '.join(str(n) for n in shape)} numbers") from None
-    if not np.isfinite(array).all():
-        raise _DamagedError(f"{what} holds NaN or infinite numbers")
+    if not (np.abs(array) <= LARGEST).all():
+        raise _DamagedError(f"{what} holds NaN or infinite numbers, or such beyond {LARGEST:g}")
     return array
 
 
@@ -192,9 +201,14 @@ def _camera(name: str, values: Any) -> Intrinsics:
     except ValueError as error:
         raise _DamagedError(f"{what}: {error}") from None
     if model == "Fisheye":
-        return Intrinsics(camera, Distortion(tuple(number(key) for key in ("k1", "k2", "k3", "k4")), fisheye=True))
-    radial = tuple(number(key) for key in ("k1", "k2", "k3"))
-    return Intrinsics(camera, Distortion(radial, tangential=(number("p1"), number("p2"))))
+        lens = Distortion(tuple(number(key) for key in ("k1", "k2", "k3", "k4")), fisheye=True)
+    else:
+        radial = tuple(number(key) for key in ("k1", "k2", "k3"))
+        lens = Distortion(radial, tangential=(number("p1"), number("p2")))
+    try:
+        return Intrinsics(*require_plausible(camera, lens, what))
+    except InputError as error:
+        raise _DamagedError(str(error)) from None
 
 
 def _keyframe(unpacker: msgpack.Unpacker, key: str) -> StellaKeyframe:

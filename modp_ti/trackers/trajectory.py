@@ -15,6 +15,7 @@ from modp_ti.settings import TrackerSettings
 from modp_ti.sources import ImageSource
 from modp_ti.sources.association import associate
 from modp_ti.trackers.number_rows import read_number_rows
+from modp_ti.trackers.replay import FARTHEST
 
 __all__ = [
     "Trajectory",
@@ -90,7 +91,11 @@ def poses_of_quaternions(
 
     where(row): file and line, for the InputError about a quaternion that is not of unit length.
     """
-    length = np.linalg.norm(quaternion, axis=1)
+    far = np.flatnonzero(~(np.abs(translation) <= FARTHEST).all(axis=1))
+    if len(far):
+        raise InputError(f"{where(int(far[0]))}: the position lies beyond {FARTHEST:g}; the file is damaged")
+    with np.errstate(over="ignore"):  # an infinite length is no unit length either
+        length = np.linalg.norm(quaternion, axis=1)
     wrong = np.flatnonzero(~(np.abs(length - 1.0) <= MAX_LENGTH_ERROR))
     if len(wrong):
         raise InputError(

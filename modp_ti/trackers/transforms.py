@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
+from modp_ti.reading import is_file, read_json
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import Distortion, FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.sources.intrinsics import require_plausible
 from modp_ti.trackers.point_cloud import read_ply_points, visible_points
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import (
@@ -92,7 +94,7 @@ def open_transforms(
         notes.append(f"{without_pose} of {len(selected)} images have no pose in {file.name}: skipped")
 
     cloud = data.get("ply_file_path")
-    if isinstance(cloud, str) and (file.parent / cloud).exists():
+    if isinstance(cloud, str) and is_file(file.parent / cloud):
         xyz = read_ply_points(file.parent / cloud)
         frames = [f.with_points(visible_points(xyz, f.undistorter, f.T_camera_world)) for f in frames]
     else:
@@ -117,12 +119,7 @@ def _transforms_file(images: Path, given: Path | None) -> Path:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{file}:{error.lineno}: not valid JSON: {error.msg}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read as text: {error}") from None
+    data = read_json(file, "tracker.path")
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f"{file}: holds no list of `frames`; it is not a transforms.json")
     return data
@@ -133,7 +130,7 @@ def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:
     what = f"{file}: frame {entry['file_path']}"
     try:
         matrix = np.array(entry.get("transform_matrix"), dtype=np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise InputError(f"{what}: `transform_matrix` must be 4 rows of 4 numbers") from None
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
@@ -156,7 +153,8 @@ def _intrinsics(
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(f"{file}: `{key}` must be a number, not {json.dumps(value)} (frame {values['file_path']})")
+            shown = json.dumps(value)[:60]
+            raise InputError(f"{file}: `{key}` must be a number, not {shown} (frame {values['file_path']})")
         return float(value)
 
     width, height = number("w"), number("h")
@@ -181,13 +179,14 @@ def _intrinsics(
         fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy, int(width), int(height)
     )
 
+    what = f"{file}: frame {values['file_path']}"
     k1, k2, k3, k4, p1, p2 = (number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(values.get("camera_model", "OPENCV")).upper()
     if values.get("is_fisheye") is True:
         model = "OPENCV_FISHEYE"
     if model in FISHEYE_MODELS:
-        return camera, Distortion((k1, k2, k3, k4), fisheye=True)
+        return require_plausible(camera, Distortion((k1, k2, k3, k4), fisheye=True), what)
     if model not in PERSPECTIVE_MODELS:
         supported = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
         raise InputError(f"{file}: camera model {model} is not supported ({supported}); undistort the images first")
-    return camera, Distortion((k1, k2, k3, k4), tangential=(p1, p2))
+    return require_plausible(camera, Distortion((k1, k2, k3, k4), tangential=(p1, p2)), what)

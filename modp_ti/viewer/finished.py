@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,11 @@ from modp_ti.errors import InputError
 from modp_ti.exports.exposure import read_exposures
 from modp_ti.playback.finished_run import FinishedRun
 from modp_ti.playback.map_renderer import MapRenderer, start_device
+from modp_ti.reading import read_bytes
 from modp_ti.settings import ViewSettings
+from modp_ti.sources.image_bounds import why_undecodable
+from modp_ti.sources.listed_images import decoded
+from modp_ti.trackers.colmap_files import read_colmap_model
 from modp_ti.viewer.handover import BrowserCamera, Latest
 from modp_ti.viewer.modes import (
     MODES,
@@ -105,25 +110,30 @@ class FinishedViewer:
 
     def _photograph(self, index: int) -> Photograph:
         """The kept image of a frame. Raises InputError where it is gone."""
-        import cv2
-
         run = self.run
         path = run.folder / "colmap" / "images" / run.names[index]
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        image = _kept_picture(path)
         camera = run.cameras[index]
         if image is None or image.shape[:2] != (camera.height, camera.width):
             raise InputError(f"{path}: the run's image is missing or damaged")
-        rgba = np.dstack([image[..., ::-1], np.full(image.shape[:2], 255, dtype=np.uint8)])
-        mask = cv2.imread(str(run.folder / "colmap" / "masks" / f"{run.names[index]}.png"), cv2.IMREAD_GRAYSCALE)
-        if mask is not None:
-            rgba[mask == 0] = 0
+        rgba = np.dstack([image, np.full(image.shape[:2], 255, dtype=np.uint8)])
+        mask = _kept_picture(run.folder / "colmap" / "masks" / f"{run.names[index]}.png")
+        if mask is not None and mask.shape == image.shape:
+            rgba[mask.max(axis=2) == 0] = 0
         return Photograph(rgba, camera, run.poses[index], self._exposures.get(index))
+
+
+def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
+    """A picture (H, W, 3) RGB that the run kept; None where it is missing or damaged."""
+    try:
+        data = read_bytes(path)
+    except OSError:
+        return None
+    return decoded(data) if why_undecodable(data) is None else None
 
 
 def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:
     """Points (N, 3) of the run's COLMAP model, which has been read before."""
-    import pycolmap
-
-    points = pycolmap.Reconstruction(str(run.folder / "colmap")).points3D
+    points = read_colmap_model(run.folder / "colmap").points3D
     xyz = np.array([points[number].xyz for number in sorted(points)]).reshape(-1, 3)
     return xyz if len(xyz) <= MAX_POINTS else xyz[np.arange(MAX_POINTS) * len(xyz) // MAX_POINTS]

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 __all__ = ["BrowserCamera", "Gate", "Latest", "Requests"]
 
+# Browsers that pictures are rendered for.
+MAX_BROWSERS = 32
+
 T = TypeVar("T")
 
 
@@ -138,8 +141,10 @@ class Requests:
         return len(self._cameras)
 
     def look(self, camera: BrowserCamera) -> None:
-        """A browser is there, or has moved."""
+        """A browser is there, or has moved. Beyond MAX_BROWSERS, further ones see the page and get no pictures."""
         with self._changed:
+            if camera.client not in self._cameras and len(self._cameras) >= MAX_BROWSERS:
+                return
             self._cameras[camera.client] = camera
             if camera.client not in self._due:
                 self._due.append(camera.client)

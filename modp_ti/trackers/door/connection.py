@@ -10,8 +10,8 @@ from modp_ti.trackers.door.messages import HEADER, Header, Hello, Kind, Protocol
 
 __all__ = ["GLANCE", "Connection", "SenderGoneError"]
 
-# Seconds for the first message: whoever connects and says nothing must not keep a tracker out.
-HELLO_PATIENCE = 30.0
+# Seconds for the first message once it has begun: whoever stops in it must not keep a tracker out.
+FIRST_PATIENCE = 5.0
 # What is read and thrown away after an error, so that closing does not take our last line back from the sender.
 DRAIN_SECONDS = 1.0
 # Seconds after which a thread that waits looks whether it is still wanted.
@@ -40,7 +40,7 @@ class Connection:
 
         Raises ProtocolError for one that is malformed or begins beyond its bounds, SenderGoneError at the end.
         """
-        patience = self._patience if hello else min(self._patience, HELLO_PATIENCE)
+        patience = self._patience if hello else min(self._patience, FIRST_PATIENCE)
         deadline = time.monotonic() + patience
         header = parse_header(self._read(HEADER.size, deadline, patience, begun=False), hello)
         return header, self._read(header.length, deadline, patience, begun=True)

@@ -14,6 +14,8 @@ __all__ = ["DEFAULT_ADDRESS", "listen", "open_to_others"]
 DEFAULT_ADDRESS = "127.0.0.1:7007"
 # A Unix socket's path may have so many bytes.
 MAX_SOCKET_PATH = 107
+# Connections that the system lets wait while a tracker is heard.
+WAITING = 8
 
 
 def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
@@ -32,7 +34,7 @@ def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(where)
-        listener.listen(1)
+        listener.listen(WAITING)
     except OSError as error:
         listener.close()
         raise InputError(
@@ -66,7 +68,7 @@ def _at_path(path: Path) -> socket.socket:
     try:
         listener.bind(str(path))
         path.chmod(0o600)  # of this user alone
-        listener.listen(1)
+        listener.listen(WAITING)
     except OSError as error:
         listener.close()
         raise InputError(f"{path}: cannot listen there: {error.strerror} (tracker.path)") from None

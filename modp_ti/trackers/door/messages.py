@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
+from modp_ti.reading import LARGEST
 from modp_ti.sources import NO_DISTORTION, Distortion, Intrinsics
-from modp_ti.trackers.replay import checked_pose
+from modp_ti.sources.intrinsics import require_plausible
+from modp_ti.trackers.replay import FARTHEST, checked_pose
 
 __all__ = [
     "HEADER",
@@ -224,6 +226,10 @@ def parse_hello(payload: bytes) -> Hello:
     except UnicodeDecodeError:
         raise ProtocolError("HELLO: the tracker's name must be UTF-8") from None
     camera = PinholeCamera(fx, fy, cx, cy, width, height)
+    try:
+        require_plausible(camera, distortion, "HELLO")
+    except InputError as error:
+        raise ProtocolError(str(error)) from None
     # A terminal shows it: nothing that it could take for more than text.
     name = "".join(c if c.isalnum() or c in " ._-" else "?" for c in name)
     return Hello(Intrinsics(camera, distortion), Encoding(encoding), name)
@@ -250,8 +256,8 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
     state = State(state)
     if kind is Kind.POSE and state is State.LATER:
         raise ProtocolError(f"{what}: must bring the pose (state 1) or say that none will come (state 2)")
-    if not math.isfinite(timestamp):
-        raise ProtocolError(f"{what}: the time stamp is not finite")
+    if not abs(timestamp) <= LARGEST:
+        raise ProtocolError(f"{what}: the time stamp is not finite, or beyond {LARGEST:g}")
     if count and state is not State.KNOWN:
         raise ProtocolError(f"{what}: has points and no pose: they come with it")
     pose = _pose(np.array(matrix).reshape(4, 4), what) if state is State.KNOWN else None
@@ -262,8 +268,8 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
 def parse_points(block: bytes, what: str) -> SparsePoints:
     """Points of a frame. what: begins the message of the ProtocolError for those that cannot be."""
     table = np.frombuffer(block, dtype=POINT)
-    if not (np.isfinite(table["xyz"]).all() and np.isfinite(table["pixel"]).all()):
-        raise ProtocolError(f"{what}: its points hold NaN or infinite numbers")
+    if not all((np.abs(table[name]) <= FARTHEST).all() for name in ("xyz", "pixel")):
+        raise ProtocolError(f"{what}: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
     if len(np.unique(table["id"])) != len(table):
         raise ProtocolError(f"{what}: a point stands twice: ids are unique in a frame")
     xyz, pixels = (table[name].astype(np.float64) for name in ("xyz", "pixel"))
@@ -283,8 +289,8 @@ def parse_correction(payload: bytes) -> Correction:
     if (np.diff(numbers) <= 0).any():
         raise ProtocolError("CORRECTION: frames must be named once each, in their order")
     matrices = [_pose(row["T"], f"CORRECTION of frame {row['number']}") for row in frames]
-    if not np.isfinite(moved["xyz"]).all():
-        raise ProtocolError("CORRECTION: its points hold NaN or infinite numbers")
+    if not (np.abs(moved["xyz"]) <= FARTHEST).all():
+        raise ProtocolError(f"CORRECTION: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
     if len(np.unique(moved["id"])) != len(moved):
         raise ProtocolError("CORRECTION: a point stands twice")
     return Correction(numbers, np.stack(matrices), moved["id"].astype(np.int64), moved["xyz"].astype(np.float64))

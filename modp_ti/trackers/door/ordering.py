@@ -13,6 +13,9 @@ __all__ = ["Ordering"]
 # What may wait behind a frame without a pose; images wait on disk.
 MAX_WAITING = 2_000  # frames and corrections
 MAX_WAITING_BYTES = 256 << 20  # of points and poses
+MAX_WAITING_IMAGES = 4 << 30  # bytes, on disk
+# Corrections between two frames: each costs as much as all poses so far.
+MAX_CORRECTIONS = 100
 
 
 class Ordering:
@@ -28,7 +31,14 @@ class Ordering:
         self._undecided: set[int] = set()
         self._posed: set[int] = set()
         self._bytes = 0
+        self._images: deque[int] = deque()  # bytes of the images of frames that wait
+        self._corrections = 0  # since the last frame
         self._last: Frame | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether a frame has come."""
+        return self._last is not None
 
     @property
     def undecided(self) -> int:
@@ -50,6 +60,8 @@ class Ordering:
     def add_frame(self, frame: Frame) -> None:
         """Take a frame in; its image is of no interest here. Raises ProtocolError as `require_next` does."""
         self.require_next(frame)
+        self._corrections = 0
+        self._images.append(len(frame.image))
         self._last = frame = replace(frame, image=b"")
         if frame.state is State.LATER:
             self._undecided.add(frame.number)
@@ -71,6 +83,9 @@ class Ordering:
 
     def add_correction(self, correction: Correction) -> None:
         """Raises ProtocolError where it names a frame that has no pose."""
+        self._corrections += 1
+        if self._corrections > MAX_CORRECTIONS:
+            raise ProtocolError(f"more than {MAX_CORRECTIONS} CORRECTIONs without a FRAME between them: send fewer")
         for number in correction.numbers.tolist():
             if number not in self._posed:
                 raise ProtocolError(f"CORRECTION of frame {number}, which has no pose so far")
@@ -89,6 +104,8 @@ class Ordering:
             else:
                 self._bytes -= _size(item)
             self._waiting.popleft()
+            if isinstance(item, Frame):
+                self._images.popleft()
             if isinstance(item, Frame) and item.state is State.LOST:
                 self.lost += 1
             else:
@@ -107,9 +124,11 @@ class Ordering:
 
     def _hold(self, size: int) -> None:
         self._bytes += size
-        if len(self._waiting) > MAX_WAITING or self._bytes > MAX_WAITING_BYTES:
+        images = sum(self._images)
+        if len(self._waiting) > MAX_WAITING or self._bytes > MAX_WAITING_BYTES or images > MAX_WAITING_IMAGES:
+            size = self._bytes + images >> 20
             raise ProtocolError(
-                f"{len(self._waiting)} frames and corrections ({self._bytes >> 20} MiB) wait for the pose of FRAME "
+                f"{len(self._waiting)} frames and corrections ({size} MiB) wait for the pose of FRAME "
                 f"{min(self._undecided, default=0)}: send its POSE, state 2 where it has none"
             )
 

@@ -17,10 +17,14 @@ from modp_ti.sources.image_header import read_image_header
 from modp_ti.sources.intrinsics import Intrinsics
 from modp_ti.trackers.door.messages import POINT, Encoding, Frame, Hello, ProtocolError, parse_points
 
-__all__ = ["Spool"]
+__all__ = ["Spool", "SpoolFullError"]
 
 # What must stay free on the disk [bytes].
 KEPT_FREE = 1 << 30
+
+
+class SpoolFullError(Exception):
+    """The disk has no room for another frame. The text says so in a line."""
 
 
 class Spool:
@@ -43,18 +47,19 @@ class Spool:
     def add(self, frame: Frame) -> str:
         """Keep the frame's image; its name. Raises ProtocolError for an image that is not what HELLO said.
 
-        Raises InputError where the disk has no room.
+        Raises SpoolFullError where the disk has no room.
         """
         self._require_image(frame)
         name = self.name(frame.number)
         self._write(name, frame.image)
-        self._position[name] = len(self.names)
-        self.names.append(name)
-        self._timestamps.append(frame.timestamp)
         try:
             self._decoded(name)
         except InputError as error:
+            (self.path / name).unlink(missing_ok=True)
             raise ProtocolError(f"FRAME {frame.number}: {error}") from None
+        self._position[name] = len(self.names)
+        self.names.append(name)
+        self._timestamps.append(frame.timestamp)
         return name
 
     def name(self, number: int) -> str:
@@ -146,7 +151,7 @@ class Spool:
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
 
     def keep_points(self, name: str, points: SparsePoints) -> None:
-        """Keep the points of a frame as they were delivered. Raises InputError where the disk has no room."""
+        """Keep the points of a frame as they were delivered. Raises SpoolFullError where the disk has no room."""
         table = np.zeros(len(points), dtype=POINT)
         table["id"], table["xyz"], table["pixel"] = points.ids, points.xyz, points.pixels
         self._write(name + ".points", table.tobytes())
@@ -158,10 +163,12 @@ class Spool:
     def _write(self, name: str, data: bytes) -> None:
         try:
             if shutil.disk_usage(self.path).free < KEPT_FREE + len(data):
-                raise InputError(f"{self.path.parent}: less than 1 GiB is free for the frames that arrive; set TMPDIR")
+                raise SpoolFullError(
+                    f"{self.path.parent}: less than 1 GiB is free for the frames that arrive; set TMPDIR"
+                )
             (self.path / name).write_bytes(data)
         except OSError as error:
-            raise InputError(f"{self.path.parent}: a frame cannot be kept: {error.strerror}; set TMPDIR") from None
+            raise SpoolFullError(f"{self.path.parent}: a frame cannot be kept: {error.strerror}; set TMPDIR") from None
 
     def close(self) -> None:
         """Delete the folder."""

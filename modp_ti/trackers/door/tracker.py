@@ -17,6 +17,7 @@ from modp_ti.sources import FrameReader, Undistorter
 from modp_ti.trackers.door.connection import GLANCE, Connection, SenderGoneError
 from modp_ti.trackers.door.history import Delivered, History
 from modp_ti.trackers.door.listening import listen, open_to_others
+from modp_ti.trackers.door.lobby import Lobby
 from modp_ti.trackers.door.messages import (
     Correction,
     Frame,
@@ -28,14 +29,15 @@ from modp_ti.trackers.door.messages import (
     parse_hello,
 )
 from modp_ti.trackers.door.ordering import Ordering
-from modp_ti.trackers.door.spool import Spool
+from modp_ti.trackers.door.spool import Spool, SpoolFullError
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import is_held_out, points_inside, unmasked
 
 __all__ = ["DoorTracker", "open_door"]
 
-# Remarks that are kept about connections that came to nothing.
-MAX_DROPPED = 5
+# Seconds that the door takes a breath after a connection that came to nothing, for each of them up to the most: who
+# connects in a loop must not keep a processor busy.
+BREATH, LONGEST_BREATH = 0.01, 0.5
 
 
 def open_door(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> DoorTracker:
@@ -54,7 +56,8 @@ class DoorTracker:
     """A live `Tracker` that listens from the start, in a thread that reads, checks and decodes what is sent.
 
     Up to `source.prefetch` frames (one at least) wait decoded for the mapper; then nothing more is read, and the
-    sender's writes wait. Connections that come to nothing before a frame was sent are dropped, and the door stays open;
+    sender's writes wait. Connections that come to nothing before a frame was sent are dropped, counted in one note,
+    and the door stays open; one that says nothing keeps nobody out;
     from the first frame on, whatever ends the connection ends the stream, and the run goes on with what it has. What
     was sent is kept in a temporary folder until `close`.
     """
@@ -73,7 +76,7 @@ class DoorTracker:
         self._undistorter: Undistorter | None = None
         self._history = History()
         self._indices: dict[int, int] = {}  # of the frames that went to the mapper, by their numbers
-        self._dropped = 0
+        self._dropped, self._dropped_note = 0, ""
         self._name = ""
         self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
         self._closed = Event()
@@ -143,20 +146,21 @@ class DoorTracker:
 
     def _serve(self) -> None:
         end: InputError | None = None
+        lobby = Lobby(self._listener, self._patience)
         try:
-            self._listener.settimeout(GLANCE)
             while not self._closed.is_set():
-                try:
-                    sock, _ = self._listener.accept()
-                except TimeoutError:
-                    continue
-                if self._talk(Connection(sock, self._patience, self._closed)):
+                sock = lobby.next(GLANCE)
+                if lobby.dropped:
+                    self._count_dropped("it said nothing", lobby.dropped)
+                    lobby.dropped = 0
+                if sock is not None and self._talk(Connection(sock, self._patience, self._closed)):
                     break
         except InputError as error:
             end = error
         except Exception as error:  # a fault of ours must end the run and not leave it waiting
             end = InputError(f"{self.address}: the door failed: {type(error).__name__}: {error}")
         finally:
+            lobby.close()
             self._listener.close()
             if self._path is not None:
                 self._path.unlink(missing_ok=True)
@@ -186,25 +190,41 @@ class DoorTracker:
         except ProtocolError as error:
             problem = str(error)
             connection.refuse(problem)
+        except SpoolFullError as error:
+            connection.refuse(f"the run takes no more: {error}")
+            if not ordering.begun:
+                raise InputError(str(error)) from None
+            problem = str(error)
         except InputError as error:
             connection.refuse(f"the run stops: {error}")
             raise
-        taken = self._spool is not None and len(self._spool) > 0
-        if problem is not None and not taken:
-            self._dropped += 1
-            if self._dropped <= MAX_DROPPED:
-                self.notes.append(f"a connection to {self.address} was dropped before its first frame: {problem}")
+        if problem is not None and not ordering.begun:
+            self._count_dropped(problem, 1)
+            self._closed.wait(min(BREATH * self._dropped, LONGEST_BREATH))
             return False
         if problem is not None:
             self.notes.append(f"the stream ended early: {problem}; the run went on with the frames before")
         ordering.close()
-        self._deliver(ordering)
+        try:
+            self._deliver(ordering)
+        except SpoolFullError as error:
+            self.notes.append(f"the last frames are missing: {error}")
         if ordering.lost:
             self.notes.append(f"{ordering.lost} of {len(self._spool or ())} frames came without a pose: skipped")
         if problem is None:
             connection.say(Kind.DONE, struct.pack("<I", len(self._indices)))
             connection.close()
         return True
+
+    def _count_dropped(self, problem: str, count: int) -> None:
+        """One note for all connections that came to nothing, however many there are."""
+        self._dropped += count
+        many = "a connection" if self._dropped == 1 else f"{self._dropped} connections"
+        were = "was" if self._dropped == 1 else "were"
+        last = "" if self._dropped == 1 else "the last: "
+        note = f"{many} to {self.address} {were} dropped before the first frame: {last}{problem}"
+        self.notes = [*(other for other in self.notes if other != self._dropped_note), note]
+        self._dropped_note = note
 
     def _prepare(self, hello: Hello) -> None:
         """Make ready for the images of this camera. Raises InputError for settings that do not fit them."""

@@ -6,7 +6,7 @@ import threading
 
 import numpy as np
 
-from modp_ti.viewer.handover import BrowserCamera, Gate, Latest, Requests
+from modp_ti.viewer.handover import MAX_BROWSERS, BrowserCamera, Gate, Latest, Requests
 
 
 def camera(client: int, x: float = 0.0) -> BrowserCamera:
@@ -115,4 +115,19 @@ def test_browsers_take_turns_and_those_that_left_are_forgotten():
     requests.leave(2)
     assert len(requests) == 2
     assert {requests.next().client, requests.next().client} == {1, 3}
+    assert requests.next() is None
+
+
+def test_browsers_beyond_the_limit_are_left_out_until_one_goes():
+    requests = Requests("splats")
+    for client in range(MAX_BROWSERS + 5):
+        requests.look(camera(client))
+    assert len(requests) == MAX_BROWSERS
+    requests.look(camera(MAX_BROWSERS))
+    assert len(requests) == MAX_BROWSERS
+    requests.look(camera(3, x=1.0))  # one that is known may move
+    requests.leave(0)
+    requests.look(camera(MAX_BROWSERS))
+    asked = [requests.next().client for _ in range(MAX_BROWSERS)]
+    assert sorted(asked) == list(range(1, MAX_BROWSERS + 1))
     assert requests.next() is None

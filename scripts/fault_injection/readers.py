@@ -1,0 +1,270 @@
+"""Every reader as a function of bytes: what the fuzzer calls, and what the corpus is replayed through.
+
+A reader with several files takes its first byte as the file's number. Anything but an InputError (or its like: what
+`pipelines` and the door raise) that comes out of one is a fault of ours.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+
+from fault_injection.samples import SAMPLES, write_sample
+from modp_ti.errors import InputError
+
+__all__ = ["READERS", "Reader", "import_readers", "seeds"]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """files: of the sample, by their numbers; read: called in the sample's folder with the one that was written."""
+
+    name: str
+    sample: str
+    files: tuple[str, ...]
+    read: Callable[[Path], object]
+
+    def __call__(self, folder: Path, data: bytes) -> bool:
+        """Read `data` in the place of one of the files; whether it was taken."""
+        if len(self.files) > 1:
+            number, data = (data[0] if data else 0) % len(self.files), data[1:]
+        else:
+            number = 0
+        file = folder / self.files[number]
+        before = file.read_bytes()
+        file.write_bytes(data)
+        try:
+            self.read(file)
+        except InputError:
+            return False
+        finally:
+            file.write_bytes(before)
+        return True
+
+
+def _open(file: Path) -> None:
+    """The tracker of the scene beside the file, opened and asked for what it holds."""
+    from modp_ti.config import load_scene
+    from modp_ti.trackers import close, open_tracker
+
+    folder = file.parent
+    while not (folder / "scene.yaml").exists():
+        folder = folder.parent
+    close(open_tracker(load_scene(folder / "scene.yaml")))
+
+
+def _scene(file: Path) -> None:
+    from modp_ti.config import load_scene
+
+    load_scene(file)
+
+
+def _tum(file: Path) -> None:
+    from modp_ti.exports.trajectory import read_trajectory
+    from modp_ti.trackers.trajectory import read_trajectory_file
+
+    try:
+        read_trajectory(file)
+    except InputError:
+        pass
+    read_trajectory_file(file)
+
+
+def _points(file: Path) -> None:
+    from modp_ti.trackers.point_file import read_point_file
+
+    read_point_file(file)
+
+
+def _listing(file: Path) -> None:
+    from modp_ti.sources.tum_rgbd import open_tum_rgbd
+
+    open_tum_rgbd(file.parent)
+
+
+def _aria(file: Path) -> None:
+    from modp_ti.trackers import aria_mps
+
+    if file.name == "closed_loop_trajectory.csv":
+        aria_mps.read_closed_loop(file)
+    elif file.suffix == ".jsonl":
+        aria_mps.read_calibration(file, "camera-rgb")
+    elif file.name == "semidense_points.csv.gz":
+        aria_mps.read_points(file, "g1", 0.005, 0.05)
+    else:
+        aria_mps.read_observations(file, np.arange(40), -1.0, 1.0)
+
+
+def _stella(file: Path) -> None:
+    from modp_ti.trackers.stella_map import read_stella_map
+
+    read_stella_map(file)
+
+
+def _image(file: Path) -> None:
+    from modp_ti.sources.exif import focal_length_35mm
+    from modp_ti.sources.listed_images import ListedImages
+    from modp_ti.sources.vignette import read_vignette
+
+    images = ListedImages(file.parent, [file.name], [0.0])
+    focal_length_35mm(file)
+    try:
+        read_vignette(file)
+    except InputError:
+        pass
+    size = images.size(file.name)
+    assert images.read(file.name).shape[1::-1] == size
+
+
+def _container(file: Path) -> None:
+    from modp_ti.sources.video_container import missing_bytes
+
+    missing_bytes(file)
+
+
+def _video(file: Path) -> None:
+    from modp_ti.sources.video_file import VideoFile
+
+    video = VideoFile(file)
+    video.read(video.names[-1])
+    video.read(video.names[0])
+    video.close()
+
+
+def _run(file: Path) -> None:
+    from modp_ti.exports.exposure import read_exposures
+    from modp_ti.exports.scores_csv import read_scores
+    from modp_ti.playback.finished_run import open_run
+
+    folder = next(parent for parent in file.parents if parent.name == "out")
+    if file.name == "exposure.json":
+        read_exposures(file)
+    elif file.name == "scores.csv":
+        read_scores(file)
+    else:
+        open_run(folder)
+
+
+def _splats(file: Path) -> None:
+    from modp_ti.exports.splats_ply import read_splats
+
+    read_splats(file)
+
+
+def _weights(file: Path) -> None:
+    from pipelines.weights import read_weights
+
+    try:
+        read_weights(file)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+class _Wire(socket.socket):
+    """A socket that has received what is in a file, and whose sender has gone."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._at = data, 0
+
+    def recv(self, size: int) -> bytes:
+        part = self._data[self._at : self._at + size]
+        self._at += len(part)
+        return part
+
+    def settimeout(self, seconds: float | None) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def _door(file: Path) -> None:
+    """A whole conversation, up to what is handed to the mapper."""
+    from modp_ti.trackers.door import messages
+    from modp_ti.trackers.door.connection import Connection, SenderGoneError
+    from modp_ti.trackers.door.ordering import Ordering
+    from modp_ti.trackers.door.spool import Spool
+
+    connection = Connection(_Wire(file.read_bytes()), 1.0, Event())
+    hello = spool = None
+    ordering = Ordering()
+    try:
+        while True:
+            header, payload = connection.receive(hello)
+            if header.kind is messages.Kind.END:
+                break
+            if header.kind is messages.Kind.HELLO:
+                hello = messages.parse_hello(payload)
+                hello.intrinsics.undistorter(1.0)
+                spool = Spool(hello)
+            elif header.kind is messages.Kind.CORRECTION:
+                ordering.add_correction(messages.parse_correction(payload))
+            else:
+                frame = messages.parse_frame(payload, header.kind)
+                if header.kind is messages.Kind.POSE:
+                    ordering.add_pose(frame)
+                else:
+                    ordering.require_next(frame)
+                    spool.add(frame)
+                    ordering.add_frame(frame)
+            for _ in ordering.ready():
+                pass
+        ordering.close()
+    except (messages.ProtocolError, SenderGoneError) as error:
+        raise InputError(str(error)) from None
+    finally:
+        if spool is not None:
+            spool.close()
+
+
+RUN_FILES = (
+    *("out/trajectory.txt", "out/frames.json", "out/exposure.json", "out/scores.csv"),
+    *(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D")),
+)
+
+READERS: dict[str, Reader] = {
+    reader.name: reader
+    for reader in (
+        Reader("scene", "scene", ("scene.yaml",), _scene),
+        Reader("colmap", "colmap", SAMPLES["colmap"][0].files, _open),
+        Reader("colmap_text", "colmap_text", SAMPLES["colmap_text"][0].files, _open),
+        Reader("transforms", "transforms", ("transforms.json",), _open),
+        Reader("tum", "tum", ("trajectory.txt",), _tum),
+        Reader("points", "ply", ("points.ply",), _points),
+        Reader("listing", "tum_rgbd", ("rgb.txt",), _listing),
+        Reader("matrices", "replica", ("traj.txt",), _open),
+        Reader("modp", "modp", SAMPLES["modp"][0].files, _open),
+        Reader("aria", "aria", SAMPLES["aria"][0].files, _aria),
+        Reader("stella_vslam", "stella_vslam", ("map.msg",), _stella),
+        Reader("image", "image", SAMPLES["image"][0].files, _image),
+        Reader("video_container", "video", ("room.mp4",), _container),
+        Reader("video", "video", ("room.mp4",), _video),
+        Reader("splats", "run", ("out/splats.ply",), _splats),
+        Reader("run", "run", RUN_FILES, _run),
+        Reader("weights", "weights", ("older.pth", "weights.pth"), _weights),
+        Reader("door", "door", ("wire",), _door),
+    )
+}
+
+
+def import_readers() -> None:
+    """Import every module that the readers use, once and for all processes that are forked off."""
+    kinds = ("aria", "colmap", "door", "modp", "replica", "stella_vslam", "transforms", "tum")
+    for name in (
+        *("config", "exports.exposure", "exports.scores_csv", "exports.splats_ply", "exports.trajectory"),
+        *("playback.finished_run", "sources.exif", "sources.tum_rgbd", "sources.video_file", "sources.vignette"),
+        *(f"trackers.{kind}" for kind in kinds),
+    ):
+        import_module(f"modp_ti.{name}")
+    import_module("pipelines.weights")
+
+
+def seeds(reader: Reader, folder: Path) -> list[bytes]:
+    """Write the reader's sample into a new folder; its files as the fuzzer gives them."""
+    write_sample(reader.sample, folder)
+    contents = [(folder / name).read_bytes() for name in reader.files]
+    return contents if len(contents) == 1 else [bytes([n]) + content for n, content in enumerate(contents)]
