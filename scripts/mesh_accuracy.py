@@ -15,11 +15,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from ending import documented_ending
 from numpy.typing import NDArray
 
 from fields.backend import initialise
 from fields.camera import PinholeCamera
 from modp_ti.config import load_scene
+from modp_ti.errors import InputError
+from modp_ti.exports.mesh import read_mesh
 from modp_ti.exports.open3d_io import open3d
 from modp_ti.playback.finished_run import FinishedRun, open_run
 from modp_ti.synthetic import SyntheticTracker
@@ -72,6 +75,7 @@ def in_the_room(run: FinishedRun, truth: list[NDArray], points: NDArray) -> NDAr
     return s * (points - estimate.mean(axis=0)) @ R.T + target.mean(axis=0)
 
 
+@documented_ending()
 def main() -> None:
     """Print the two shares."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])

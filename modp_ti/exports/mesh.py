@@ -18,7 +18,7 @@ from modp_ti.exports.glb import write_glb
 from modp_ti.exports.open3d_io import open3d, written_aside
 from pipelines.rendering import RenderedView
 
-__all__ = ["MESH_SUFFIXES", "SurfaceView", "fuse", "surface_depth", "without_floating_parts", "write_mesh"]
+__all__ = ["MESH_SUFFIXES", "SurfaceView", "fuse", "read_mesh", "surface_depth", "without_floating_parts", "write_mesh"]
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 # The distance is kept up to this many voxels before and behind the surface.
@@ -110,3 +110,15 @@ def write_mesh(path: Path, mesh: object) -> None:
     with written_aside(path) as partial:
         if not o3d.io.write_triangle_mesh(str(partial), mesh):
             raise OSError(None, "Open3D could not write the mesh")
+
+
+def read_mesh(path: Path) -> object:
+    """An Open3D TriangleMesh from a file. Raises InputError where there is none."""
+    o3d = open3d()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; modp-ti export OUT --format mesh makes a mesh")
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(str(path))
+    if len(mesh.triangles) == 0:
+        raise InputError(f"{path}: holds no triangle that Open3D can read; modp-ti export OUT --format mesh makes a mesh")
+    return mesh
