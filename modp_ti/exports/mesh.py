@@ -120,5 +120,5 @@ def read_mesh(path: Path) -> object:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(str(path))
     if len(mesh.triangles) == 0:
-        raise InputError(f"{path}: holds no triangle that Open3D can read; modp-ti export OUT --format mesh makes a mesh")
+        raise InputError(f"{path}: holds no triangle; modp-ti export OUT --format mesh makes a mesh")
     return mesh

@@ -118,10 +118,7 @@ def _surface(run: FinishedRun, device: str, line: ProgressLine) -> Iterator[Surf
     with line.working("loading the map"):
         gaussians = run.gaussians
         start_device(device)
-    mapped = run.mapped
-    chosen = [
-        mapped[i * len(mapped) // min(len(mapped), SURFACE_VIEWS)] for i in range(min(len(mapped), SURFACE_VIEWS))
-    ]
+    chosen = run.spread(SURFACE_VIEWS)
     cameras = [run.cameras[index] for index in chosen]
     renderer = MapRenderer(gaussians, max(c.width for c in cameras), max(c.height for c in cameras), run.record.near)
     views = list(zip(cameras, run.poses[chosen], strict=True))

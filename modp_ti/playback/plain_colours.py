@@ -32,8 +32,7 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
     Where a Gaussian brighter than 1 lets light through, clipping makes it too dark. So colours, opacities and sizes are
     fitted to the map's own pictures at the frames that were mapped. Taichi runs already.
     """
-    mapped = run.mapped
-    chosen = [mapped[i * len(mapped) // min(len(mapped), VIEWS)] for i in range(min(len(mapped), VIEWS))]
+    chosen = run.spread(VIEWS)
     cameras = [run.cameras[index] for index in chosen]
     maps = MapRenderer(run.gaussians, max(c.width for c in cameras), max(c.height for c in cameras), run.record.near)
     views = []
