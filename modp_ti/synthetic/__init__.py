@@ -25,7 +25,8 @@ def open_synthetic(
     """The demo sequence; with drift or correction the camera walks in a loop.
 
     Of `source`, scale, start, stop, step, holdout and fps count; of `tracker` exposure_change, drift and correction.
-    room: one that is built already. Raises InputError where the scale leaves no picture or the range no frames, and for masks or a vignette.
+    room: one that is built already. Raises InputError where the scale leaves no picture or the range no frames, and for
+    masks or a vignette.
     """
     if source.masks is not None or source.mask_colour is not None or source.vignette is not None:
         raise InputError("the demo room has neither masks nor a vignette: take source.masks, mask_colour, vignette out")
