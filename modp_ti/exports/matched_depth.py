@@ -1,4 +1,4 @@
-"""Depth of rendered views, corrected by matching the map's own pictures of neighbouring frames.
+"""Depth of rendered views, corrected by matching the images of neighbouring frames.
 
 A map is optimised for colour: where the pictures have little texture, its Gaussians stay at the depth that they were
 given, whole regions of them some percent off, and all views agree on it. The pictures that it renders are right all the
@@ -38,8 +38,9 @@ LEAST_VARIANCE = 1e-4
 # decides where nothing else does: with 0.05, whole regions stayed where the map has them.)
 SMALL_JUMP, LARGE_JUMP, GREY_EDGE = 0.1, 0.8, 0.05
 MAP_WEIGHT = 0.002
-# Kept is a depth that as many neighbours find at the same place to this share of it.
-AGREEING = 2
+# Kept is a depth that as many neighbours find at the same place to this share of it. (Of the demo room's mesh, true
+# vertices and surface found in percent: all depth 76 and 75, one that agrees 81 and 70, two 84 and 66.)
+AGREEING = 1
 AGREEMENT = 0.01
 
 Image = NDArray[np.float32]

@@ -224,6 +224,17 @@ def test_a_mesh_lies_in_the_room(out: Path, tmp_path: Path) -> None:
     assert np.asarray(mesh.vertex_colors).std() > 0.05
 
 
+def test_a_mesh_is_made_of_the_map_s_own_pictures_where_the_images_are_gone(out: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(out, tmp_path / "run")
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(config.replace("  stop: 9", "  stop: 8"))
+    result = invoke("export", run, "--format", "mesh")
+    assert result.exit_code == 0
+    assert "note: matching the map's own pictures, for want of the images: " in result.stderr
+    assert "the source no longer gives the frames that were mapped" in result.stderr
+    assert len(o3d.io.read_triangle_mesh(str(run / "mesh.ply")).triangles) > 1000
+
+
 @pytest.mark.parametrize("kept", [False, True])
 def test_a_colmap_data_set_has_model_and_images(out: Path, tmp_path: Path, kept: bool) -> None:
     """Whether the run kept its images or they are read again from its source."""

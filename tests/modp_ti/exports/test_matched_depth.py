@@ -68,7 +68,7 @@ def test_neighbours_lie_on_both_sides_at_the_wanted_parallaxes() -> None:
 def test_depth_is_kept_where_neighbours_agree_on_it() -> None:
     seen, _ = views(contrast=1.0)
     bent = seen[4].depth.copy()
-    bent[:, :40] *= 1.03
+    bent[:, :40] *= 1.03  # no neighbour agrees
     shown = [*seen[:4], replace(seen[4], depth=bent), *seen[5:]]
     depth = agreed_depth(shown, 4, [2, 3, 5, 6])
     assert (depth[:, :40] == 0).all()
