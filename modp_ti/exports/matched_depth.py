@@ -1,10 +1,10 @@
 """Depth of rendered views, corrected by matching the images of neighbouring frames.
 
-A map is optimised for colour: where the pictures have little texture, its Gaussians stay at the depth that they were
-given, whole regions of them some percent off, and all views agree on it. The pictures that it renders are right all the
-same, and hold the parallax. Around the depth that the map shows, inverse depths are swept [Collins 1996]: every
-neighbour's picture is carried over and compared (ZNCC); sums of matching cost along rows and columns decide
-[Hirschmueller 2008], and the map where the pictures say nothing.
+A map is optimised for colour: where there is little texture, its Gaussians stay at the depth that they were given, whole
+regions of them some percent off, and all views agree on it. The images hold the parallax all the same; so do, less
+sharp, the pictures that the map renders. Around the depth that the map shows, inverse depths are swept [Collins 1996]:
+every neighbour's image is carried over and compared (ZNCC); sums of matching cost along rows and columns decide
+[Hirschmueller 2008], and the map where the images say nothing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DepthView:
-    """A camera at T_camera_world (4, 4), its grey picture (H, W) in [0, 1], and z (H, W), 0 where unknown."""
+    """A camera at T_camera_world (4, 4), its grey image (H, W) in [0, 1], and z (H, W), 0 where unknown."""
 
     camera: PinholeCamera
     T_camera_world: NDArray[np.float64]
