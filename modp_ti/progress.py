@@ -37,6 +37,10 @@ class ProgressLine:
         with self.console.status(what):
             yield
 
+    def note(self, text: str) -> None:
+        """Say something that a person should know."""
+        self.console.print(text, highlight=False, soft_wrap=True)
+
     def prepare(self, what: str, done: int, total: int) -> None:
         """Show a tracker's preparation; the Progress callback of trackers."""
         if self._progress is None:

@@ -64,6 +64,9 @@ def render(
     fps: Annotated[
         float | None, typer.Option(min=1, max=120, help="frames per second of a video; empty: as recorded, else 30")
     ] = None,
+    exposure: Annotated[
+        bool, typer.Option("--exposure", help="of the recorded path: each picture as exposed as its frame was")
+    ] = False,
     device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -78,7 +81,9 @@ def render(
         line = ProgressLine(progress_console(quiet))
         with line.working("reading the run"):
             run = open_run(out)
-        flight = plan_flight(run, path, picture_size(size) if size is not None else None, fov, frames, fps, smooth)
+        flight = plan_flight(
+            run, path, picture_size(size) if size is not None else None, fov, frames, fps, smooth, exposure
+        )
         depth = show is Shown.depth
         target = output or run.folder / f"{Path(path).stem}{'-depth' if depth else ''}.mp4"
         film(run, flight, target, depth, device.value, line)

@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from ending import documented_ending
 from experiments import (
     Figures,
     Job,
@@ -47,6 +48,7 @@ TABLES = (
 )
 
 
+@documented_ending()
 def main() -> None:
     """Run what is missing, then print and write the tables."""
     parser = argparse.ArgumentParser(
@@ -66,13 +68,10 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of every run")
     parser.add_argument("--fresh", action="store_true", help="run again what is there already")
     arguments = parser.parse_args()
-    try:
-        scenes = named_scenes(arguments.scenes)
-        common = {"refine.steps": str(arguments.refine)} | command_line(arguments.set)
-        jobs = plan(scenes, arguments.output, common, arguments.tracker, arguments.only or VARIANTS)
-        metrics = execute([job for of_scene in jobs.values() for job in of_scene.values()], arguments.fresh)
-    except InputError as error:
-        parser.exit(2, f"error: {error}\n")
+    scenes = named_scenes(arguments.scenes)
+    common = {"refine.steps": str(arguments.refine)} | command_line(arguments.set)
+    jobs = plan(scenes, arguments.output, common, arguments.tracker, arguments.only or VARIANTS)
+    metrics = execute([job for of_scene in jobs.values() for job in of_scene.values()], arguments.fresh)
     rest = iter(metrics)
     figures = {
         scene: {variant: summary(next(rest), job.folder) for variant, job in of_scene.items()}

@@ -17,6 +17,7 @@ from typing import Any
 
 from benchmarks.report import report
 from benchmarks.whole_runs import measure_runs, planned_runs
+from ending import documented_ending
 from experiments import command_line, write_report
 
 from modp_ti.errors import InputError
@@ -26,6 +27,7 @@ SIZES = [(270, 480, 12_500), (640, 480, 100_000), (1280, 720, 500_000)]
 DEMO = Path(__file__).resolve().parent.parent / "demo" / "scene.yaml"
 
 
+@documented_ending()
 def main() -> None:
     """Measure, and print the tables; exit code 2 for bad input."""
     parser = argparse.ArgumentParser(
@@ -46,10 +48,7 @@ def main() -> None:
     if arguments.measure:
         print(json.dumps(measure(**json.loads(arguments.measure))))
         return
-    try:
-        figures = collect(arguments)
-    except InputError as error:
-        parser.exit(2, f"error: {' '.join(str(error).split())}\n")
+    figures = collect(arguments)
     text = report(figures)
     if arguments.output is None:
         print(text)

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ending import documented_ending
 from experiments import (
     Figures,
     Job,
@@ -46,6 +47,7 @@ BREAKDOWN = {
 }
 
 
+@documented_ending()
 def main() -> None:
     """Run what is missing, then print and write the tables."""
     parser = argparse.ArgumentParser(
@@ -68,30 +70,27 @@ def main() -> None:
         parser.error("--steps must be positive: the online map is a row in any case")
     figures: dict[str, dict[str, Figures]] = {}
     breakdown: dict[str, Figures] = {}
-    try:
-        common = command_line(arguments.set)
-        jobs = {
-            (scene, file): [
-                refined_job(scene, file, arguments.output / scene, steps, common)
-                for steps in dict.fromkeys(arguments.steps)
-            ]
-            for scene, file in named_scenes(arguments.scenes).items()
-        }
-        for (scene, file), of_scene in jobs.items():  # before the first of them runs for hours
-            for job in of_scene:
-                job.check()
-            if not arguments.no_offline:
-                offline_job(scene, file, arguments.output / scene, 1, common).check()
-        for (scene, file), of_scene in jobs.items():
-            runs = execute(of_scene, arguments.fresh)
-            figures[scene] = online_rows(runs, [job.check()["refine"]["steps"] for job in of_scene])
-            breakdown[scene] = time_breakdown(runs[0])
-            if not arguments.no_offline:
-                renders = counts(runs[0], "refined")["view_renders"]
-                job = offline_job(scene, file, arguments.output / scene, renders, common)
-                figures[scene][OFFLINE] = offline_row(execute([job], arguments.fresh)[0])
-    except InputError as error:
-        parser.exit(2, f"error: {error}\n")
+    common = command_line(arguments.set)
+    jobs = {
+        (scene, file): [
+            refined_job(scene, file, arguments.output / scene, steps, common)
+            for steps in dict.fromkeys(arguments.steps)
+        ]
+        for scene, file in named_scenes(arguments.scenes).items()
+    }
+    for (scene, file), of_scene in jobs.items():  # before the first of them runs for hours
+        for job in of_scene:
+            job.check()
+        if not arguments.no_offline:
+            offline_job(scene, file, arguments.output / scene, 1, common).check()
+    for (scene, file), of_scene in jobs.items():
+        runs = execute(of_scene, arguments.fresh)
+        figures[scene] = online_rows(runs, [job.check()["refine"]["steps"] for job in of_scene])
+        breakdown[scene] = time_breakdown(runs[0])
+        if not arguments.no_offline:
+            renders = counts(runs[0], "refined")["view_renders"]
+            job = offline_job(scene, file, arguments.output / scene, renders, common)
+            figures[scene][OFFLINE] = offline_row(execute([job], arguments.fresh)[0])
     text = report(figures, breakdown)
     write_report(arguments.output, "comparison", text, {"quality": figures, "breakdown_percent": breakdown})
 

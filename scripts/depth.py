@@ -15,13 +15,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from ending import documented_ending
 from numpy.typing import NDArray
 
 from fields.backend import initialise
 from fields.camera import PinholeCamera
 from fields.tracked_frame import TrackedFrame
 from modp_ti.config import load_scene
-from modp_ti.errors import InputError
 from modp_ti.trackers import open_tracker
 from pipelines.depth import DepthEstimate, DepthEstimator, FusedDepth, GaussianProcessDepth
 from pipelines.mapping import OnlineMapper
@@ -76,6 +76,7 @@ def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
     return ratio[np.isfinite(ratio)]
 
 
+@documented_ending()
 def main() -> None:
     """Map, compare, print."""
     parser = argparse.ArgumentParser(
@@ -95,12 +96,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=10**9, help="map only so many")
     parser.add_argument("--set", action="append", default=[], help="override a setting, key=value")
     arguments = parser.parse_args()
-    try:
-        config = load_scene(arguments.scene, arguments.set)
-        initialise(config.device, config.threads, config.seed)
-        frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
-    except InputError as error:
-        parser.exit(2, f"error: {error}\n")
+    config = load_scene(arguments.scene, arguments.set)
+    initialise(config.device, config.threads, config.seed)
+    frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
     mapper = OnlineMapper(config.mapping, frames[0].camera.width, frames[0].camera.height, config.seed)
     constant = GaussianProcessDepth(config.mapping.depth, np.random.default_rng(config.seed))
     mapper.depth = recorder = Recorder(mapper.depth, constant)

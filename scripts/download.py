@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
+from ending import documented_ending
+
 TUM = "https://cvg.cit.tum.de/rgbd/dataset"
 REPLICA = "https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip"
 REPLICA_SCENES = ("office0", "office1", "office2", "office3", "office4", "room0", "room1", "room2")
@@ -242,6 +244,7 @@ def fetch(name: str, folder: Path, say: Callable[[str], None], sequences: dict[s
     return target
 
 
+@documented_ending(DownloadError)
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(
@@ -259,11 +262,8 @@ def main() -> None:
     unknown = [name for name in arguments.names if name not in SEQUENCES]
     if unknown:
         parser.error(f"{unknown[0]}: no such sequence; there are {', '.join(SEQUENCES)}")
-    try:
-        for name in arguments.names:
-            fetch(name, arguments.output, lambda line: print(line, flush=True))
-    except DownloadError as error:
-        parser.exit(2, f"error: {error}\n")
+    for name in arguments.names:
+        fetch(name, arguments.output, lambda line: print(line, flush=True))
 
 
 if __name__ == "__main__":

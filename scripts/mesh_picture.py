@@ -11,9 +11,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from ending import documented_ending
 from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
+from modp_ti.errors import InputError
+from modp_ti.exports.mesh import read_mesh
 from modp_ti.exports.open3d_io import open3d
 from modp_ti.playback.finished_run import open_run
 
@@ -43,6 +46,7 @@ def pictures(mesh, camera: PinholeCamera, T_camera_world: NDArray) -> tuple[NDAr
     return coloured, grey
 
 
+@documented_ending()
 def main() -> None:
     """Draw both side by side."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -55,17 +59,15 @@ def main() -> None:
     arguments = parser.parse_args()
     run = open_run(arguments.out)
     if not 0 <= arguments.frame < len(run):
-        parser.error(f"--frame {arguments.frame}: the run has frames 0 to {len(run) - 1}")
-    mesh = open3d().io.read_triangle_mesh(str(arguments.mesh or run.folder / "mesh.ply"))
-    if not len(mesh.triangles):
-        parser.error(f"{arguments.mesh or run.folder / 'mesh.ply'}: no mesh; modp-ti export OUT --format mesh makes it")
+        raise InputError(f"--frame {arguments.frame}: the run has frames 0 to {len(run) - 1}")
+    mesh = read_mesh(arguments.mesh or run.folder / "mesh.ply")
     camera = run.cameras[arguments.frame]
     camera = camera.resized(arguments.width, round(arguments.width * camera.height / camera.width))
     T = run.poses[arguments.frame].copy()
     T[2, 3] += arguments.back * run.record.scene_depth
     both = np.hstack(pictures(mesh, camera, T))
     if not cv2.imwrite(str(arguments.picture), np.rint(255 * both[..., ::-1]).astype(np.uint8)):
-        parser.error(f"{arguments.picture}: could not be written")
+        raise InputError(f"{arguments.picture}: could not be written")
 
 
 if __name__ == "__main__":

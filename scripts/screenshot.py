@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from browser import choose_mode, missing, open_page
+from ending import documented_ending
+
+from modp_ti.errors import InputError
 
 
-def main() -> int:
+@documented_ending()
+def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("url", help="what `modp-ti run --view` or `modp-ti view` printed")
@@ -19,8 +22,7 @@ def main() -> int:
     arguments = parser.parse_args()
     lacking = missing()
     if lacking:
-        print(f"error: {lacking}", file=sys.stderr)
-        return 2
+        raise InputError(lacking)
     with open_page(arguments.url) as page:
         if arguments.until:
             page.get_by_text(arguments.until).first.wait_for()
@@ -28,8 +30,7 @@ def main() -> int:
             choose_mode(page, arguments.mode)
         page.wait_for_timeout(1000 * arguments.wait)
         page.screenshot(path=arguments.file)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

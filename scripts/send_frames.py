@@ -235,13 +235,11 @@ def main() -> None:
     parser.add_argument("--wait", type=float, default=60.0, help="seconds in which the run may still start to listen")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override of the scene file")
     arguments = parser.parse_args()
-    from modp_ti.errors import InputError
+    from ending import documented_ending  # here: `Sender` is used without the rest, too
 
-    try:
+    with documented_ending(DoorError):
         taken = play(arguments.scene, arguments.set, arguments.to, arguments.wait, arguments.late, arguments.rate)
-    except (DoorError, InputError) as error:
-        parser.exit(2, f"error: {error}\n")
-    print(f"{taken} frames taken")
+        print(f"{taken} frames taken")
 
 
 if __name__ == "__main__":

@@ -77,6 +77,8 @@ def write_transforms(
     if held_out:
         tested = {files[index] for index in held_out}
         data["train_filenames"] = [file for file in files if file not in tested]
+        # The same frames twice: nerfstudio looks at `val` while it trains and at `test` when it evaluates, and where
+        # one split is listed it refuses a set without the others.
         data["val_filenames"] = data["test_filenames"] = [file for file in files if file in tested]
     data["frames"] = frames
     (folder / "transforms.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

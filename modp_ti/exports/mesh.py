@@ -16,9 +16,18 @@ from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
 from modp_ti.exports.glb import write_glb
 from modp_ti.exports.open3d_io import open3d, written_aside
-from pipelines.rendering import RenderedView
 
-__all__ = ["MESH_SUFFIXES", "SurfaceView", "fuse", "surface_depth", "without_floating_parts", "write_mesh"]
+__all__ = [
+    "LEAST_OPACITY",
+    "MESH_SUFFIXES",
+    "SurfaceView",
+    "extracted",
+    "fused",
+    "read_mesh",
+    "without_edges",
+    "without_floating_parts",
+    "write_mesh",
+]
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 # The distance is kept up to this many voxels before and behind the surface.
@@ -46,17 +55,16 @@ class SurfaceView:
     colour: NDArray[np.float32]
 
 
-def surface_depth(view: RenderedView) -> NDArray[np.float32]:
-    """Depth (H, W) of a rendered view where it is that of a surface, 0 elsewhere."""
-    z = view.expected_depth(LEAST_OPACITY).astype(np.float32)
+def without_edges(z: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth (H, W), 0 where unknown, without the pixels at the edges of things."""
     padded = np.pad(z, 1, mode="edge")
     across = np.minimum(np.abs(z - padded[1:-1, :-2]), np.abs(z - padded[1:-1, 2:]))
     down = np.minimum(np.abs(z - padded[:-2, 1:-1]), np.abs(z - padded[2:, 1:-1]))
     return np.where(np.maximum(across, down) <= LARGEST_STEP * z, z, 0).astype(np.float32)
 
 
-def fuse(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object:
-    """The surface (an Open3D TriangleMesh) with colours, in voxels of edge `voxel`, of what is nearer than `farthest`.
+def fused(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object:
+    """The signed distance (an Open3D VoxelBlockGrid) in voxels of edge `voxel` of what is nearer than `farthest`.
 
     Both in scene units. Raises InputError where the views show no surface.
     """
@@ -80,6 +88,12 @@ def fuse(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object:
         grid.integrate(blocks, depth, colour, K, K, T, 1.0, farthest, TRUNCATION)
     if grid.hashmap().size() == 0:
         raise InputError("the map shows no surface: nowhere is it opaque")
+    return grid
+
+
+def extracted(grid: object) -> object:
+    """The surface (an Open3D TriangleMesh) with colours. Raises InputError where nowhere enough views agree on one."""
+    o3d = open3d()
     mesh = grid.extract_triangle_mesh(LEAST_VIEWS).to_legacy()
     if len(mesh.triangles) == 0:
         raise InputError(f"no {LEAST_VIEWS:.0f} frames agree on a surface; try larger voxels (--voxel)")
@@ -110,3 +124,15 @@ def write_mesh(path: Path, mesh: object) -> None:
     with written_aside(path) as partial:
         if not o3d.io.write_triangle_mesh(str(partial), mesh):
             raise OSError(None, "Open3D could not write the mesh")
+
+
+def read_mesh(path: Path) -> object:
+    """An Open3D TriangleMesh from a file. Raises InputError where there is none."""
+    o3d = open3d()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; modp-ti export OUT --format mesh makes a mesh")
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(str(path))
+    if len(mesh.triangles) == 0:
+        raise InputError(f"{path}: holds no triangle; modp-ti export OUT --format mesh makes a mesh")
+    return mesh

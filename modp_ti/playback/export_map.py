@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.errors import InputError
 from modp_ti.exports.compressed_ply import write_compressed_ply
 from modp_ti.exports.datasets import dataset_folder, rename_images, write_transforms
-from modp_ti.exports.mesh import (
-    MESH_SUFFIXES,
-    SurfaceView,
-    fuse,
-    surface_depth,
-    without_floating_parts,
-    write_mesh,
-)
+from modp_ti.exports.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
 from modp_ti.exports.points_ply import write_points
 from modp_ti.exports.spz import write_spz
 from modp_ti.exports.web_splat import write_web_splat
 from modp_ti.playback.film import is_video
 from modp_ti.playback.finished_run import FinishedRun
 from modp_ti.playback.flight import film, plan_flight
-from modp_ti.playback.map_renderer import MapRenderer, eight_bits, start_device
+from modp_ti.playback.map_renderer import start_device
 from modp_ti.playback.mapped_images import dataset_names, write_images
 from modp_ti.playback.plain_colours import with_plain_colours
+from modp_ti.playback.surface import surface_views
 from modp_ti.progress import ProgressLine
 
 __all__ = ["DEFAULT_NAMES", "export_map"]
@@ -45,8 +38,6 @@ SPLATS = {"spz": write_spz, "compressed-ply": write_compressed_ply}
 # Edge of the mesh's voxels in scene depths, and how far its surface reaches.
 VOXEL = 1 / 160
 FARTHEST = 4.0
-# Frames whose views are fused; of more, as many at equal steps.
-SURFACE_VIEWS = 300
 
 
 @dataclass(frozen=True)
@@ -106,28 +97,9 @@ def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
 
 def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     voxel = options.voxel or VOXEL * run.record.scene_depth
-    write_mesh(target, without_floating_parts(fuse(_surface(run, options.device, line), voxel, _farthest(run))))
-
-
-def _farthest(run: FinishedRun) -> float:
-    return FARTHEST * run.record.scene_depth
-
-
-def _surface(run: FinishedRun, device: str, line: ProgressLine) -> Iterator[SurfaceView]:
-    """What the frames that were mapped see of the map."""
-    with line.working("loading the map"):
-        gaussians = run.gaussians
-        start_device(device)
-    mapped = run.mapped
-    chosen = [
-        mapped[i * len(mapped) // min(len(mapped), SURFACE_VIEWS)] for i in range(min(len(mapped), SURFACE_VIEWS))
-    ]
-    cameras = [run.cameras[index] for index in chosen]
-    renderer = MapRenderer(gaussians, max(c.width for c in cameras), max(c.height for c in cameras), run.record.near)
-    views = list(zip(cameras, run.poses[chosen], strict=True))
-    for camera, T in line.through("fusing depth", views, len(views)):
-        view = renderer.view(camera, T)
-        yield SurfaceView(camera, T, surface_depth(view), eight_bits(view.colour) / 255.0)
+    grid = fused(surface_views(run, options.device, line), voxel, FARTHEST * run.record.scene_depth)
+    with line.working("extracting the surface"):
+        write_mesh(target, without_floating_parts(extracted(grid)))
 
 
 def _dataset(run: FinishedRun, target: Path, format: str, line: ProgressLine) -> None:

@@ -54,6 +54,12 @@ class FinishedRun:
         held_out = set(self.record.held_out)
         return [index for index in range(len(self)) if index not in held_out]
 
+    def spread(self, most: int) -> list[int]:
+        """Positions of the frames that were not held out: all, or of more than `most` as many at equal steps."""
+        mapped = self.mapped
+        count = min(len(mapped), most)
+        return [mapped[i * len(mapped) // count] for i in range(count)]
+
 
 def open_run(folder: Path) -> FinishedRun:
     """Read what a finished run left. Raises InputError where it is none, or not finished, or damaged."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
+from modp_ti.exports.exposure import read_exposures
 from modp_ti.exports.trajectory import read_trajectory
 from modp_ti.playback.camera_paths import orbit, smoothed
 from modp_ti.playback.film import depth_colours, is_video, require_writable, write_pictures, write_video
@@ -29,11 +30,15 @@ DEFAULT_FPS = 30.0
 
 @dataclass(frozen=True)
 class Flight:
-    """Poses T_camera_world (M, 4, 4), the camera at each, and pictures a second."""
+    """Poses T_camera_world (M, 4, 4), the camera at each, and pictures a second.
+
+    exposures: (A, b) (3, 4) at each, which makes A colour + b of the map's colours; None for the map's own.
+    """
 
     poses: NDArray[np.float64]
     cameras: list[PinholeCamera]
     frames_per_second: float
+    exposures: list[NDArray[np.float64]] | None = None
 
     def even(self) -> Flight:
         """With pictures of even width and height, as videos have them: the last row and column left out."""
@@ -41,7 +46,7 @@ class Flight:
             PinholeCamera(c.fx, c.fy, c.cx, c.cy, max(c.width // 2 * 2, 2), max(c.height // 2 * 2, 2))
             for c in self.cameras
         ]
-        return Flight(self.poses, cameras, self.frames_per_second)
+        return replace(self, cameras=cameras)
 
 
 def plan_flight(
@@ -52,13 +57,16 @@ def plan_flight(
     frames: int | None = None,
     fps: float | None = None,
     deviation: float = 5.0,
+    exposure: bool = False,
 ) -> Flight:
     """The flight along `path`: one of PATHS, or a trajectory file (TUM).
 
     size: (width, height); None for the recorded one. fov: horizontal, in degrees; None for the recorded one. frames:
-    pictures, of a smoothed path or an orbit. deviation: of the smoothing, in frames. Raises InputError for a path or
-    file that is none, and for frames where the path has its own.
+    pictures, of a smoothed path or an orbit. deviation: of the smoothing, in frames. exposure: each picture as its
+    frame was exposed, of the recorded path. Raises InputError for a path or file that is none, for frames where the
+    path has its own, and for exposures where none were estimated.
     """
+    exposures = _exposures(run, path) if exposure else None
     times = None
     if path == "smoothed":
         poses = smoothed(run.poses, frames or max(DEFAULT_FRAMES, len(run)), deviation)
@@ -77,7 +85,7 @@ def plan_flight(
         raise InputError(f"--path {path}: holds no pose")
     own = run.cameras if path == "recorded" else [run.cameras[run.record.keyframes[0]]] * len(poses)
     cameras = [_lens(camera, size, fov) for camera in own]
-    return Flight(poses, cameras, fps or _rate(times))
+    return Flight(poses, cameras, fps or _rate(times), exposures)
 
 
 def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: str, line: ProgressLine) -> None:
@@ -94,9 +102,11 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
         renderer = MapRenderer(gaussians, width, height, run.record.near)
 
     def views() -> Iterator[RenderedView]:
-        pairs = list(zip(flight.cameras, flight.poses, strict=True))
-        for camera, T in line.through("rendering", pairs, len(pairs)):
-            yield renderer.view(camera, T)
+        exposures = flight.exposures or [None] * len(flight.poses)
+        shots = list(zip(flight.cameras, flight.poses, exposures, strict=True))
+        for camera, T, exposure in line.through("rendering", shots, len(shots)):
+            view = renderer.view(camera, T)
+            yield view if exposure is None else replace(view, colour=view.colour @ exposure[:, :3].T + exposure[:, 3])
 
     if not is_video(output):
         write_pictures(output, views(), depth)
@@ -104,6 +114,18 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
     show: Callable[[RenderedView], NDArray[np.uint8]]
     show = (lambda v: depth_colours(v, run.record.scene_depth)) if depth else (lambda v: eight_bits(v.colour))
     write_video(output, (show(view) for view in views()), flight.frames_per_second)
+
+
+def _exposures(run: FinishedRun, path: str) -> list[NDArray[np.float64]]:
+    """The exposure of every recorded frame. Raises InputError where they are not known, or belong to another path."""
+    if path != "recorded":
+        raise InputError(f"--exposure is of the recorded frames: --path {path} has none of its own")
+    known = read_exposures(run.folder / "exposure.json")
+    if not known:
+        raise InputError(f"{run.folder}: no exposures were estimated (mapping.exposure.enabled): leave out --exposure")
+    if missing := [index for index in range(len(run)) if index not in known]:
+        raise InputError(f"{run.folder / 'exposure.json'}: frame {missing[0]} is missing")
+    return [known[index] for index in range(len(run))]
 
 
 def _lens(camera: PinholeCamera, size: tuple[int, int] | None, fov: float | None) -> PinholeCamera:

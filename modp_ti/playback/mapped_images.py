@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from modp_ti.config import load_scene
 from modp_ti.errors import InputError
@@ -12,7 +18,7 @@ from modp_ti.playback.finished_run import FinishedRun
 from modp_ti.progress import ProgressLine
 from modp_ti.trackers import close, open_tracker
 
-__all__ = ["dataset_names", "write_images"]
+__all__ = ["dataset_names", "grey_images", "write_images"]
 
 
 def dataset_names(run: FinishedRun) -> list[str]:
@@ -55,6 +61,23 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
             raise other
     finally:
         close(tracker)
+
+
+def grey_images(run: FinishedRun, positions: Sequence[int], line: ProgressLine) -> list[NDArray[np.uint8]]:
+    """The images (H, W) of some frames, in grey, from where `write_images` has them; it raises the same."""
+    names = dataset_names(run)
+    with TemporaryDirectory() as folder:
+        place = _kept(run)
+        if not place.is_dir():
+            write_images(run, Path(folder), line)
+            place = Path(folder) / "images"
+        images = []
+        for index in positions:
+            image = cv2.imread(str(place / names[index]), cv2.IMREAD_GRAYSCALE)
+            if image is None:
+                raise InputError(f"{place / names[index]}: the run's image is missing")
+            images.append(image)
+    return images
 
 
 def _kept(run: FinishedRun) -> Path:

@@ -1,6 +1,6 @@
 """`with_plain_colours`: a map whose colours lie in [0, 1] and do not depend on the direction, looking as it did."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import taichi as ti
@@ -17,9 +17,9 @@ __all__ = ["with_plain_colours"]
 
 # Views of the map that its plain form is optimised to show; of more frames, as many at equal steps.
 VIEWS = 60
-STEPS = 600
-# Adam's rates at the start and the factor at the end. Places and shapes stay, but for sizes, which give a little.
-RATES = LearningRates(position=0.0, log_scale=0.01, quaternion=0.0, opacity_logit=0.1, colour=0.04)
+STEPS = 900
+# Adam's rates at the start, positions' in scene depths, and the factor at the end.
+RATES = LearningRates(position=1e-4, log_scale=0.01, quaternion=0.002, opacity_logit=0.1, colour=0.04)
 DECAY = 0.05
 SSIM_WEIGHT = 0.2
 # Of the constant harmonic, where colours end.
@@ -29,11 +29,10 @@ LARGEST = 0.5 / SH_C0
 def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArray[np.float32]]:
     """The run's Gaussians (as `GaussianField.load` takes them), optimised under that constraint to render alike.
 
-    Where a Gaussian brighter than 1 lets light through, clipping makes it too dark. So colours, opacities and sizes are
-    fitted to the map's own pictures at the frames that were mapped. Taichi runs already.
+    Where a Gaussian brighter than 1 lets light through, clipping makes it too dark. So all of it is fitted to the map's
+    own pictures at the frames that were mapped. Taichi runs already.
     """
-    mapped = run.mapped
-    chosen = [mapped[i * len(mapped) // min(len(mapped), VIEWS)] for i in range(min(len(mapped), VIEWS))]
+    chosen = run.spread(VIEWS)
     cameras = [run.cameras[index] for index in chosen]
     maps = MapRenderer(run.gaussians, max(c.width for c in cameras), max(c.height for c in cameras), run.record.near)
     views = []
@@ -43,6 +42,7 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
     gaussians, renderer = maps.renderer.gaussians, maps.renderer
     constraint, adam, loss = PlainColours(gaussians), Adam(gaussians), photometric_loss(renderer.images)
     constraint.impose()
+    rates = asdict(replace(RATES, position=RATES.position * run.record.scene_depth))
     rng = np.random.default_rng(0)
     order: list[int] = []
     for step in line.through("fitting plain colours", range(STEPS), STEPS):
@@ -54,7 +54,7 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
         loss.backward(SSIM_WEIGHT)
         renderer.backward()
         decayed = DECAY ** (step / STEPS)
-        adam.step(LearningRates(**{name: decayed * rate for name, rate in asdict(RATES).items()}))
+        adam.step(LearningRates(**{name: decayed * rate for name, rate in rates.items()}))
         constraint.impose()
     return gaussians.to_numpy()
 

@@ -12,17 +12,21 @@ from modp_ti.synthetic.simulated_tracker import FRAMES, LOOP_FRAMES, SMALLEST, S
 
 if TYPE_CHECKING:
     from modp_ti.settings import SourceSettings, TrackerSettings
+    from modp_ti.synthetic.renderer import RoomRenderer
 
 __all__ = ["LightChange", "Loop", "SyntheticTracker", "TrackerNoise", "open_synthetic"]
 
 WIDTH, HEIGHT = 320, 240  # [px] at scale 1
 
 
-def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> SyntheticTracker:
+def open_synthetic(
+    source: SourceSettings, tracker: TrackerSettings, room: RoomRenderer | None = None
+) -> SyntheticTracker:
     """The demo sequence; with drift or correction the camera walks in a loop.
 
     Of `source`, scale, start, stop, step, holdout and fps count; of `tracker` exposure_change, drift and correction.
-    Raises InputError where the scale leaves no picture or the range no frames, and for masks or a vignette.
+    room: one that is built already. Raises InputError where the scale leaves no picture or the range no frames, and for
+    masks or a vignette.
     """
     if source.masks is not None or source.mask_colour is not None or source.vignette is not None:
         raise InputError("the demo room has neither masks nor a vignette: take source.masks, mask_colour, vignette out")
@@ -46,4 +50,5 @@ def open_synthetic(source: SourceSettings, tracker: TrackerSettings) -> Syntheti
         fps=source.fps,
         light=LightChange().scaled(tracker.exposure_change),
         loop=loop,
+        room=room,
     )

@@ -17,6 +17,7 @@ from plyfile import PlyData
 from typer.testing import CliRunner, Result
 
 from modp_ti.cli import app
+from modp_ti.exports.exposure import write_exposures
 from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory, write_trajectory
 from modp_ti.playback.finished_run import open_run
@@ -78,6 +79,30 @@ def test_the_recorded_path_shows_what_the_run_itself_showed(out: Path, tmp_path:
     for index, (_, render) in held_out_pairs(out).items():
         picture = cv2.imread(str(folder / f"{index:06d}.png"))[..., ::-1]
         np.testing.assert_array_equal(picture, render)
+
+
+def test_exposure_is_that_of_each_frame_where_it_is_asked_for(out: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(out, tmp_path / "run")
+    assert "no exposures were estimated" in failure("render", run, "--exposure", "-o", tmp_path / "none")
+    matrix = np.array([[0.5, 0.1, 0, 0.05], [0, 0.6, 0, 0.1], [0, 0, 0.7, 0.0]])
+    exposures = [matrix if index == 4 else np.eye(3, 4) for index in range(9)]
+    write_exposures(run / "exposure.json", range(9), [0.1 * index for index in range(9)], exposures, {1, 5})
+    assert "--path orbit has none" in failure("render", run, "--exposure", "--path", "orbit")
+    neutral, exposed = (
+        done("render", run, "-o", tmp_path / name, *option) for name, option in (("n", ()), ("e", ("--exposure",)))
+    )
+    for index in (3, 4):
+        before, after = (cv2.imread(str(f / f"{index:06d}.png"))[..., ::-1].astype(float) for f in (neutral, exposed))
+        expected = before @ exposures[index][:, :3].T + 255 * exposures[index][:, 3]
+        unclipped = (before > 0).all(axis=2) & (before < 255).all(axis=2)
+        assert unclipped.mean() > 0.5
+        assert np.abs(after - expected)[unclipped].max() <= 1.1
+
+
+def test_frames_are_spread_evenly_over_those_that_were_mapped(out: Path) -> None:
+    run = open_run(out)
+    assert run.mapped == run.spread(6) == run.spread(100) == [1, 2, 3, 5, 6, 7]
+    assert run.spread(3) == [1, 3, 6]
 
 
 def test_depth_is_that_of_the_room(out: Path, tmp_path: Path) -> None:
@@ -199,6 +224,17 @@ def test_a_mesh_lies_in_the_room(out: Path, tmp_path: Path) -> None:
     assert np.asarray(mesh.vertex_colors).std() > 0.05
 
 
+def test_a_mesh_is_made_of_the_map_s_own_pictures_where_the_images_are_gone(out: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(out, tmp_path / "run")
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(config.replace("  stop: 9", "  stop: 8"))
+    result = invoke("export", run, "--format", "mesh")
+    assert result.exit_code == 0
+    assert "note: matching the map's own pictures, for want of the images: " in result.stderr
+    assert "the source no longer gives the frames that were mapped" in result.stderr
+    assert len(o3d.io.read_triangle_mesh(str(run / "mesh.ply")).triangles) > 1000
+
+
 @pytest.mark.parametrize("kept", [False, True])
 def test_a_colmap_data_set_has_model_and_images(out: Path, tmp_path: Path, kept: bool) -> None:
     """Whether the run kept its images or they are read again from its source."""
@@ -228,6 +264,8 @@ def test_a_nerfstudio_data_set_is_read_by_our_own_reader_and_has_its_split(out: 
     data = json.loads((folder / "transforms.json").read_text())
     assert data["camera_model"] == "OPENCV" and (data["w"], data["h"]) == (80, 60)
     assert len(data["test_filenames"]) == 3 and len(data["train_filenames"]) == 6
+    assert data["val_filenames"] == data["test_filenames"]  # nerfstudio refuses a set that lists two splits of three
+    assert not set(data["train_filenames"]) & set(data["test_filenames"])
     assert PlyData.read(folder / data["ply_file_path"])["vertex"].count > 100
     source, tracker = SourceSettings(path=folder / "images"), TrackerSettings(kind="transforms", path=folder)
     frames = list(open_transforms(source, tracker))

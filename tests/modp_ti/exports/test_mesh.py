@@ -14,10 +14,17 @@ from mesh_accuracy import precision_recall, true_surface
 
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
-from modp_ti.exports.mesh import SurfaceView, fuse, surface_depth, without_floating_parts, write_mesh
+from modp_ti.exports.mesh import (
+    SurfaceView,
+    extracted,
+    fused,
+    read_mesh,
+    without_edges,
+    without_floating_parts,
+    write_mesh,
+)
 from modp_ti.synthetic import SyntheticTracker
 from modp_ti.synthetic.renderer import RoomRenderer
-from pipelines.rendering import RenderedView
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
 COLOUR = np.float32([0.25, 0.5, 1.0])
@@ -41,7 +48,7 @@ def plane_views(normal: np.ndarray, offset: float, count: int = 6) -> Iterator[S
 def test_a_slanted_plane_is_fused_where_it_is() -> None:
     """No half pixel is lost: seen aslant, it would shift the plane by 20 mm at its far end."""
     normal = np.array([0.8, 0.0, -0.6])
-    mesh = fuse(plane_views(normal, -1.2), voxel=0.02, farthest=4.0)
+    mesh = extracted(fused(plane_views(normal, -1.2), voxel=0.02, farthest=4.0))
     vertices = np.asarray(mesh.vertices)
     assert len(vertices) > 10_000
     for near, far in ((1.2, 1.8), (1.8, 2.5), (2.5, 3.5)):
@@ -59,22 +66,21 @@ def test_the_room_is_fused_to_its_true_surface() -> None:
     poses = tracker.ground_truth()
     depths = [tracker.depth(index) for index in range(len(tracker))]
     grey = np.full((120, 160, 3), 0.5, np.float32)
-    seen = [surface_depth(RenderedView(grey, z, (z > 0).astype(np.float32))) for z in depths]
+    seen = [without_edges(z) for z in depths]
     views = [SurfaceView(tracker.camera, T, z, grey) for T, z in zip(poses, seen, strict=True)]
-    mesh = without_floating_parts(fuse(views, voxel=0.025, farthest=10.0))
+    mesh = without_floating_parts(extracted(fused(views, voxel=0.025, farthest=10.0)))
     surface = true_surface(tracker.camera, poses, depths)
     precision, recall = precision_recall(np.asarray(mesh.vertices), surface, 0.01 * 4.8)
     assert precision > 0.9
     assert recall > 0.9
 
 
-def test_depth_is_left_out_where_the_map_is_thin_and_at_the_edges_of_things() -> None:
+def test_depth_is_left_out_at_the_edges_of_things() -> None:
     z = np.full((20, 20), 2.0, np.float32)
     z[:, 10:] = 3.0
     z[:, 9] = 2.6  # what compositing makes of an edge
-    opacity = np.ones((20, 20), np.float32)
-    opacity[15:] = 0.3
-    depth = surface_depth(RenderedView(np.zeros((20, 20, 3), np.float32), z * opacity, opacity))
+    z[15:] = 0
+    depth = without_edges(z)
     assert (depth[:15, :9] == 2.0).all() and (depth[:15, 10:] == 3.0).all()
     assert (depth[:, 9] == 0).all()
     assert (depth[15:] == 0).all()
@@ -94,7 +100,15 @@ def test_small_parts_on_their_own_go_and_large_ones_stay() -> None:
 def test_views_of_nothing_are_refused() -> None:
     nothing = SurfaceView(CAMERA, np.eye(4), np.zeros((120, 160), np.float32), np.zeros((120, 160, 3), np.float32))
     with pytest.raises(InputError, match="shows no surface"):
-        fuse([nothing], voxel=0.02, farthest=4.0)
+        fused([nothing], voxel=0.02, farthest=4.0)
+
+
+def test_a_file_without_triangles_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file; modp-ti export OUT --format mesh makes a mesh"):
+        read_mesh(tmp_path / "none.ply")
+    (tmp_path / "damaged.ply").write_text("ply\n")
+    with pytest.raises(InputError, match="holds no triangle"):
+        read_mesh(tmp_path / "damaged.ply")
 
 
 @pytest.fixture(scope="module")
