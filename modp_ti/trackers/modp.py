@@ -166,7 +166,8 @@ def _read_cloud(path: Path) -> NDArray[np.float64]:
         raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
     if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
         raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
-    xyz = np.array(xyz[:, :3], dtype=np.float64)
+    with np.errstate(all="ignore"):  # a NaN that signals says so when it becomes a float64
+        xyz = np.array(xyz[:, :3], dtype=np.float64)
     bad = np.flatnonzero(~(np.abs(xyz) <= LARGEST).all(axis=1))
     if len(bad):
         raise InputError(f"{path}: point {bad[0]} holds NaN or infinite numbers, or such beyond {LARGEST:g}")

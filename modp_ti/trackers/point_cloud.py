@@ -49,8 +49,9 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
             order = {"binary_little_endian": "<", "binary_big_endian": ">"}[header.form]
             record = np.dtype([(name, order + kind) for name, kind in header.properties])
             vertices = np.frombuffer(data, dtype=record, count=header.count, offset=header.start)
-            for column, axis in enumerate("xyz"):
-                xyz[:, column] = vertices[axis]
+            with np.errstate(all="ignore"):  # a NaN that signals says so when it becomes a float64
+                for column, axis in enumerate("xyz"):
+                    xyz[:, column] = vertices[axis]
     except (ValueError, UnicodeDecodeError):
         raise InputError(f"{path}: the PLY file is damaged or cut off") from None
     return xyz[(np.abs(xyz) <= FARTHEST).all(axis=1)]
