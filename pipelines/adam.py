@@ -29,7 +29,7 @@ class LearningRates:
 
 
 @ti.func
-def _size(x):
+def _bits(x):
     """The bits of |x| as float32, which are in the order of the numbers, infinity and NaN above all.
 
     A comparison of the numbers would be left to a compiler that is told that there is no NaN.
@@ -52,9 +52,9 @@ class Adam:
     1 - 0.1 B and 1 - 0.001 B, eps / sqrt(B). A Gaussian that no view saw keeps its value, moments and count, so that
     looking elsewhere does not move it.
 
-    Two guards look at every Gaussian on the way. One whose gradient has a component that is no number, or beyond
-    1e18, keeps value, moments and count as well. One that comes out larger than it may be is made transparent, so that
-    the next pruning removes it. Both are counted, see `GaussianField.take_caught`.
+    Two guards look at every Gaussian on the way. One whose gradient has a component that is no number, or whose
+    components sum to more than 1e18, keeps value, moments and count as well. One that comes out larger than it may be
+    is made transparent, so that the next pruning removes it. Both are counted, see `GaussianField.take_caught`.
     """
 
     def __init__(self, gaussians: GaussianField) -> None:
@@ -110,7 +110,7 @@ class Adam:
             sound = False
             if self.gaussians.touched[i] != 0:
                 self.gaussians.touched[i] = 0
-                sound = self._worst(i, active) < BOUND
+                sound = self._magnitude(i, active) < BOUND
                 if not sound:
                     ti.atomic_add(self.gaussians._caught[0], 1)
                     self._forget_gradient(i)
@@ -119,62 +119,69 @@ class Adam:
                 t = ti.cast(self.gaussians.steps[i], ti.f32)
                 betas = ti.Vector([beta1, beta2])
                 corrections = ti.Vector([_one_over_complement(t * log_beta1), _one_over_complement(t * log_beta2)])
-                for c in ti.static(range(3)):
-                    self.gaussians.position[i][c] = self._update(
-                        self.gaussians.position[i][c], self.gaussians.position.grad[i][c],
-                        self.gaussians.position_m[i][c], self.gaussians.position_v[i][c],
-                        lr_position, betas, corrections, eps,
-                    )  # fmt: skip
-                    self.gaussians.position.grad[i][c] = 0.0
-                    self.gaussians.log_scale[i][c] = self._update(
-                        self.gaussians.log_scale[i][c], self.gaussians.log_scale.grad[i][c],
-                        self.gaussians.log_scale_m[i][c], self.gaussians.log_scale_v[i][c],
-                        lr_log_scale, betas, corrections, eps,
-                    )  # fmt: skip
-                    self.gaussians.log_scale.grad[i][c] = 0.0
-                for c in ti.static(range(4)):
-                    self.gaussians.quaternion[i][c] = self._update(
-                        self.gaussians.quaternion[i][c], self.gaussians.quaternion.grad[i][c],
-                        self.gaussians.quaternion_m[i][c], self.gaussians.quaternion_v[i][c],
-                        lr_quaternion, betas, corrections, eps,
-                    )  # fmt: skip
-                    self.gaussians.quaternion.grad[i][c] = 0.0
-                self.gaussians.opacity_logit[i] = self._update(
-                    self.gaussians.opacity_logit[i], self.gaussians.opacity_logit.grad[i],
-                    self.gaussians.opacity_logit_m[i], self.gaussians.opacity_logit_v[i],
-                    lr_opacity, betas, corrections, eps,
-                )  # fmt: skip
-                self.gaussians.opacity_logit.grad[i] = 0.0
+                # Whole vectors: Taichi takes its time with every line that it unrolls.
+                g = self.gaussians
+                g.position[i] = self._update(
+                    g.position[i],
+                    g.position.grad[i],
+                    g.position_m[i],
+                    g.position_v[i],
+                    lr_position,
+                    betas,
+                    corrections,
+                    eps,
+                )
+                g.log_scale[i] = self._update(
+                    g.log_scale[i],
+                    g.log_scale.grad[i],
+                    g.log_scale_m[i],
+                    g.log_scale_v[i],
+                    lr_log_scale,
+                    betas,
+                    corrections,
+                    eps,
+                )
+                g.quaternion[i] = self._update(
+                    g.quaternion[i],
+                    g.quaternion.grad[i],
+                    g.quaternion_m[i],
+                    g.quaternion_v[i],
+                    lr_quaternion,
+                    betas,
+                    corrections,
+                    eps,
+                )
+                g.opacity_logit[i] = self._update(
+                    g.opacity_logit[i],
+                    g.opacity_logit.grad[i],
+                    g.opacity_logit_m[i],
+                    g.opacity_logit_v[i],
+                    lr_opacity,
+                    betas,
+                    corrections,
+                    eps,
+                )
                 for k in range(active):
                     # The directional part moves twenty times slower, as in 3DGS.
                     lr = ti.select(k == 0, lr_colour, lr_colour / 20.0)
-                    for c in ti.static(range(3)):
-                        self.gaussians.sh[i, k][c] = self._update(
-                            self.gaussians.sh[i, k][c], self.gaussians.sh.grad[i, k][c],
-                            self.gaussians.sh_m[i, k][c], self.gaussians.sh_v[i, k][c],
-                            lr, betas, corrections, eps,
-                        )  # fmt: skip
-                        self.gaussians.sh.grad[i, k][c] = 0.0
-                for k in range(active, self.gaussians.sh_count):
-                    self.gaussians.sh.grad[i, k].fill(0.0)
+                    g.sh[i, k] = self._update(
+                        g.sh[i, k], g.sh.grad[i, k], g.sh_m[i, k], g.sh_v[i, k], lr, betas, corrections, eps
+                    )
+                self._forget_gradient(i)
                 if self.gaussians.log_scale[i].max() > largest:
                     self.gaussians.log_scale[i] = ti.min(self.gaussians.log_scale[i], largest)
                     self.gaussians.opacity_logit[i] = TRANSPARENT
                     ti.atomic_add(self.gaussians._caught[1], 1)
 
     @ti.func
-    def _worst(self, i, active):
-        """The largest component of a Gaussian's gradient, as bits: see `_size`."""
+    def _magnitude(self, i, active):
+        """The sum of the magnitudes of a Gaussian's gradient, as bits: see `_bits`."""
         g = self.gaussians
-        worst = _size(g.opacity_logit.grad[i])
-        for c in ti.static(range(3)):
-            worst = ti.max(worst, _size(g.position.grad[i][c]), _size(g.log_scale.grad[i][c]))
-        for c in ti.static(range(4)):
-            worst = ti.max(worst, _size(g.quaternion.grad[i][c]))
+        total = ti.abs(g.opacity_logit.grad[i]) + ti.abs(g.position.grad[i]).sum() + ti.abs(g.log_scale.grad[i]).sum()
+        total += ti.abs(g.quaternion.grad[i]).sum()
         for k in range(active):
-            for c in ti.static(range(3)):
-                worst = ti.max(worst, _size(g.sh.grad[i, k][c]))
-        return worst
+            total += ti.abs(g.sh.grad[i, k]).sum()
+        return _bits(total)
 
     @ti.func
     def _forget_gradient(self, i):

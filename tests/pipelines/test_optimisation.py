@@ -110,7 +110,7 @@ def test_a_step_follows_the_mean_gradient_of_its_views(
 ) -> None:
     gradients = []
 
-    def instead_of_adam(*_: object) -> None:
+    def instead_of_adam(*_: object, **__: object) -> None:
         gradients.append(optimiser.gaussians.gradients_to_numpy())
         optimiser.gaussians.load(optimiser.gaussians.to_numpy())  # back to no gradients
 
@@ -128,7 +128,7 @@ def test_the_views_of_a_step_are_shared_out_among_batches(
     optimiser: MapOptimiser, store: KeyframeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batches = []
-    monkeypatch.setattr(optimiser.adam, "step", lambda rates, size: batches.append(size))
+    monkeypatch.setattr(optimiser.adam, "step", lambda rates, size, **__: batches.append(size))
     monkeypatch.setattr(optimiser, "settings", MappingSettings(optimise={"batch": 2}))
     optimiser.step(store, [0, 1, 2, 0, 1], optimiser.rates(1.0), pose_rate=0.0)
     assert batches == [2, 2, 1]
