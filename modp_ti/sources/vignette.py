@@ -30,7 +30,7 @@ def read_vignette(path: Path) -> NDArray[np.float32]:
         raise InputError(f"{path}: the vignette cannot be opened: {error.strerror} (source.vignette)") from None
     reason = why_undecodable(data)
     if data and reason is not None:
-        raise InputError(f"{path}: the vignette is unreadable: {reason} (source.vignette)")
+        raise InputError(f"{path}: the vignette is no image that can be used: {reason} (source.vignette)")
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:  # silent: the one line that the user gets is ours

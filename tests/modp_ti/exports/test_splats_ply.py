@@ -51,14 +51,14 @@ def test_a_file_cut_short_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "splats.ply"
     write_splats(path, splats(9, 1))
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InputError, match=r"splats\.ply: cut short"):
+    with pytest.raises(InputError, match=r"splats\.ply: the PLY file is damaged or cut off"):
         read_splats(path)
 
 
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (b"no ply at all", "not a binary little-endian PLY"),
+        (b"no ply at all", "not a PLY file"),
         (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "not a binary little-endian PLY"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n", "y does not fit"),
     ],
