@@ -59,9 +59,10 @@ def position(file: Path) -> tuple[int, int]:
 
 
 def wait_for(process: subprocess.Popen[str], file: Path, least: tuple[int, int]) -> None:
-    while process.poll() is None and not all(
-        there >= wanted for there, wanted in zip(position(file), least, strict=True)
-    ):
+    def is_there() -> bool:
+        return all(now >= wanted for now, wanted in zip(position(file), least, strict=True))
+
+    while process.poll() is None and not is_there():
         time.sleep(0.01)
     assert process.poll() is None, process.communicate()
 
