@@ -1,8 +1,9 @@
 """Faults, made on purpose, and what became of the run: tables for docs/reliability.md.
 
-kills   a small run is killed at random moments and resumed; its map must be that of a run in peace, byte for byte
-stream  a recording with a tenth of its frames spoilt, beside the same one in order
-soak    a long recording, and the memory that the process holds meanwhile
+kills      a small run is killed at random moments and resumed; its map must be that of a run in peace, byte for byte
+stream     a recording with a tenth of its frames spoilt, beside the same one in order
+soak       a long recording, and the memory that the process holds meanwhile
+malformed  inputs of every reader, spoilt in hundreds of ways: one clear line each
 """
 
 from __future__ import annotations
@@ -42,7 +43,14 @@ def soak(arguments: argparse.Namespace, say: Say) -> str:
     return soak_table(run_soak(arguments.frames, say))
 
 
-PARTS: dict[str, Part] = {"kills": kills, "stream": stream, "soak": soak}
+def malformed(arguments: argparse.Namespace, say: Say) -> str:
+    """Table of the malformed inputs."""
+    from fault_injection.malformed import malformed_inputs, markdown
+
+    return markdown(list(malformed_inputs()))
+
+
+PARTS: dict[str, Part] = {"kills": kills, "stream": stream, "soak": soak, "malformed": malformed}
 
 
 def main() -> None:
