@@ -2,13 +2,8 @@
 
 A map is optimised for colour: where there is little texture, its Gaussians stay at the depth that they were given,
 whole regions of them some percent off, and all views agree on it. The images hold the parallax all the same; so do,
-<<<<<<< HEAD
-less sharp, the pictures that the map renders. Around the depth that the map shows, inverse depths are swept [Collins
-1996]: every neighbour's image is carried over and compared (ZNCC); sums of matching cost along rows and columns decide
-=======
 less sharp, the map's own pictures. Around the depth that the map shows, inverse depths are swept [Collins 1996]:
 every neighbour's image is carried over and compared (ZNCC); sums of matching cost along rows and columns decide
->>>>>>> six
 [Hirschmueller 2008], and the map where the images say nothing.
 """
 
