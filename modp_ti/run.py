@@ -26,7 +26,7 @@ EXAMPLES = examples(
     "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
     "modp-ti run scene.yaml --set snapshot_every=50",
-    "modp-ti run --resume OUT   (goes on after a crash or Ctrl-C; OUT: the output folder)",
+    "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
     "modp-ti run scene.yaml --quiet --json > result.json",
 )
 

@@ -362,6 +362,7 @@ class OnlineMapper:
             self.renderer.images.colour_to_numpy()
             self.gaussians.to_numpy()
             self.gaussians.anchors()
+            self.gaussians.take_caught()
             if self.settings.corrections.enabled:
                 self.motion.move(np.eye(4)[None], np.eye(self.gaussians.sh_count)[None])
                 if self.voxels is not None:

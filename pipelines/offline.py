@@ -208,6 +208,7 @@ class OfflineMapper:
             self.density.statistics.clear()
             self.renderer.images.clip_colour()
             self.renderer.images.colour_to_numpy()
+            self.gaussians.take_caught()
             self.gaussians.to_numpy()
             self.gaussians.remove(np.zeros(4, dtype=bool))
             self.renderer.view_renders = 0

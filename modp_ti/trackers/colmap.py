@@ -42,6 +42,8 @@ def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTra
     selected = set(images.selected(source.start, source.stop, source.step))
     folder = _model_folder(source.path, tracker.path)
     model = read_colmap_model(folder)
+    if not model.images:
+        raise InputError(f"{folder}: the COLMAP model holds no image")
 
     posed: dict[str, pycolmap.Image] = {}
     absent: list[str] = []

@@ -31,7 +31,7 @@ MAX_TEXT_LINE = 1 << 24
 
 
 def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
-    """The model in a folder, binary or text. Raises InputError for one that is incomplete, damaged or empty."""
+    """The model in a folder, binary or text. Raises InputError for one that is incomplete or damaged."""
     import pycolmap
 
     if not any(all((folder / f"{stem}{suffix}").exists() for stem in STEMS) for suffix in (".bin", ".txt")):
@@ -48,8 +48,6 @@ def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     except Exception as error:  # pycolmap throws what its C++ does: ValueError, IndexError, MemoryError, RuntimeError
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{folder}: not a readable COLMAP model ({reason}); export it again") from None
-    if not model.images:
-        raise InputError(f"{folder}: the COLMAP model holds no image")
     return model
 
 

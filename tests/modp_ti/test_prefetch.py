@@ -116,7 +116,7 @@ for prefetch in (0, 3):
         errors.append((type(error).__name__, str(error)))
     assert not [t for t in threading.enumerate() if t.name == "frames ahead"]
 assert len(errors) == 2 and errors[0] == errors[1], errors
-assert errors[0][0] == "InputError" and "view11.png" in errors[0][1], errors
+assert errors[0][0] == "UnreadableImageError" and "view11.png" in errors[0][1], errors
 """
 
 

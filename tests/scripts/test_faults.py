@@ -58,7 +58,7 @@ def test_the_recording_is_one_that_a_run_takes(tmp_path: Path) -> None:
     frames = list(open_tracker(load_scene(tmp_path / "scene.yaml")))
     assert [frame.index for frame in frames] == list(range(12))
     assert frames[0].image.shape == (48, 64, 3) and frames[8].held_out
-    assert min(len(frame.points) for frame in frames) > 50
+    assert min(len(frame.points) for frame in frames) > 10  # what a keyframe needs
     load_scene_text = tmp_path / "kills.yaml"
     load_scene_text.write_text(KILLS_SCENE)
     assert load_scene(load_scene_text).can_be_resumed

@@ -75,7 +75,7 @@ def test_damaged_images_are_left_out_each_time_and_told_of_once(folder: Path, ho
             np.testing.assert_allclose(frame.T_camera_world, POSES[i], atol=1e-12)
     assert [note for note in tracker.notes if "damaged" in note] == [
         f"2 of {COUNT} images are damaged: left out (the first: {folder / 'images' / '0006.png'}: unreadable image: "
-        f"{'the file is cut off' if how == 'cut off' else 'it is damaged or no image'})"
+        f"{'the file is cut off' if how == 'cut off' else 'its pixels are damaged or missing'})"
     ]
     assert list(tracker.unreadable) == ["0006.png", "0008.png"]
 
