@@ -42,6 +42,8 @@ MAP_WEIGHT = 0.002
 # vertices and surface found in percent: all depth 76 and 75, one that agrees 81 and 70, two 84 and 66.)
 AGREEING = 1
 AGREEMENT = 0.01
+# A view of which a smaller share agrees with its neighbours keeps all: of a short run, a poor mesh is better than none.
+LEAST_AGREED = 0.25
 
 Image = NDArray[np.float32]
 
@@ -96,7 +98,10 @@ def matched_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[i
 
 
 def agreed_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[int]) -> Image:
-    """Depth (H, W) of a view where AGREEING neighbours show the same place, 0 elsewhere."""
+    """Depth (H, W) of a view where AGREEING neighbours show the same place, 0 elsewhere.
+
+    All of it where hardly any of the view is agreed on (LEAST_AGREED).
+    """
     view = views[index]
     row, column = np.nonzero(view.depth > 0)
     points = view.camera.unproject(np.stack([column, row], axis=1) + 0.5, view.depth[row, column])
@@ -112,6 +117,8 @@ def agreed_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[in
         agreeing[inside] += np.abs(there[inside, 2] - seen) < AGREEMENT * seen
     depth = np.zeros_like(view.depth)
     kept = agreeing >= AGREEING
+    if kept.sum() < LEAST_AGREED * len(kept):
+        return view.depth
     depth[row[kept], column[kept]] = view.depth[row[kept], column[kept]]
     return depth
 

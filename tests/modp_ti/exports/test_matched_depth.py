@@ -73,3 +73,9 @@ def test_depth_is_kept_where_neighbours_agree_on_it() -> None:
     depth = agreed_depth(shown, 4, [2, 3, 5, 6])
     assert (depth[:, :40] == 0).all()
     assert (depth[8:-8, 48:-8] == bent[8:-8, 48:-8]).all()
+
+
+def test_a_view_that_nobody_agrees_with_keeps_all_its_depth() -> None:
+    shown, _ = views(0.3)
+    wrong = [replace(view, depth=view.depth * np.float32(1 + 0.1 * i)) for i, view in enumerate(shown)]
+    assert (agreed_depth(wrong, 4, [2, 3, 5, 6]) == wrong[4].depth).all()
