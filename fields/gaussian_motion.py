@@ -70,12 +70,7 @@ class GaussianMotion:
                 if ti.static(self.gaussians.sh_degree > 0):
                     self._turn_colour(i, a, sh_rotation)
                 self.gaussians.touched[i] = 0
-                self.gaussians.position.grad[i].fill(0.0)
-                self.gaussians.log_scale.grad[i].fill(0.0)
-                self.gaussians.quaternion.grad[i].fill(0.0)
-                self.gaussians.opacity_logit.grad[i] = 0.0
-                for k in range(self.gaussians.sh_count):
-                    self.gaussians.sh.grad[i, k].fill(0.0)
+                self.gaussians.forget_gradient(i)
 
     @ti.func
     def _move_geometry(

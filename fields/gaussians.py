@@ -245,20 +245,22 @@ class GaussianField:
         for i in range(count):
             if self.touched[i] != 0:
                 self.touched[i] = 0
-                self.position.grad[i].fill(0.0)
-                self.log_scale.grad[i].fill(0.0)
-                self.quaternion.grad[i].fill(0.0)
-                self.opacity_logit.grad[i] = 0.0
-                for k in range(self.sh_count):
-                    self.sh.grad[i, k].fill(0.0)
+                self.forget_gradient(i)
 
     @ti.func
-    def _forget(self, i):
-        """A Gaussian's first state: no gradient, no history."""
+    def forget_gradient(self, i):
+        """Set the gradients of one Gaussian to zero."""
         self.position.grad[i].fill(0.0)
         self.log_scale.grad[i].fill(0.0)
         self.quaternion.grad[i].fill(0.0)
         self.opacity_logit.grad[i] = 0.0
+        for k in range(self.sh_count):
+            self.sh.grad[i, k].fill(0.0)
+
+    @ti.func
+    def _forget(self, i):
+        """A Gaussian's first state: no gradient, no history."""
+        self.forget_gradient(i)
         self.position_m[i].fill(0.0)
         self.position_v[i].fill(0.0)
         self.log_scale_m[i].fill(0.0)
@@ -268,7 +270,6 @@ class GaussianField:
         self.opacity_logit_m[i] = 0.0
         self.opacity_logit_v[i] = 0.0
         for k in range(self.sh_count):
-            self.sh.grad[i, k].fill(0.0)
             self.sh_m[i, k].fill(0.0)
             self.sh_v[i, k].fill(0.0)
         self.steps[i] = 0

@@ -113,7 +113,7 @@ class Adam:
                 sound = self._magnitude(i, active) < BOUND
                 if not sound:
                     ti.atomic_add(self.gaussians._caught[0], 1)
-                    self._forget_gradient(i)
+                    self.gaussians.forget_gradient(i)
             if sound:
                 self.gaussians.steps[i] = self.gaussians.steps[i] + 1
                 t = ti.cast(self.gaussians.steps[i], ti.f32)
@@ -167,7 +167,7 @@ class Adam:
                     g.sh[i, k] = self._update(
                         g.sh[i, k], g.sh.grad[i, k], g.sh_m[i, k], g.sh_v[i, k], lr, betas, corrections, eps
                     )
-                self._forget_gradient(i)
+                self.gaussians.forget_gradient(i)
                 if self.gaussians.log_scale[i].max() > largest:
                     self.gaussians.log_scale[i] = ti.min(self.gaussians.log_scale[i], largest)
                     self.gaussians.opacity_logit[i] = TRANSPARENT
@@ -182,12 +182,3 @@ class Adam:
         for k in range(active):
             total += ti.abs(g.sh.grad[i, k]).sum()
         return _bits(total)
-
-    @ti.func
-    def _forget_gradient(self, i):
-        self.gaussians.position.grad[i].fill(0.0)
-        self.gaussians.log_scale.grad[i].fill(0.0)
-        self.gaussians.quaternion.grad[i].fill(0.0)
-        self.gaussians.opacity_logit.grad[i] = 0.0
-        for k in range(self.gaussians.sh_count):
-            self.gaussians.sh.grad[i, k].fill(0.0)
