@@ -10,6 +10,9 @@ import numpy as np
 import taichi as ti
 import torch
 
+from fields.kernel_sources import answer_quickly
+from fields.workers import pin_workers, threads_of_process
+
 __all__ = [
     "describe",
     "growing",
@@ -42,6 +45,7 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
     """
     options = {"offline_cache": True, "log_level": ti.ERROR, "random_seed": seed, "default_fp": ti.f32}
     torch.set_num_threads(1)
+    answer_quickly()
     if threads is not None:
         options["cpu_max_num_threads"] = threads
     if device in ("cuda", "auto") and _has_cuda_driver() and torch.cuda.is_available():
@@ -57,7 +61,9 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
         if ti.lang.impl.current_cfg().arch == ti.vulkan:
             return "vulkan"
         raise RuntimeError("no Vulkan driver starts here")
+    before = threads_of_process()
     _start(ti.cpu, options)
+    pin_workers(before, ti.lang.impl.current_cfg().cpu_max_num_threads)
     return "cpu"
 
 

@@ -233,8 +233,7 @@ class ImageBuffers:
 
     @ti.kernel
     def _read_planes(self, width: ti.i32, height: ti.i32, buffer: ti.template(), out: ti.types.ndarray()):
-        for y in range(height):
-            row = (y + PAD) * self.stride + PAD
-            for x in range(width):
-                for c in range(out.shape[2]):
-                    out[y, x, c] = buffer[c * self.plane + row + x]
+        channels = out.shape[2]
+        for i in range(width * height * channels):
+            c, x, y = i % channels, i // channels % width, i // channels // width
+            out[y, x, c] = buffer[c * self.plane + (y + PAD) * self.stride + PAD + x]

@@ -87,7 +87,7 @@ class PhotometricLoss:
         if self.images.masked:
             self._mask(width * height, width, height)
         self._sums[:] = 0.0
-        self._compare(width, height, self._sums)
+        self._compare(width, height, 4, self._sums)
         l1, ssim, square, count = (float(v) for v in self._sums.sum(axis=0))
         count = max(count, 1.0)
         return LossValues(l1 / count, ssim / count, square / count)
@@ -134,13 +134,15 @@ class PhotometricLoss:
                 self.images.rows[target + x] = total
 
     @ti.kernel
-    def _compare_strips(self, width: ti.i32, height: ti.i32, sums: ti.types.ndarray()):
+    def _compare_strips(self, width: ti.i32, height: ti.i32, moments: ti.i32, sums: ti.types.ndarray()):
+        # moments is 4, but not a constant: LLVM would unroll the loop over them, and compile longer at every start of
+        # a process for a kernel that is no faster.
         for i in range((3 * STRIPS) * SPREAD):
             if i % SPREAD == 0:
-                self._compare_unit(i // SPREAD, width, height, sums)
+                self._compare_unit(i // SPREAD, width, height, moments, sums)
 
     @ti.func
-    def _compare_unit(self, unit, width, height, sums: ti.template()):
+    def _compare_unit(self, unit, width, height, moments, sums: ti.template()):
         stride, plane = ti.static(self.images.stride, self.images.plane)
         channel = unit // STRIPS * plane
         partial = unit // STRIPS * 3 * plane
@@ -153,7 +155,7 @@ class PhotometricLoss:
         for y in range(height * strip // STRIPS, height * (strip + 1) // STRIPS):
             self._moments_of_row(channel + (y + PAD - RADIUS) * stride, scratch, width)
             smooth = place(scratch + 4 * stride)
-            self._smooth_rows(scratch, smooth, 4, width)
+            self._smooth_rows(scratch, smooth, moments, width)
             row = place((y + PAD) * stride + PAD)
             for x in range(extent(width)):
                 mu_x, mu_y = self.images.rows[smooth + x], self.images.rows[smooth + stride + x]
@@ -200,8 +202,7 @@ class PhotometricLoss:
     def _differentiate_strips(
         self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64, partials: ti.i32
     ):
-        # partials is 3, but not a constant: LLVM would unroll the loops over them, and compile a second longer at
-        # every start of a process for a kernel that is no faster.
+        # partials is 3, but not a constant, as above.
         for i in range((3 * STRIPS) * SPREAD):
             if i % SPREAD == 0:
                 self._differentiate_unit(i // SPREAD, width, height, l1_scale, ssim_scale, partials)
