@@ -76,6 +76,11 @@ class GaussianField:
     def __len__(self) -> int:
         return self.count
 
+    @property
+    def bytes_each(self) -> int:
+        """Bytes of a Gaussian: values, gradients and two moments, and three integers."""
+        return 4 * (11 + 3 * self.sh_count) * np.dtype(self.dtype).itemsize + 3 * 4
+
     # ---- growing and shrinking -------------------------------------------------------------------------------
 
     def append(

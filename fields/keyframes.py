@@ -101,6 +101,10 @@ def _median_depth(points: SparsePoints, T_camera_world: NDArray[np.float64], oth
     return float(np.median(depth)) if len(depth) else otherwise
 
 
+def _nbytes(pyramid: tuple[ImageLevel, ...], points: SparsePoints) -> int:
+    return sum(image.rgba.nbytes for image in pyramid) + sum(a.nbytes for a in (points.xyz, points.pixels, points.ids))
+
+
 class KeyframeStore:
     """The keyframes in the order of their frames.
 
@@ -129,12 +133,23 @@ class KeyframeStore:
         """Median over the keyframes of the median depth of their tracked points: the unit of all lengths."""
         return self._depths.value if len(self._depths) else 1.0
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the keyframes' images and points."""
+        return sum(_nbytes(keyframe.pyramid, keyframe.points) for keyframe in self._keyframes)
+
+    def bytes_of(self, frame: TrackedFrame) -> int:
+        """Bytes that a frame would take as a keyframe."""
+        return _nbytes(self._kept(frame, self.levels), frame.points)
+
     def errors(self) -> NDArray[np.float64]:
         """The keyframes' errors (N,)."""
         return np.fromiter((k.error for k in self._keyframes), np.float64, len(self._keyframes))
 
-    def _is_kept(self, image: ImageLevel) -> bool:
-        return min(image.camera.width, image.camera.height) >= self.min_side
+    def _kept(self, frame: TrackedFrame, levels: int) -> tuple[ImageLevel, ...]:
+        """The first `levels` levels of a frame's pyramid, without those that are too small."""
+        first, *others = frame.pyramid[:levels]
+        return (first, *(o for o in others if min(o.camera.width, o.camera.height) >= self.min_side))
 
     def append(self, frame: TrackedFrame) -> Keyframe:
         """Keep `frame`. It starts at the mean error of the others (1 for the first), so that it is drawn soon."""
@@ -162,7 +177,7 @@ class KeyframeStore:
             error=float(self.errors().mean()) if self._keyframes else 1.0,
             vignette=frame.vignette,
             exposure=self.exposure_at(frame.index),
-            pyramid=tuple(image for i, image in enumerate(frame.pyramid[:levels]) if i == 0 or self._is_kept(image)),
+            pyramid=self._kept(frame, levels),
         )
 
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:

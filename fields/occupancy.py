@@ -88,6 +88,11 @@ class OccupancyVoxels:
         """Forget all marks. The memory of the places stays, for those around them."""
         self._clear()
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the marks."""
+        return self._count_bricks() * WORDS * 8
+
     def marks(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
         """All marks: places (M, 4) of words that have any, in their order, and the words (M,). For `restore`."""
         count = self._count_bricks()

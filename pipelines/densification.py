@@ -15,6 +15,7 @@ from fields.occupancy import OccupancyVoxels
 from fields.se3 import inverse_se3
 from pipelines.depth import DepthEstimator
 from pipelines.exposure import scene_colours
+from pipelines.memory_budget import MemoryBudget
 from pipelines.settings import DensifySettings
 
 __all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "tracked_seeds"]
@@ -112,15 +113,17 @@ def grow(
     voxels: OccupancyVoxels | None,
     target: float,
     settings: DensifySettings,
+    budget: MemoryBudget,
     anchor: int = NO_ANCHOR,
 ) -> int:
     """Add isotropic Gaussians at the seeds that the voxels admit at spacing `target` [scene units]; return how many.
 
-    anchor: of the new ones, see `GaussianField`.
+    The first of them, as far as the budget has room. anchor: of the new ones, see `GaussianField`.
     """
-    if voxels is not None:
+    # A place that is marked and stays empty would be refused for ever.
+    if voxels is not None and budget.room() > 0:
         seeds = seeds[voxels.admit(seeds.xyz, target)]
-    seeds = seeds[np.arange(len(seeds)) < gaussians.capacity - gaussians.count]
+    seeds = seeds[np.arange(len(seeds)) < budget.take_gaussians(len(seeds))]
     n = len(seeds)
     log_scale = np.log(settings.initial_scale * seeds.size) + settings.scale_offset
     sh = np.zeros((n, gaussians.sh_count, 3))

@@ -27,6 +27,7 @@ from pipelines.frame_gate import FrameGate
 from pipelines.guards import Guards
 from pipelines.keyframe_selection import KeyframeSelector
 from pipelines.map_state import MapState
+from pipelines.memory_budget import MemoryBudget
 from pipelines.optimisation import MapOptimiser
 from pipelines.rendering import Renderer
 from pipelines.settings import MappingSettings
@@ -93,6 +94,8 @@ class OnlineMapper:
         self.selector = KeyframeSelector(settings.keyframes)
         self.depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
+        limit = None if settings.memory is None else settings.memory * 1e9
+        self.budget = MemoryBudget(limit, self.gaussians, self.keyframes, self.voxels, self.optimiser.guards)
         self.motion = GaussianMotion(self.gaussians)
         self.anchors: list[Anchor] = []
         self._tracked: dict[int, NDArray[np.float64]] = {}  # the tracker's pose of every frame so far
@@ -117,7 +120,7 @@ class OnlineMapper:
             last = self.keyframes[-1] if len(self.keyframes) else None
             if self.gate.refuses(frame, last, self.renderer, self.near):
                 return FrameReport(frame.index, False, len(self.keyframes), len(self.gaussians), None)
-            is_keyframe = self.selector.is_keyframe(frame, last)
+            is_keyframe = self.selector.is_keyframe(frame, last) and self.budget.takes_keyframe(frame)
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
@@ -263,7 +266,7 @@ class OnlineMapper:
                 centre = inverse_se3(view.T_camera_world)[:3, 3]
                 self.voxels.settle(v.coarsest * view.view_scale, centre)
             spacing = self.anchors[-1].spacing
-            grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, len(self.anchors) - 1)
+            grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, len(self.anchors) - 1)
 
     def caught(self) -> Guards:
         """What the guards have caught so far. Waits for the device."""
@@ -351,7 +354,7 @@ class OnlineMapper:
                 view = store.append(TrackedFrame(i, 0.0, "compile", image, camera, T, points))
             if self.voxels is not None:
                 self.voxels.admit(np.zeros((0, 3)), 1.0)
-            grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify)
+            grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify, self.budget)
             self.optimiser.exposure.begin(view, self.renderer, self.settings.near)
             self.optimiser.step(store, [0], self.optimiser.rates(1.0), pose_rate=0.0)
             self.optimiser.settle()

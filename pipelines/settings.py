@@ -249,6 +249,12 @@ class MappingSettings(StrictModel):
         le=1_500_000,
         description="size of the pool; further Gaussians are not added. Taichi's allocator sets the limit",
     )
+    memory: float | None = Field(
+        None,
+        gt=0,
+        description="memory that Gaussians, keyframes and voxels may take [GB]; what has no room is left out and "
+        "counted. Empty for no limit but max_gaussians",
+    )
     near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     image_cache: float = Field(
         2.0, ge=0, description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed"

@@ -12,6 +12,8 @@ from fields.se3 import exp_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from pipelines.densification import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.depth import DepthEstimate
+from pipelines.guards import Guards
+from pipelines.memory_budget import MemoryBudget
 from pipelines.settings import DensifySettings
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
@@ -135,11 +137,15 @@ def gaussians(taichi_on_the_cpu: None) -> GaussianField:
     return GaussianField(1, max_gaussians=1024)
 
 
+def unlimited(gaussians: GaussianField) -> MemoryBudget:
+    return MemoryBudget(None, gaussians, KeyframeStore(), None, Guards())
+
+
 def test_gaussians_begin_as_the_paper_says(gaussians: GaussianField) -> None:
     gaussians.remove(np.zeros(len(gaussians), dtype=bool))
     settings = DensifySettings()
     seeds = Seeds(np.array([[1.0, 2.0, 3.0]]), np.array([0.02]), np.array([[0.1, 0.5, 0.9]]))
-    assert grow(gaussians, seeds, None, 1.0, settings) == 1
+    assert grow(gaussians, seeds, None, 1.0, settings, unlimited(gaussians)) == 1
     state = gaussians.to_numpy()
     np.testing.assert_allclose(state["position"], [[1, 2, 3]])
     np.testing.assert_allclose(state["log_scale"], np.log(0.5 * 0.02) + 0.5, rtol=1e-6)
@@ -154,14 +160,17 @@ def test_voxels_keep_gaussians_from_crowding(gaussians: GaussianField) -> None:
     voxels = OccupancyVoxels(1.0, levels=4)
     xyz = np.random.default_rng(4).uniform(0, 1, (400, 3)) * [1, 1, 0.05]
     seeds = Seeds(xyz, np.full(400, 0.1), np.full((400, 3), 0.5))
-    added = grow(gaussians, seeds, voxels, 0.25, DensifySettings())
+    budget = unlimited(gaussians)
+    added = grow(gaussians, seeds, voxels, 0.25, DensifySettings(), budget)
     assert added == len(gaussians) == len(np.unique(np.floor(xyz / 0.25), axis=0))
-    assert grow(gaussians, seeds, voxels, 0.25, DensifySettings()) == 0
-    assert grow(gaussians, seeds, voxels, 0.125, DensifySettings()) > 0
+    assert grow(gaussians, seeds, voxels, 0.25, DensifySettings(), budget) == 0
+    assert grow(gaussians, seeds, voxels, 0.125, DensifySettings(), budget) > 0
 
 
 def test_a_full_pool_takes_what_it_can(gaussians: GaussianField) -> None:
     gaussians.remove(np.zeros(len(gaussians), dtype=bool))
     seeds = Seeds(np.random.default_rng(5).normal(size=(1100, 3)), np.full(1100, 0.1), np.full((1100, 3), 0.5))
-    assert grow(gaussians, seeds, None, 1.0, DensifySettings()) == 1024
-    assert grow(gaussians, seeds, None, 1.0, DensifySettings()) == 0
+    budget = unlimited(gaussians)
+    assert grow(gaussians, seeds, None, 1.0, DensifySettings(), budget) == 1024
+    assert grow(gaussians, seeds, None, 1.0, DensifySettings(), budget) == 0
+    assert budget.guards.gaussians_without_room == 76 + 1100

@@ -1,0 +1,62 @@
+"""`MemoryBudget`: what a map may take of the memory, so that a long recording ends with a map, not out of memory."""
+
+from __future__ import annotations
+
+from fields.gaussians import GaussianField
+from fields.keyframes import KeyframeStore
+from fields.occupancy import OccupancyVoxels
+from fields.tracked_frame import TrackedFrame
+from pipelines.guards import Guards
+
+__all__ = ["MemoryBudget"]
+
+
+class MemoryBudget:
+    """Keeps Gaussians, keyframes' images and points, and voxels within a number of bytes.
+
+    It is reckoned from what the map holds, and not asked of the system: two runs refuse the same. What has no room is
+    left out and counted in `guards`: Gaussians are not added, and a frame that would have been a keyframe is one like
+    those between keyframes. The map goes on being optimised with what it has. Voxels are counted once they are marked:
+    those of one keyframe's Gaussians may come on top.
+
+    limit: in bytes, None for none; the pool of `gaussians` is a limit in any case.
+    """
+
+    def __init__(
+        self,
+        limit: float | None,
+        gaussians: GaussianField,
+        keyframes: KeyframeStore,
+        voxels: OccupancyVoxels | None,
+        guards: Guards,
+    ) -> None:
+        self.limit = limit
+        self.gaussians = gaussians
+        self.keyframes = keyframes
+        self.voxels = voxels
+        self.guards = guards
+
+    def held(self) -> int:
+        """Bytes that the map holds now."""
+        voxels = 0 if self.voxels is None else self.voxels.nbytes
+        return len(self.gaussians) * self.gaussians.bytes_each + self.keyframes.nbytes + voxels
+
+    def room(self) -> int:
+        """How many further Gaussians there is room for."""
+        room = self.gaussians.capacity - len(self.gaussians)
+        if self.limit is not None:
+            room = min(room, int(self.limit - self.held()) // self.gaussians.bytes_each)
+        return max(room, 0)
+
+    def take_gaussians(self, wanted: int) -> int:
+        """How many of so many further Gaussians there is room for; the others are counted."""
+        taken = min(wanted, self.room())
+        self.guards.gaussians_without_room += wanted - taken
+        return taken
+
+    def takes_keyframe(self, frame: TrackedFrame) -> bool:
+        """Whether there is room for a frame's images and points; counted where not."""
+        if self.limit is None or self.held() + self.keyframes.bytes_of(frame) <= self.limit:
+            return True
+        self.guards.keyframes_without_room += 1
+        return False

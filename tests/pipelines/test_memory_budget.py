@@ -1,0 +1,99 @@
+"""What a map may take of the memory, on the small wall."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from fields.backend import initialise
+from fields.gaussians import GaussianField
+from pipelines.guards import Guards
+from pipelines.mapping import OnlineMapper
+from pipelines.settings import MappingSettings
+
+from .wall import frame
+
+FRAMES = 6
+
+
+@dataclass
+class Mapped:
+    """What is left of a map."""
+
+    gaussians: dict[str, np.ndarray]
+    keyframes: list[int]  # their frames
+    guards: Guards
+    held: int  # what the budget says [bytes]
+    counted: int  # what its arrays hold [bytes]
+
+
+def mapped(memory: float | None) -> Mapped:
+    """A map of six frames with so much memory [GB]."""
+    initialise("cpu")
+    settings = MappingSettings(
+        sh_degree=0, optimise={"steps": 2, "last_steps": 2}, densify={"warm_up": 2}, memory=memory
+    )
+    mapper = OnlineMapper(settings, 64, 48, seed=1)
+    mapper.compile()
+    for i in range(FRAMES):
+        mapper.process(frame(i))
+    mapper.finish()
+    images = sum(level.rgba.nbytes for view in mapper.keyframes for level in view.pyramid)
+    points = sum(a.nbytes for v in mapper.keyframes for a in (v.points.xyz, v.points.pixels, v.points.ids))
+    bricks = len({tuple(place[:3]) for place in mapper.voxels.marks()[0].tolist()})
+    return Mapped(
+        mapper.gaussians.to_numpy(),
+        [view.index for view in mapper.keyframes],
+        mapper.caught(),
+        mapper.budget.held(),
+        len(mapper.gaussians) * 236 + images + points + bricks * 592,
+    )
+
+
+@pytest.fixture(scope="module")
+def free(taichi_on_the_cpu: None) -> Mapped:
+    return mapped(None)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2])
+@pytest.mark.parametrize("real", [ti.f32, ti.f64])
+def test_a_gaussian_takes_what_its_fields_hold(taichi_on_the_cpu: None, sh_degree: int, real: object) -> None:
+    initialise("cpu")
+    gaussians = GaussianField(sh_degree, 1024, real)
+    gaussians.append(
+        np.zeros((1, 3)), np.zeros((1, 3)), np.eye(4)[:1], np.zeros(1), np.zeros((1, gaussians.sh_count, 3))
+    )
+    values = sum(array.nbytes for array in gaussians.to_numpy().values())
+    assert gaussians.bytes_each == 4 * values + 3 * 4
+
+
+def test_the_budget_adds_up_what_the_map_holds(free: Mapped) -> None:
+    assert free.held == free.counted
+
+
+def test_nothing_is_refused_without_a_limit_or_below_it(free: Mapped) -> None:
+    assert free.guards.warning() is None
+    roomy = mapped(free.held / 1e9 * 1.5)
+    assert roomy.guards.warning() is None
+    for name, array in free.gaussians.items():
+        np.testing.assert_array_equal(roomy.gaussians[name], array)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_a_map_ends_within_its_memory_and_says_what_had_no_room(free: Mapped, share: float) -> None:
+    limit = share * free.held
+    tight = mapped(limit / 1e9)
+    assert tight.held <= 1.05 * limit  # the voxels of the last keyframe's Gaussians come on top
+    assert tight.guards.gaussians_without_room > 0 and "mapping.memory" in tight.guards.warning()
+    assert 0 < len(tight.gaussians["position"]) < len(free.gaussians["position"])
+    assert len(tight.keyframes) + tight.guards.keyframes_without_room == FRAMES
+
+
+def test_a_frame_without_room_is_no_keyframe(free: Mapped) -> None:
+    # Without a Gaussian two frames fit, and a third does not.
+    tight = mapped(2.5 * (64 * 48 * 4 + 120 * (24 + 16 + 8)) / 1e9)
+    assert tight.keyframes == list(range(len(tight.keyframes))) and len(tight.keyframes) in (1, 2)
+    assert tight.guards.keyframes_without_room == FRAMES - len(tight.keyframes)
