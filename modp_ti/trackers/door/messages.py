@@ -29,6 +29,7 @@ __all__ = [
     "Kind",
     "ProtocolError",
     "State",
+    "UnfitError",
     "encoded",
     "parse_correction",
     "parse_frame",
@@ -65,6 +66,17 @@ ROUNDING = 1e-12
 
 class ProtocolError(Exception):
     """What the other side sent is no message, or none at its place. The text is the one line that it is told."""
+
+
+class UnfitError(ProtocolError):
+    """A message in its right form and place says what cannot be: it is left out, and the next one heard.
+
+    number: of the frame that it is about, where it is one.
+    """
+
+    def __init__(self, text: str, number: int | None = None) -> None:
+        super().__init__(text)
+        self.number = number
 
 
 class Kind(IntEnum):
@@ -238,7 +250,7 @@ def parse_hello(payload: bytes) -> Hello:
 def parse_frame(payload: bytes, kind: Kind) -> Frame:
     """The payload of a FRAME, or of a POSE, which is the same without an image.
 
-    Raises ProtocolError for sizes that disagree and for numbers that are no pose, time or point.
+    Raises ProtocolError for sizes that disagree, UnfitError for numbers that are no pose, time or point.
     """
     number, state, timestamp, *matrix, count, length = FRAME.unpack_from(payload)
     what = f"{kind.name} {number}"
@@ -257,27 +269,30 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
     if kind is Kind.POSE and state is State.LATER:
         raise ProtocolError(f"{what}: must bring the pose (state 1) or say that none will come (state 2)")
     if not abs(timestamp) <= LARGEST:
-        raise ProtocolError(f"{what}: the time stamp is not finite, or beyond {LARGEST:g}")
+        raise UnfitError(f"{what}: the time stamp is not finite, or beyond {LARGEST:g}", number)
     if count and state is not State.KNOWN:
         raise ProtocolError(f"{what}: has points and no pose: they come with it")
-    pose = _pose(np.array(matrix).reshape(4, 4), what) if state is State.KNOWN else None
-    points = parse_points(payload[FRAME.size : FRAME.size + count * POINT.itemsize], what)
+    try:
+        pose = _pose(np.array(matrix).reshape(4, 4), what) if state is State.KNOWN else None
+        points = parse_points(payload[FRAME.size : FRAME.size + count * POINT.itemsize], what)
+    except UnfitError as error:
+        raise UnfitError(str(error), number) from None
     return Frame(number, state, timestamp, pose, points, payload[FRAME.size + count * POINT.itemsize :])
 
 
 def parse_points(block: bytes, what: str) -> SparsePoints:
-    """Points of a frame. what: begins the message of the ProtocolError for those that cannot be."""
+    """Points of a frame. what: begins the message of the UnfitError for those that cannot be."""
     table = np.frombuffer(block, dtype=POINT)
     if not all((np.abs(table[name]) <= FARTHEST).all() for name in ("xyz", "pixel")):
-        raise ProtocolError(f"{what}: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
+        raise UnfitError(f"{what}: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
     if len(np.unique(table["id"])) != len(table):
-        raise ProtocolError(f"{what}: a point stands twice: ids are unique in a frame")
+        raise UnfitError(f"{what}: a point stands twice: ids are unique in a frame")
     xyz, pixels = (table[name].astype(np.float64) for name in ("xyz", "pixel"))
     return SparsePoints(xyz, pixels, table["id"].astype(np.int64))
 
 
 def parse_correction(payload: bytes) -> Correction:
-    """Raises ProtocolError for sizes that disagree, poses that are none, and frames or points named twice."""
+    """Raises ProtocolError for sizes that disagree, UnfitError for poses that are none and what is named twice."""
     poses, points = CORRECTION.unpack_from(payload)
     middle = CORRECTION.size + poses * MOVED_POSE.itemsize
     size = middle + points * MOVED_POINT.itemsize
@@ -287,12 +302,12 @@ def parse_correction(payload: bytes) -> Correction:
     moved = np.frombuffer(payload[middle:], dtype=MOVED_POINT)
     numbers = frames["number"].astype(np.int64)
     if (np.diff(numbers) <= 0).any():
-        raise ProtocolError("CORRECTION: frames must be named once each, in their order")
+        raise UnfitError("CORRECTION: frames must be named once each, in their order")
     matrices = [_pose(row["T"], f"CORRECTION of frame {row['number']}") for row in frames]
     if not (np.abs(moved["xyz"]) <= FARTHEST).all():
-        raise ProtocolError(f"CORRECTION: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
+        raise UnfitError(f"CORRECTION: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
     if len(np.unique(moved["id"])) != len(moved):
-        raise ProtocolError("CORRECTION: a point stands twice")
+        raise UnfitError("CORRECTION: a point stands twice")
     return Correction(numbers, np.stack(matrices), moved["id"].astype(np.int64), moved["xyz"].astype(np.float64))
 
 
@@ -300,7 +315,7 @@ def _pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
     try:
         pose = checked_pose(matrix, what)
     except InputError as error:
-        raise ProtocolError(str(error)) from None
+        raise UnfitError(str(error)) from None
     exact = np.abs(matrix - pose).max() < ROUNDING
     return np.array(matrix, dtype=np.float64) if exact else pose
 

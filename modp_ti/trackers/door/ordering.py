@@ -6,7 +6,10 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 
-from modp_ti.trackers.door.messages import Correction, Frame, ProtocolError, State
+import numpy as np
+
+from fields.tracked_frame import SparsePoints
+from modp_ti.trackers.door.messages import Correction, Frame, ProtocolError, State, UnfitError
 
 __all__ = ["Ordering"]
 
@@ -16,6 +19,7 @@ MAX_WAITING_BYTES = 256 << 20  # of points and poses
 MAX_WAITING_IMAGES = 4 << 30  # bytes, on disk
 # Corrections between two frames: each costs as much as all poses so far.
 MAX_CORRECTIONS = 100
+NO_POINTS = SparsePoints(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
 
 class Ordering:
@@ -30,6 +34,7 @@ class Ordering:
         self._late: dict[int, Frame] = {}  # poses of frames that came without, to be delivered
         self._undecided: set[int] = set()
         self._posed: set[int] = set()
+        self._left_out: set[int] = set()
         self._bytes = 0
         self._images: deque[int] = deque()  # bytes of the images of frames that wait
         self._corrections = 0  # since the last frame
@@ -46,21 +51,23 @@ class Ordering:
         return len(self._undecided)
 
     def require_next(self, frame: Frame) -> None:
-        """Raises ProtocolError where the frame does not come after those before it."""
+        """Raises UnfitError where the frame does not come after those before it."""
         if self._last is None:
             return
         if frame.number <= self._last.number:
-            raise ProtocolError(f"FRAME {frame.number} after FRAME {self._last.number}: numbers must grow")
+            raise UnfitError(f"FRAME {frame.number} after FRAME {self._last.number}: numbers must grow")
         if frame.timestamp <= self._last.timestamp:
-            raise ProtocolError(
+            raise UnfitError(
                 f"FRAME {frame.number}: its time {frame.timestamp!r} is not after {self._last.timestamp!r}, that of "
-                f"FRAME {self._last.number}"
+                f"FRAME {self._last.number}",
+                frame.number,
             )
 
     def add_frame(self, frame: Frame) -> None:
-        """Take a frame in; its image is of no interest here. Raises ProtocolError as `require_next` does."""
+        """Take a frame in; its image is of no interest here. Raises UnfitError as `require_next` does."""
         self.require_next(frame)
         self._corrections = 0
+        self._left_out.discard(frame.number)
         self._images.append(len(frame.image))
         self._last = frame = replace(frame, image=b"")
         if frame.state is State.LATER:
@@ -71,6 +78,8 @@ class Ordering:
 
     def add_pose(self, pose: Frame) -> None:
         """What became of a frame's pose. Raises ProtocolError where that is not open."""
+        if pose.number in self._left_out:
+            return
         if pose.number not in self._undecided:
             raise ProtocolError(
                 f"POSE {pose.number}: no frame of this number waits for its pose; CORRECTION revises one that has it"
@@ -82,14 +91,27 @@ class Ordering:
         self._hold(_size(pose))
 
     def add_correction(self, correction: Correction) -> None:
-        """Raises ProtocolError where it names a frame that has no pose."""
+        """Raises UnfitError where it names a frame that has no pose."""
         self._corrections += 1
         if self._corrections > MAX_CORRECTIONS:
             raise ProtocolError(f"more than {MAX_CORRECTIONS} CORRECTIONs without a FRAME between them: send fewer")
-        for number in correction.numbers.tolist():
+        heard = np.array([number not in self._left_out for number in correction.numbers.tolist()])
+        if not heard.any():
+            return
+        numbers = correction.numbers[heard]
+        for number in numbers.tolist():
             if number not in self._posed:
-                raise ProtocolError(f"CORRECTION of frame {number}, which has no pose so far")
-        self._wait(correction)
+                raise UnfitError(f"CORRECTION of frame {number}, which has no pose so far")
+        self._wait(replace(correction, numbers=numbers, T_camera_world=correction.T_camera_world[heard]))
+
+    def leave_out(self, number: int) -> None:
+        """A frame that is of no use, or its pose: what else is said of it is not heard. Not one that had a pose."""
+        if number in self._posed:
+            return
+        self._left_out.add(number)
+        if number in self._undecided:
+            self._undecided.discard(number)
+            self._late[number] = Frame(number, State.LOST, 0.0, None, NO_POINTS, b"")
 
     def ready(self) -> Iterator[Frame | Correction]:
         """What can be delivered by now: frames with their poses, and corrections of frames before them."""

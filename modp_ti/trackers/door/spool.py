@@ -15,7 +15,7 @@ from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
 from modp_ti.sources.image_header import read_image_header
 from modp_ti.sources.intrinsics import Intrinsics
-from modp_ti.trackers.door.messages import POINT, Encoding, Frame, Hello, ProtocolError, parse_points
+from modp_ti.trackers.door.messages import POINT, Encoding, Frame, Hello, UnfitError, parse_points
 
 __all__ = ["Spool", "SpoolFullError"]
 
@@ -45,7 +45,7 @@ class Spool:
         self._last: tuple[str, NDArray[np.uint8]] | None = None
 
     def add(self, frame: Frame) -> str:
-        """Keep the frame's image; its name. Raises ProtocolError for an image that is not what HELLO said.
+        """Keep the frame's image; its name. Raises UnfitError for an image that is not what HELLO said.
 
         Raises SpoolFullError where the disk has no room.
         """
@@ -56,7 +56,7 @@ class Spool:
             self._decoded(name)
         except InputError as error:
             (self.path / name).unlink(missing_ok=True)
-            raise ProtocolError(f"FRAME {frame.number}: {error}") from None
+            raise UnfitError(f"FRAME {frame.number}: {error}", frame.number) from None
         self._position[name] = len(self.names)
         self.names.append(name)
         self._timestamps.append(frame.timestamp)
@@ -74,17 +74,18 @@ class Spool:
         if self._encoding.channels is not None:
             wanted = camera.width * camera.height * self._encoding.channels
             if len(frame.image) != wanted:
-                raise ProtocolError(f"{what}: its image has {len(frame.image)} bytes, HELLO says {wanted}")
+                raise UnfitError(f"{what}: its image has {len(frame.image)} bytes, HELLO says {wanted}", frame.number)
             return
         start = b"\xff\xd8" if self._encoding is Encoding.JPEG else b"\x89PNG"
         header = read_image_header(io.BytesIO(frame.image)) if frame.image.startswith(start) else None
         if header is None:
-            raise ProtocolError(f"{what}: its image is no {self._encoding.name}")
+            raise UnfitError(f"{what}: its image is no {self._encoding.name}", frame.number)
         if not header.complete:
-            raise ProtocolError(f"{what}: its {self._encoding.name} image is cut off")
+            raise UnfitError(f"{what}: its {self._encoding.name} image is cut off", frame.number)
         if (header.width, header.height) != (camera.width, camera.height):
-            raise ProtocolError(
-                f"{what}: its image is {header.width}x{header.height}, HELLO says {camera.width}x{camera.height}"
+            raise UnfitError(
+                f"{what}: its image is {header.width}x{header.height}, HELLO says {camera.width}x{camera.height}",
+                frame.number,
             )
 
     def __len__(self) -> int:

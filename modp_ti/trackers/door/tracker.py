@@ -24,6 +24,7 @@ from modp_ti.trackers.door.messages import (
     Hello,
     Kind,
     ProtocolError,
+    UnfitError,
     parse_correction,
     parse_frame,
     parse_hello,
@@ -38,6 +39,8 @@ __all__ = ["DoorTracker", "open_door"]
 # Seconds that the door takes a breath after a connection that came to nothing, for each of them up to the most: who
 # connects in a loop must not keep a processor busy.
 BREATH, LONGEST_BREATH = 0.01, 0.5
+# Messages that may be of no use before that is the end: so many, and so many more for each frame.
+FEW_UNFIT, UNFIT_SHARE = 3, 0.1
 
 
 def open_door(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> DoorTracker:
@@ -78,6 +81,7 @@ class DoorTracker:
         self._indices: dict[int, int] = {}  # of the frames that went to the mapper, by their numbers
         self._dropped, self._dropped_note = 0, ""
         self._name = ""
+        self._unfit: list[str] = []  # what was wrong with messages that were left out
         self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
         self._closed = Event()
         self._ended = False
@@ -182,7 +186,10 @@ class DoorTracker:
                     self._name = hello.name
                     connection.say(Kind.WELCOME)
                 else:
-                    self._take(header.kind, payload, ordering)
+                    try:
+                        self._take(header.kind, payload, ordering)
+                    except UnfitError as error:
+                        self._leave_out(error, ordering)
                     self._deliver(ordering)
         except SenderGoneError as error:
             problem = f"the sender {error}"
@@ -209,12 +216,24 @@ class DoorTracker:
             self._deliver(ordering)
         except SpoolFullError as error:
             self.notes.append(f"the last frames are missing: {error}")
+        if self._unfit:
+            messages = "1 message was" if len(self._unfit) == 1 else f"{len(self._unfit)} messages were"
+            self.notes.append(f"{messages} left out: {'' if len(self._unfit) == 1 else 'the last: '}{self._unfit[-1]}")
         if ordering.lost:
             self.notes.append(f"{ordering.lost} of {len(self._spool or ())} frames came without a pose: skipped")
         if problem is None:
             connection.say(Kind.DONE, struct.pack("<I", len(self._indices)))
             connection.close()
         return True
+
+    def _leave_out(self, error: UnfitError, ordering: Ordering) -> None:
+        """Go on without a message. Raises ProtocolError before the first frame, and where they are too many."""
+        self._unfit.append(str(error))
+        if not ordering.begun or len(self._unfit) > FEW_UNFIT + UNFIT_SHARE * len(self._spool or ()):
+            self._unfit.pop()
+            raise ProtocolError(str(error))
+        if error.number is not None:
+            ordering.leave_out(error.number)
 
     def _count_dropped(self, problem: str, count: int) -> None:
         """One note for all connections that came to nothing, however many there are."""
@@ -236,7 +255,10 @@ class DoorTracker:
         self._undistorter, self._spool = undistorter, spool
 
     def _take(self, kind: Kind, payload: bytes, ordering: Ordering) -> None:
-        """Raises ProtocolError for what is malformed or out of order, before it has had any effect."""
+        """Raises ProtocolError for what is malformed or at the wrong place, before it has had any effect.
+
+        Raises UnfitError for what is of no use, and nothing else.
+        """
         if kind is Kind.CORRECTION:
             ordering.add_correction(parse_correction(payload))
             return
