@@ -75,7 +75,8 @@ def measure_frames(device: str, threads: int) -> list[dict[str, float]]:
         pixels = camera.project(xyz + T[:3, 3])
         seen = camera.contains(pixels)
         points = SparsePoints(xyz[seen], pixels[seen], np.flatnonzero(seen))
-        made = TrackedFrame(2 * number, 0.0, str(number), image, camera, T, points)
+        # Shifted: a picture that repeats the one before has no business in a map.
+        made = TrackedFrame(2 * number, 0.0, str(number), np.roll(image, number, axis=1), camera, T, points)
         _ = made.pyramid  # as the thread that reads ahead makes it
         return made
 

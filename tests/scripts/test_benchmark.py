@@ -9,6 +9,7 @@ from pathlib import Path
 import benchmark
 import numpy as np
 import pytest
+from benchmarks import growth
 from benchmarks.growth import HIDDEN, KEYFRAMES, PIXELS, VISIBLE
 from benchmarks.scene import Size, add_gaussians, arrays, camera_of, noise_frame
 from benchmarks.step import ADAM_BYTES, BACKWARD_FLOPS, FORWARD_FLOPS, STAGES, measure_step
@@ -55,6 +56,13 @@ def test_the_scene_lies_in_the_picture_and_hidden_gaussians_behind_the_camera() 
     assert camera.contains(camera.project(seen)).all()
     assert seen[:, 2].min() >= 2.0
     assert hidden[:, 2].max() <= -2.0
+
+
+def test_the_growth_with_keyframes_is_that_of_frames_that_become_keyframes(monkeypatch) -> None:
+    monkeypatch.setattr(growth, "KEYFRAMES", [2, 12])
+    monkeypatch.setattr(growth, "TIMED", 2)
+    rows = growth.measure_frames("cpu", 2)
+    assert [row["keyframes"] for row in rows] == [2, 12] and all(row["frame"] > 0 for row in rows)
 
 
 def made_up(kind: str, **arguments: object) -> object:
