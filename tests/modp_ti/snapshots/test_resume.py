@@ -10,12 +10,14 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from modp_ti.errors import InputError
 from modp_ti.snapshots import load_resumed
 from modp_ti.snapshots.file import FILE, read_arrays, write_arrays
+from modp_ti.synthetic import SyntheticTracker
 from tests.modp_ti.runs import finished_run
 
 # Exposure, drift with a correction and pruning: all that a snapshot must hold.
@@ -68,7 +70,8 @@ def wait_for(process: subprocess.Popen[str], file: Path, least: tuple[int, int])
 
 
 def assert_the_same(out: Path, peace: Path) -> None:
-    for name in SAME:
+    assert set(os.listdir(out)) == set(os.listdir(peace))
+    for name in set(SAME) & set(os.listdir(peace)):
         assert (out / name).read_bytes() == (peace / name).read_bytes(), name
     figures, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (out, peace))
     assert {name: figures[name] for name in FIGURES} == {name: expected[name] for name in FIGURES}
@@ -111,6 +114,56 @@ def test_a_run_that_is_killed_and_interrupted_on_its_way_ends_as_one_in_peace(tm
     assert process.returncode == 0, errors
     assert_the_same(out, in_peace)
     assert not (out / FILE).exists()
+
+
+def test_a_run_that_is_interrupted_while_it_is_scored_keeps_its_map_and_is_scored_later(
+    tmp_path: Path, in_peace: Path
+) -> None:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    out = tmp_path / "out"
+    process = start(str(tmp_path / "scene.yaml"))
+    while process.poll() is None and not (tmp_path / "out.partial" / "splats.ply").exists():
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 130, errors
+    assert "resume" in errors
+    assert not (out / "metrics.json").exists()
+    for name in ("splats.ply", "trajectory.txt"):
+        assert (out / name).read_bytes() == (in_peace / name).read_bytes()
+
+    process = start("--resume", str(out))
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert_the_same(out, in_peace)
+
+
+def test_a_tracker_that_finds_the_poses_itself_finds_them_again(tmp_path: Path) -> None:
+    recording = SyntheticTracker(width=160, height=120, frames=90)
+    (tmp_path / "images").mkdir()
+    for frame in list(recording)[:24]:
+        cv2.imwrite(str(tmp_path / "images" / f"{frame.index:04d}.png"), frame.rgba[..., 2::-1])
+    c = recording.camera
+    scene = f"""
+source:  {{path: images, holdout: 8, fps: 10, intrinsics: {{fx: {c.fx}, fy: {c.fy}, cx: {c.cx}, cy: {c.cy}}}}}
+tracker: {{kind: klt}}
+output:  out
+device:  cpu
+mapping: {{optimise: {{steps: 2, last_steps: 2}}}}
+refine:  {{steps: 4}}
+export:  {{report: false}}
+snapshot_every: 3
+"""
+    peace = finished_run(tmp_path, scene, "device: CPU").rename(tmp_path / "peace")
+    out = tmp_path / "out"
+    process = start(str(tmp_path / "scene.yaml"))
+    wait_for(process, out / FILE, (6, 0))
+    process.kill()
+    process.communicate()
+    process = start("--resume", str(out))
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert_the_same(out, peace)
 
 
 @pytest.fixture
