@@ -23,25 +23,26 @@ __all__ = ["DepthView", "agreed_depth", "choose_neighbours", "matched_depth"]
 
 # Neighbours a view is compared with: as many before and after it, half of them at each of these parallaxes (the
 # baseline over the median depth), as near as there are.
-PARALLAXES = (0.15, 0.06)
-NEIGHBOURS = 8
+PARALLAXES = (0.25, 0.12, 0.06)
+NEIGHBOURS = 12
 # No neighbour looks more than this away (cosine of the angle), or from within or beyond these parallaxes.
-LEAST_COSINE = 0.8
+LEAST_COSINE = 0.7
 LEAST_PARALLAX, LARGEST_PARALLAX = 0.015, 0.4
 # Steps of inverse depth to either side, of a pixel in the most distant neighbour: a wide sweep, then one around it.
 SWEEPS = (16, 6)
-# Side of the compared windows [px], and what is added to their variance: contrast of less says nothing.
-WINDOW = 7
-LEAST_VARIANCE = 1e-4
+# Side of the compared windows [px], and what is added to their variance: contrast of less says nothing. (Large windows
+# make things wider: beside its edge, a thing's outline is seen in the window of what is behind it. Of the demo room's
+# mesh, 88 percent of the vertices were true with windows of 3 and 83 with windows of 5.)
+WINDOW = 3
+LEAST_VARIANCE = 3e-5
 # Costs are 1 - ZNCC. Of a change by one step between neighbouring pixels, of a larger one where their grey is the same
 # and falls off with this difference, and of the ends of the sweep beside its middle, where the map is. (The last only
 # decides where nothing else does: with 0.05, whole regions stayed where the map has them.)
 SMALL_JUMP, LARGE_JUMP, GREY_EDGE = 0.1, 0.8, 0.05
 MAP_WEIGHT = 0.002
-# Kept is a depth that as many neighbours find at the same place to this share of it. (Of the demo room's mesh, true
-# vertices and surface found in percent: all depth 76 and 75, one that agrees 81 and 70, two 84 and 66.)
+# Kept is a depth that as many neighbours find at the same place to this share of it.
 AGREEING = 1
-AGREEMENT = 0.01
+AGREEMENT = 0.02
 # A view of which a smaller share agrees with its neighbours keeps all: of a short run, a poor mesh is better than none.
 LEAST_AGREED = 0.25
 
@@ -142,7 +143,7 @@ def _swept(
     for reach in SWEEPS:
         # Smooth, so that a window is carried over as one piece of a surface, but for edges.
         inverse = cv2.medianBlur(inverse.astype(np.float32), 5)
-        inverse = cv2.bilateralFilter(inverse, -1, 0.1 * float(np.median(inverse)), 6)
+        inverse = cv2.bilateralFilter(inverse, -1, 0.05 * float(np.median(inverse)), 6)
         offsets = np.arange(-reach, reach + 1, dtype=np.float32)
         cost = _matching_cost(view, others, warps, inverse, step * offsets)
         cost += MAP_WEIGHT * np.abs(offsets) / reach

@@ -30,8 +30,11 @@ class Ended:
     said: str
 
 
-def run_until(arguments: list[str], snapshot: Path, kill_after: float | None = None) -> Ended:
-    """`modp-ti run` with these arguments; `kill -9` after so many seconds, if it is there still."""
+def run_until(arguments: list[str], snapshot: Path, kill_after: float | None = None, mapping: bool = False) -> Ended:
+    """`modp-ti run` with these arguments; `kill -9` after so many seconds, if it is there still.
+
+    mapping: they count from when it has written a snapshot, however long it took to start.
+    """
     before = _stamp(snapshot)
     started, first = time.monotonic(), None
     process = subprocess.Popen(
@@ -46,7 +49,8 @@ def run_until(arguments: list[str], snapshot: Path, kill_after: float | None = N
         elapsed = time.monotonic() - started
         if first is None and _stamp(snapshot) != before:
             first = elapsed
-        if kill_after is not None and elapsed >= kill_after:
+        since = first if mapping else 0.0
+        if kill_after is not None and since is not None and elapsed >= since + kill_after:
             process.kill()
             killed = True
             break

@@ -71,6 +71,13 @@ def test_a_run_is_killed_when_it_is_time(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["scene.yaml"]
 
 
+def test_a_run_is_killed_in_the_midst_of_mapping(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(KILLS_SCENE)
+    snapshot = tmp_path / "reference" / "snapshot.npz"
+    ended = run_until([str(tmp_path / "scene.yaml")], snapshot, kill_after=0.0, mapping=True)
+    assert ended.killed and ended.seconds >= ended.first_snapshot and snapshot.is_file()
+
+
 def test_a_run_that_fails_by_itself_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"ended with 2: error: .*gone\.yaml: no such scene file"):
         finished([str(tmp_path / "gone.yaml")], tmp_path)
