@@ -49,8 +49,8 @@ def main() -> None:
         if unknown:
             parser.error(f"no reader {unknown[0]}; there are {', '.join(READERS)}")
         import_readers()
-    print("| reader | seconds | inputs tried | of them kept, for new code | stopped by |")
-    print("|---|---|---|---|---|", flush=True)
+    print("| reader | seconds | of the processor | inputs tried | of them kept, for new code | stopped by |")
+    print("|---|---|---|---|---|---|", flush=True)
     stopped = [name for name in options.reader or READERS if one(name, options)]
     sys.exit(1 if stopped else 0)
 
@@ -71,13 +71,14 @@ def one(name: str, options: argparse.Namespace) -> bool:
                 traceback.print_exc()
             finally:
                 os._exit(1)
-        _, status = os.waitpid(child, 0)
+        _, status, used = os.wait4(child, 0)
         text = log.read_text(errors="replace") if log.exists() else ""
         runs = [int(number) for number in re.findall(r"(?:^#|^Done |executed_units: *)(\d+)", text, re.MULTILINE)]
         crashes = sorted(kept.glob("crash-new-*"))
         reason = "" if status == 0 and not crashes else _reason(text)
         new = sorted((file for file in found.iterdir()), key=lambda file: (file.stat().st_size, file.name))
-        row = [name, f"{time.monotonic() - began:.0f}", f"{max(runs, default=0):,}", str(len(new)), reason]
+        seconds = [f"{time.monotonic() - began:.0f}", f"{used.ru_utime + used.ru_stime:.0f}"]
+        row = [name, *seconds, f"{max(runs, default=0):,}", str(len(new)), reason]
         print(f"| {' | '.join(row)} |", flush=True)
         for crash in crashes:
             crash.rename(crash.with_name(crash.name.replace("crash-new-", "crash-")[:22]))
