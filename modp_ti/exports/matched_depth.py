@@ -28,13 +28,13 @@ NEIGHBOURS = 12
 # No neighbour looks more than this away (cosine of the angle), or from within or beyond these parallaxes.
 LEAST_COSINE = 0.7
 LEAST_PARALLAX, LARGEST_PARALLAX = 0.015, 0.4
-# Steps of inverse depth to either side, of a pixel in the most distant neighbour: a wide sweep, then one around it.
-SWEEPS = (16, 6)
+# Steps of inverse depth to either side, of a pixel in the most distant neighbour: a wide sweep, then those around it.
+SWEEPS = (16, 6, 3)
 # Side of the compared windows [px], and what is added to their variance: contrast of less says nothing. (Large windows
 # make things wider: beside its edge, a thing's outline is seen in the window of what is behind it. Of the demo room's
 # mesh, 88 percent of the vertices were true with windows of 3 and 83 with windows of 5.)
 WINDOW = 3
-LEAST_VARIANCE = 3e-5
+LEAST_VARIANCE = 1e-5
 # Costs are 1 - ZNCC. Of a change by one step between neighbouring pixels, of a larger one where their grey is the same
 # and falls off with this difference, and of the ends of the sweep beside its middle, where the map is. (The last only
 # decides where nothing else does: with 0.05, whole regions stayed where the map has them.)
@@ -142,8 +142,8 @@ def _swept(
     """Inverse depth (H, W) near `inverse` at which the others' pictures fit, found in steps."""
     for reach in SWEEPS:
         # Smooth, so that a window is carried over as one piece of a surface, but for edges.
-        inverse = cv2.medianBlur(inverse.astype(np.float32), 5)
-        inverse = cv2.bilateralFilter(inverse, -1, 0.05 * float(np.median(inverse)), 6)
+        inverse = cv2.medianBlur(inverse.astype(np.float32), 3)
+        inverse = cv2.bilateralFilter(inverse, -1, 0.03 * float(np.median(inverse)), 6)
         offsets = np.arange(-reach, reach + 1, dtype=np.float32)
         cost = _matching_cost(view, others, warps, inverse, step * offsets)
         cost += MAP_WEIGHT * np.abs(offsets) / reach
