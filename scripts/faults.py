@@ -40,7 +40,7 @@ def soak(arguments: argparse.Namespace, say: Say) -> str:
     from fault_injection.soak import soak as run_soak
     from fault_injection.soak import soak_table
 
-    return soak_table(run_soak(arguments.frames, say))
+    return soak_table(run_soak(arguments.frames, arguments.memory, say))
 
 
 def malformed(arguments: argparse.Namespace, say: Say) -> str:
@@ -64,6 +64,9 @@ def main() -> None:
     parser.add_argument("-o", "--output", required=True, type=Path, help="folder of the runs and of faults.md")
     parser.add_argument("--kills", type=int, default=50, metavar="N", help="how many (default 50)")
     parser.add_argument("--frames", type=int, default=20_000, metavar="N", help="of the soak (default 20,000)")
+    parser.add_argument(
+        "--memory", type=float, metavar="GB", help="of the soak's map (mapping.memory; default no limit)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of all chance (default 0)")
     arguments = parser.parse_args()
     unknown = [part for part in arguments.parts if part not in PARTS]

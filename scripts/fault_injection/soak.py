@@ -39,11 +39,11 @@ class Soak:
         return 100.0 * (last / first - 1.0)
 
 
-def soak(frames: int, say: Callable[[str], None]) -> Soak:
-    """Map so many frames: the demo's, there and back again without end."""
+def soak(frames: int, memory: float | None, say: Callable[[str], None]) -> Soak:
+    """Map so many frames, the demo's, there and back again without end, in so much memory [GB] (`mapping.memory`)."""
     initialise("cpu")
     tracker = list(SyntheticTracker(width=WIDTH, height=HEIGHT))
-    settings = MappingSettings(optimise=OptimiseSettings(steps=1, last_steps=1))
+    settings = MappingSettings(optimise=OptimiseSettings(steps=1, last_steps=1), memory=memory)
     mapper = Mapper(WIDTH, HEIGHT, settings)
     megabytes: list[float] = []
     kept: list[float] = []
@@ -88,6 +88,7 @@ def soak_table(result: Soak) -> str:
             "| soak | after a tenth | at the end |",
             "|---|---|---|",
             f"| frames | {result.frames // 10:,} | {result.frames:,} |",
+            f"| keyframes | | {result.keyframes:,} |",
             f"| Gaussians | {result.gaussians[0]:,} | {result.gaussians[-1]:,} |",
             f"| memory of the process [MB] | {result.megabytes[0]:.1f} | {result.megabytes[-1]:.1f} |",
             f"| of that keyframes' images and frames' points [MB] | {result.kept[0]:.1f} | {result.kept[-1]:.1f} |",
