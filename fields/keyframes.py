@@ -118,6 +118,7 @@ class KeyframeStore:
         self.min_side = min_side
         self._keyframes: list[Keyframe] = []
         self._depths = RunningMedian()
+        self.nbytes = 0  # of the keyframes' images and points
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -132,11 +133,6 @@ class KeyframeStore:
     def scene_depth(self) -> float:
         """Median over the keyframes of the median depth of their tracked points: the unit of all lengths."""
         return self._depths.value if len(self._depths) else 1.0
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the keyframes' images and points."""
-        return sum(_nbytes(keyframe.pyramid, keyframe.points) for keyframe in self._keyframes)
 
     def bytes_of(self, frame: TrackedFrame) -> int:
         """Bytes that a frame would take as a keyframe."""
@@ -155,6 +151,7 @@ class KeyframeStore:
         """Keep `frame`. It starts at the mean error of the others (1 for the first), so that it is drawn soon."""
         keyframe = self.view(frame, self.levels)
         self._keyframes.append(keyframe)
+        self.nbytes += _nbytes(keyframe.pyramid, keyframe.points)
         self._depths.add(keyframe.median_depth)
         return keyframe
 
