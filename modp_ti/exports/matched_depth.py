@@ -32,8 +32,9 @@ LEAST_PARALLAX, LARGEST_PARALLAX = 0.015, 0.4
 SWEEPS = (16, 6, 3)
 # Side of the compared windows [px], and what is added to their variance: contrast of less says nothing. (Large windows
 # make things wider: beside its edge, a thing's outline is seen in the window of what is behind it. Of the demo room's
-# mesh, 88 percent of the vertices were true with windows of 3 and 83 with windows of 5.)
-WINDOW = 3
+# mesh, 88 percent of the vertices were true with windows of 3 and 83 with windows of 5. Where fewer than half of the
+# neighbours are there, as in a short run, small ones are too noisy.)
+WINDOW, WINDOW_OF_FEW = 3, 7
 LEAST_VARIANCE = 1e-5
 # Costs are 1 - ZNCC. Of a change by one step between neighbouring pixels, of a larger one where their grey is the same
 # and falls off with this difference, and of the ends of the sweep beside its middle, where the map is. (The last only
@@ -43,8 +44,9 @@ MAP_WEIGHT = 0.002
 # Kept is a depth that as many neighbours find at the same place to this share of it.
 AGREEING = 1
 AGREEMENT = 0.02
-# A view of which a smaller share agrees with its neighbours keeps all: of a short run, a poor mesh is better than none.
-LEAST_AGREED = 0.25
+# A view of which a smaller share agrees with its neighbours, a quarter of it by chance, keeps all: of a short run, a
+# poor mesh is better than none.
+LEAST_AGREED = 0.5
 
 Image = NDArray[np.float32]
 
@@ -164,7 +166,8 @@ def _matching_cost(
     """
     height, width = view.grey.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
-    mean, variance = _moments(view.grey)
+    window = WINDOW if len(others) >= NEIGHBOURS // 2 else WINDOW_OF_FEW
+    mean, variance = _moments(view.grey, window)
     total, count = (np.zeros((len(offsets), height, width), np.float32) for _ in range(2))
     for other, (A, b) in zip(others, warps, strict=True):
         u, v, w = (A[r, 0] * x + A[r, 1] * y + A[r, 2] + b[r] * inverse for r in range(3))
@@ -174,8 +177,8 @@ def _matching_cost(
             carried = cv2.remap(
                 other.grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-99.0
             )
-            there, spread = _moments(carried)
-            together = cv2.blur(view.grey * carried, (WINDOW, WINDOW)) - mean * there
+            there, spread = _moments(carried, window)
+            together = cv2.blur(view.grey * carried, (window, window)) - mean * there
             seen = there >= 0.0  # no part of the window is outside
             score = together / np.sqrt((variance + LEAST_VARIANCE) * (spread + LEAST_VARIANCE))
             total[d] += np.where(seen, 1.0 - score, 0.0)
@@ -184,10 +187,10 @@ def _matching_cost(
     return np.ascontiguousarray(cost.transpose(1, 2, 0))
 
 
-def _moments(grey: Image) -> tuple[Image, Image]:
+def _moments(grey: Image, window: int) -> tuple[Image, Image]:
     """Mean and variance (H, W) of the window around every pixel."""
-    mean = cv2.blur(grey, (WINDOW, WINDOW))
-    return mean, np.maximum(cv2.blur(grey * grey, (WINDOW, WINDOW)) - mean * mean, 0.0)
+    mean = cv2.blur(grey, (window, window))
+    return mean, np.maximum(cv2.blur(grey * grey, (window, window)) - mean * mean, 0.0)
 
 
 def _smoothed(cost: NDArray[np.float32], grey: Image) -> NDArray[np.float32]:
