@@ -44,9 +44,8 @@ MAP_WEIGHT = 0.002
 # Kept is a depth that as many neighbours find at the same place to this share of it.
 AGREEING = 1
 AGREEMENT = 0.02
-# A view of which a smaller share agrees with its neighbours, a quarter of it by chance, keeps all: of a short run, a
-# poor mesh is better than none.
-LEAST_AGREED = 0.5
+# A view of which a smaller share agrees with its neighbours keeps all: of a short run, a poor mesh is better than none.
+LEAST_AGREED = 0.25
 
 Image = NDArray[np.float32]
 

@@ -67,12 +67,9 @@ def _there_and_back(frames: list[TrackedFrame], count: int) -> Iterator[TrackedF
 
 def _must_be_kept(mapper: Mapper) -> int:
     """Bytes of keyframes' images and points, and of what every frame saw."""
-    images = sum(level.rgba.nbytes for view in mapper.pipeline.keyframes for level in view.pyramid)
-    points = sum(
-        p.xyz.nbytes + p.pixels.nbytes + p.ids.nbytes for p in (view.points for view in mapper.pipeline.keyframes)
-    )
     seen = mapper.frames.points
-    return images + points + sum(rows.nbytes + p.nbytes for rows, p in zip(seen.rows, seen.pixels, strict=True))
+    points = sum(rows.nbytes + pixels.nbytes for rows, pixels in zip(seen.rows, seen.pixels, strict=True))
+    return mapper.pipeline.keyframes.nbytes + points
 
 
 def _resident() -> float:

@@ -8,7 +8,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgpack
@@ -250,19 +250,16 @@ def bomb(text: str) -> str:
 
 def setting(path: str, value: object) -> Callable[[dict], None]:
     """Sets what stands at `a/b/0` of nested data."""
-    *parents, last = [int(part) if part.isdecimal() else part for part in path.split("/")]
-
-    def change(data: dict) -> None:
-        for part in parents:
-            data = data[part]
-        data[last] = value
-
-    return change
+    return _placed([int(part) if part.isdecimal() else part for part in path.split("/")], value)
 
 
 def key_of(path: str, value: object) -> Callable[[dict], None]:
     """The same where every key is text."""
-    *parents, last = path.split("/")
+    return _placed(path.split("/"), value)
+
+
+def _placed(path: Sequence[str | int], value: object) -> Callable[[dict], None]:
+    *parents, last = path
 
     def change(data: dict) -> None:
         for part in parents:

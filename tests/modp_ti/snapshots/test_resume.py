@@ -78,6 +78,13 @@ def assert_the_same(out: Path, peace: Path) -> None:
     assert expected["snapshots"]["resumed"] == 0 < figures["snapshots"]["resumed"]
 
 
+def assert_resumed_ends_the_same(out: Path, peace: Path) -> None:
+    process = start("--resume", str(out))
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert_the_same(out, peace)
+
+
 def test_a_finished_run_keeps_no_snapshot(in_peace: Path) -> None:
     assert not (in_peace / FILE).exists()
     assert json.loads((in_peace / "metrics.json").read_text())["snapshots"]["written"] >= 7
@@ -109,10 +116,7 @@ def test_a_run_that_is_killed_and_interrupted_on_its_way_ends_as_one_in_peace(tm
     process.kill()
     process.communicate()
 
-    process = start("--resume", str(out))
-    said, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert_the_same(out, in_peace)
+    assert_resumed_ends_the_same(out, in_peace)
     assert not (out / FILE).exists()
 
 
@@ -132,10 +136,7 @@ def test_a_run_that_is_interrupted_while_it_is_scored_keeps_its_map_and_is_score
     for name in ("splats.ply", "trajectory.txt"):
         assert (out / name).read_bytes() == (in_peace / name).read_bytes()
 
-    process = start("--resume", str(out))
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert_the_same(out, in_peace)
+    assert_resumed_ends_the_same(out, in_peace)
 
 
 def test_a_tracker_that_finds_the_poses_itself_finds_them_again(tmp_path: Path) -> None:
@@ -160,10 +161,7 @@ snapshot_every: 3
     wait_for(process, out / FILE, (6, 0))
     process.kill()
     process.communicate()
-    process = start("--resume", str(out))
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert_the_same(out, peace)
+    assert_resumed_ends_the_same(out, peace)
 
 
 @pytest.fixture
