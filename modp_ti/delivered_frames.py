@@ -35,15 +35,18 @@ class DeliveredFrames:
     def __len__(self) -> int:
         return len(self.index)
 
-    def add(self, frame: TrackedFrame) -> None:
-        """Keep the next frame, but for its image."""
+    def add(self, frame: TrackedFrame, with_points: bool = True) -> None:
+        """Keep the next frame, but for its image. with_points: whether also which points it saw where."""
         self.index.append(frame.index)
         self.name.append(frame.name)
         self.timestamp.append(frame.timestamp)
         self.camera.append(frame.camera)
         self.held_out.append(frame.held_out)
         self.T_tracked.append(frame.T_camera_world)
-        self.points.add(frame)
+        if with_points:
+            self.points.add(frame)
+        else:
+            self.points.leave_out(frame)
 
     def correct(self, correction: PoseCorrection, motion: WorldMotion, moved: bool) -> None:
         """Take over the poses and points that the tracker names; the others go with the world around them.

@@ -64,9 +64,18 @@ class Mapper:
         if self.frames.index and frame.index <= self.frames.index[-1]:
             raise ValueError(f"{frame.name} has index {frame.index}, the frame before it {self.frames.index[-1]}")
         report = None if frame.held_out else self.pipeline.process(frame)
-        self.frames.add(frame)
+        self._keep(frame)
         self._finished = False
         return report
+
+    def _keep(self, frame: TrackedFrame) -> None:
+        """Keep what is kept of every frame, as far as there is room beside the map."""
+        if isinstance(self.pipeline, OfflineMapper):
+            self.frames.add(frame)
+            return
+        budget = self.pipeline.budget
+        self.frames.add(frame, with_points=budget.takes_observations(len(frame.points)))
+        budget.beside = self.frames.points.nbytes
 
     def correct(self, correction: PoseCorrection) -> None:
         """Take over poses and points that the tracker has revised. Raises InputError for frames that have not come."""
@@ -125,6 +134,8 @@ class Mapper:
         """
         self.pipeline.restore(state, again)
         self.frames = frames
+        if isinstance(self.pipeline, OnlineMapper):
+            self.pipeline.budget.beside = frames.points.nbytes
         self._finished = finished
 
     def trajectory(self) -> list[NDArray[np.float64]]:

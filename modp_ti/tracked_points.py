@@ -11,36 +11,48 @@ from fields.similarity import moved_points
 from fields.tracked_frame import TrackedFrame
 from modp_ti.trackers.observations import Observations
 from modp_ti.trackers.point_solving import placed_anew
+from pipelines.memory_budget import OBSERVATION
 
 __all__ = ["TrackedPoints"]
 
 # Of a point that only held-out frames saw: their pictures must not come into what is trained on elsewhere.
 UNSEEN = (128, 128, 128)
+# Bytes of a point.
+POINT = 64
+# Rows and pixels of a frame that saw none.
+NOTHING = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
 
 
 class TrackedPoints:
-    """Points by the tracker's ids; 16 bytes an observation, 64 a point.
+    """Points by the tracker's ids; 12 bytes an observation, 64 a point.
 
-    `rows[i]` (N,) and `pixels[i]` (N, 2) float32 are the points that frame i saw, as rows of `xyz`, and their pixels.
+    `rows[i]` (N,) int32 and `pixels[i]` (N, 2) float32 are the points that frame i saw, as rows of `xyz`, and their
+    pixels; none of a frame whose observations found no room.
     """
 
     def __init__(self) -> None:
-        self.rows: list[NDArray[np.int64]] = []
+        self.rows: list[NDArray[np.int32]] = []
         self.pixels: list[NDArray[np.float32]] = []
         self._held_out: list[bool] = []
         self._row_of: dict[int, int] = {}
         self._xyz = np.zeros((0, 3))
         self._colours = np.zeros((0, 4))  # sums of red, green, blue, and of how many
         self._last = np.zeros((0, 1), dtype=np.int64)  # the frame that saw it last
+        self._observations = 0
 
     def __len__(self) -> int:
         return len(self._row_of)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of points and observations."""
+        return self._observations * OBSERVATION + len(self) * POINT
 
     def add(self, frame: TrackedFrame) -> None:
         """Keep what the next frame saw. A point is where the last frame says that it is."""
         points = frame.points
         of = self._row_of
-        rows = np.array([of.setdefault(i, len(of)) for i in points.ids.tolist()], dtype=np.int64)
+        rows = np.array([of.setdefault(i, len(of)) for i in points.ids.tolist()], dtype=np.int32)
         self._grow(len(of))
         self._xyz[rows] = points.xyz
         self._last[rows, 0] = len(self.rows)
@@ -49,9 +61,17 @@ class TrackedPoints:
             rgba = frame.rgba[row, column]
             seen = rgba[:, 3] > 0
             np.add.at(self._colours, rows[seen], np.c_[rgba[seen, :3], np.ones(seen.sum())])
+        self._append(rows, points.pixels.astype(np.float32), frame.held_out)
+
+    def leave_out(self, frame: TrackedFrame) -> None:
+        """Keep nothing of what the next frame saw."""
+        self._append(*NOTHING, frame.held_out)
+
+    def _append(self, rows: NDArray[np.int32], pixels: NDArray[np.float32], held_out: bool) -> None:
         self.rows.append(rows)
-        self.pixels.append(points.pixels.astype(np.float32))
-        self._held_out.append(frame.held_out)
+        self.pixels.append(pixels)
+        self._held_out.append(held_out)
+        self._observations += len(rows)
 
     def correct(self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Sequence[NDArray[np.float64]]) -> None:
         """The tracker has revised its map: points `ids` (N,) are at xyz (N, 3) now, as far as frames saw them.
@@ -69,8 +89,8 @@ class TrackedPoints:
         """All of it as arrays, for `restore`."""
         return {
             "counts": np.array([len(rows) for rows in self.rows], dtype=np.int64),
-            "rows": np.concatenate([*self.rows, np.zeros(0, dtype=np.int64)]),
-            "pixels": np.concatenate([*self.pixels, np.zeros((0, 2), dtype=np.float32)]),
+            "rows": np.concatenate([*self.rows, NOTHING[0]]),
+            "pixels": np.concatenate([*self.pixels, NOTHING[1]]),
             "ids": self.ids,
             "xyz": self.xyz,
             "colours": self._colours[: len(self)],
@@ -95,6 +115,7 @@ class TrackedPoints:
         self.rows = np.split(state["rows"], cuts) if frames else []
         self.pixels = np.split(state["pixels"], cuts) if frames else []
         self._held_out = list(held_out)
+        self._observations = seen
         self._row_of = {i: row for row, i in enumerate(state["ids"].tolist())}
         self._xyz, self._colours, self._last = state["xyz"], state["colours"], state["last"]
 

@@ -18,7 +18,8 @@ class Guards:
     exploded_gaussians: those that had grown beyond `EXPLODED`, made transparent, so that the next pruning takes them.
     camera_steps: steps of a keyframe's pose, or its alignment, that were no number or would have carried it away.
     exposure_steps: steps of an exposure that were no number. views: views of a step whose loss was no number.
-    gaussians_without_room, keyframes_without_room: those that were left out for want of memory (`MemoryBudget`).
+    gaussians_without_room, keyframes_without_room, observations_without_room: those that were left out for want of
+    memory (`MemoryBudget`).
     """
 
     gaussian_steps: int = 0
@@ -28,6 +29,7 @@ class Guards:
     views: int = 0
     gaussians_without_room: int = 0
     keyframes_without_room: int = 0
+    observations_without_room: int = 0
 
     def counts(self) -> dict[str, int]:
         """The counts by their names."""
@@ -48,6 +50,7 @@ class Guards:
             "views": "views had a loss that is no number",
             "gaussians_without_room": "Gaussians found no room (mapping.max_gaussians, mapping.memory)",
             "keyframes_without_room": "keyframes found no room (mapping.memory)",
+            "observations_without_room": "observations of tracked points found no room (mapping.memory)",
         }
         caught = [f"{count:,} {meanings[name]}" for name, count in self.counts().items() if count]
         return f"guards: {'; '.join(caught)}" if caught else None

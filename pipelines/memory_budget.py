@@ -8,18 +8,22 @@ from fields.occupancy import OccupancyVoxels
 from fields.tracked_frame import TrackedFrame
 from pipelines.guards import Guards
 
-__all__ = ["MemoryBudget"]
+__all__ = ["OBSERVATION", "MemoryBudget"]
+
+# Bytes of a point that a frame saw: which, and its pixel.
+OBSERVATION = 12
 
 
 class MemoryBudget:
-    """Keeps Gaussians, keyframes' images and points, and voxels within a number of bytes.
+    """Keeps Gaussians, keyframes' images and points, voxels, and what is kept beside them within a number of bytes.
 
     It is reckoned from what the map holds, and not asked of the system: two runs refuse the same. What has no room is
     left out and counted in `guards`: Gaussians are not added, and a frame that would have been a keyframe is one like
     those between keyframes. The map goes on being optimised with what it has. Voxels are counted once they are marked:
     those of one keyframe's Gaussians may come on top.
 
-    limit: in bytes, None for none; the pool of `gaussians` is a limit in any case.
+    limit: in bytes, None for none; the pool of `gaussians` is a limit in any case. beside: bytes that others than the
+    map keep of the frames.
     """
 
     def __init__(
@@ -35,11 +39,12 @@ class MemoryBudget:
         self.keyframes = keyframes
         self.voxels = voxels
         self.guards = guards
+        self.beside = 0
 
     def held(self) -> int:
-        """Bytes that the map holds now."""
+        """Bytes that are held now."""
         voxels = 0 if self.voxels is None else self.voxels.nbytes
-        return len(self.gaussians) * self.gaussians.bytes_each + self.keyframes.nbytes + voxels
+        return len(self.gaussians) * self.gaussians.bytes_each + self.keyframes.nbytes + voxels + self.beside
 
     def room(self) -> int:
         """How many further Gaussians there is room for."""
@@ -56,7 +61,12 @@ class MemoryBudget:
 
     def takes_keyframe(self, frame: TrackedFrame) -> bool:
         """Whether there is room for a frame's images and points; counted where not."""
-        if self.limit is None or self.held() + self.keyframes.bytes_of(frame) <= self.limit:
-            return True
-        self.guards.keyframes_without_room += 1
-        return False
+        fits = self.limit is None or self.held() + self.keyframes.bytes_of(frame) <= self.limit
+        self.guards.keyframes_without_room += not fits
+        return fits
+
+    def takes_observations(self, count: int) -> bool:
+        """Whether there is room for so many more of what frames saw of the tracker's points; counted where not."""
+        fits = self.limit is None or self.held() + count * OBSERVATION <= self.limit
+        self.guards.observations_without_room += 0 if fits else count
+        return fits

@@ -252,8 +252,8 @@ class MappingSettings(StrictModel):
     memory: float | None = Field(
         None,
         gt=0,
-        description="memory that Gaussians, keyframes and voxels may take [GB]; what has no room is left out and "
-        "counted. Empty for no limit but max_gaussians",
+        description="memory that Gaussians, keyframes, voxels and what frames saw of tracked points may take [GB]; "
+        "what has no room is left out and counted. Empty for no limit but max_gaussians",
     )
     near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     image_cache: float = Field(
