@@ -120,7 +120,8 @@ class OnlineMapper:
             last = self.keyframes[-1] if len(self.keyframes) else None
             if self.gate.refuses(frame, last, self.renderer, self.near):
                 return FrameReport(frame.index, False, len(self.keyframes), len(self.gaussians), None)
-            is_keyframe = self.selector.is_keyframe(frame, last) and self.budget.takes_keyframe(frame)
+            is_wanted = self.selector.is_keyframe(frame, last)
+            is_keyframe = is_wanted and self.budget.takes_keyframe(frame)
         psnr = None
         if is_keyframe:
             view = self.keyframes.append(frame)
@@ -134,6 +135,12 @@ class OnlineMapper:
         elif len(self.keyframes):
             # Other frames only bring their points, at the pose that the keyframes around them imply.
             self._add(self.keyframes.view(frame), compensate=False)
+            if is_wanted:
+                # Without room for it, the map is optimised for those that there are. Far from them every frame is
+                # wanted: a share of the steps for each.
+                steps = -(-self.settings.optimise.steps // self.settings.keyframes.max_gap)
+                count = 1 + self.settings.views.local_views + self.settings.views.global_views
+                self._optimise_evenly(np.arange(len(self.keyframes)), steps, count)
         return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr)
 
     def correct(self, correction: PoseCorrection) -> CorrectionReport:
@@ -153,8 +160,7 @@ class OnlineMapper:
             if not (settings.enabled and (lags > settings.min_pixels).any()):
                 return CorrectionReport(motion, moved=False)
             self._follow()
-        with self.stopwatch.measure("optimise"):
-            self._mend(np.flatnonzero(lags > 0))
+        self._optimise_evenly(np.flatnonzero(lags > 0), settings.steps, settings.views)
         return CorrectionReport(motion, moved=True)
 
     def _follow(self) -> None:
@@ -185,17 +191,17 @@ class OnlineMapper:
         order = np.argsort(spacing, kind="stable")  # a GPU takes the places of one level together
         self.voxels.update(position[order], spacing[order])
 
-    def _mend(self, moved: NDArray[np.int64]) -> None:
-        """Optimise the map for the keyframes that have moved."""
-        settings, views = self.settings.corrections, self.settings.views
+    def _optimise_evenly(self, among: NDArray[np.int64], steps: int, views: int) -> None:
+        """Optimise the map, and no pose, for so many keyframes `among` (N,) a step, drawn by their errors alone."""
         if len(self.gaussians) == 0:
             return
-        for _ in range(settings.steps):
-            p = global_probabilities(self.keyframes, views.error_weight, 0.0)[moved]
-            batch = [int(j) for j in self.rng.choice(moved, settings.views, p=p / p.sum())]
-            rates = self.optimiser.rates(self.keyframes.scene_depth)
-            self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
-        self.optimiser.settle()
+        with self.stopwatch.measure("optimise"):
+            for _ in range(steps):
+                p = global_probabilities(self.keyframes, self.settings.views.error_weight, 0.0)[among]
+                batch = [int(j) for j in self.rng.choice(among, views, p=p / p.sum())]
+                rates = self.optimiser.rates(self.keyframes.scene_depth)
+                self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
+            self.optimiser.settle()
 
     def finish(self) -> float | None:
         """After the last frame: more steps on the last keyframe, and a last removal of transparent Gaussians."""

@@ -17,6 +17,7 @@ from pipelines.settings import MappingSettings
 from .wall import frame
 
 FRAMES = 6
+VIEWS = MappingSettings().views
 
 
 @dataclass
@@ -28,17 +29,18 @@ class Mapped:
     guards: Guards
     held: int  # what the budget says [bytes]
     counted: int  # what its arrays hold [bytes]
+    renders: int  # views that it was optimised for
 
 
-def mapped(memory: float | None) -> Mapped:
-    """A map of six frames with so much memory [GB]."""
+def mapped(memory: float | None, frames: int = FRAMES) -> Mapped:
+    """A map of so many frames with so much memory [GB]."""
     initialise("cpu")
     settings = MappingSettings(
         sh_degree=0, optimise={"steps": 2, "last_steps": 2}, densify={"warm_up": 2}, memory=memory
     )
     mapper = OnlineMapper(settings, 64, 48, seed=1)
     mapper.compile()
-    for i in range(FRAMES):
+    for i in range(frames):
         mapper.process(frame(i))
     mapper.finish()
     images = sum(level.rgba.nbytes for view in mapper.keyframes for level in view.pyramid)
@@ -50,6 +52,7 @@ def mapped(memory: float | None) -> Mapped:
         mapper.caught(),
         mapper.budget.held(),
         len(mapper.gaussians) * 236 + images + points + bricks * 592,
+        mapper.renderer.view_renders,
     )
 
 
@@ -90,6 +93,16 @@ def test_a_map_ends_within_its_memory_and_says_what_had_no_room(free: Mapped, sh
     assert tight.guards.gaussians_without_room > 0 and "mapping.memory" in tight.guards.warning()
     assert 0 < len(tight.gaussians["position"]) < len(free.gaussians["position"])
     assert len(tight.keyframes) + tight.guards.keyframes_without_room == FRAMES
+
+
+def test_frames_without_room_go_on_optimising_the_map(free: Mapped) -> None:
+    memory = 0.7 * free.held / 1e9
+    tight = mapped(memory)
+    kept = len(tight.keyframes)
+    assert tight.keyframes == list(range(kept)) and 0 < kept < FRAMES
+    # The fifth part of two steps, but one at least, for as many views.
+    views = 1 + VIEWS.local_views + VIEWS.global_views
+    assert tight.renders - mapped(memory, kept).renders == (FRAMES - kept) * views
 
 
 def test_a_frame_without_room_is_no_keyframe(free: Mapped) -> None:
