@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fields.tracked_frame import TrackedFrame
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers.door import DoorTracker, open_door
 
@@ -97,3 +98,15 @@ def answer(connection: socket.socket) -> tuple[int, bytes]:
     while len(payload) < length:
         payload += connection.recv(length - len(payload))
     return kind, payload
+
+
+def greeted(path: Path) -> socket.socket:
+    connection = connect(path)
+    connection.sendall(message(HELLO, hello()))
+    assert answer(connection) == (WELCOME, b"")
+    return connection
+
+
+def colours(frames: list[TrackedFrame]) -> list[int]:
+    """The numbers that the frames were sent with."""
+    return [int(f.rgba[0, 0, 0]) for f in frames]
