@@ -1,7 +1,4 @@
-"""Small valid inputs of every reader, written here byte by byte: what is malformed is made of them.
-
-Three pictures of 48x36 pixels, taken by a camera that moves to the right before forty points on a wall.
-"""
+"""Small valid inputs of every reader, written here byte by byte: what is malformed is made of them."""
 
 from __future__ import annotations
 
@@ -17,11 +14,28 @@ import cv2
 import msgpack
 import numpy as np
 
-__all__ = ["SAMPLES", "Sample", "write_sample"]
+from fault_injection.small_recording import (
+    FOCAL,
+    FRAMES,
+    HEIGHT,
+    INTRINSICS,
+    NAMES,
+    WIDTH,
+    picture,
+    pixels_on,
+    points_file,
+    points_ply,
+    position,
+    scene_file,
+    seen_on,
+    tum_line,
+    wall,
+    write_bytes,
+    write_images,
+    write_text,
+)
 
-WIDTH, HEIGHT, FOCAL, FRAMES = 48, 36, 40.0, 3
-INTRINSICS = f"intrinsics: {{fx: {FOCAL}, cx: {WIDTH / 2}, cy: {HEIGHT / 2}}}"
-NAMES = [f"frame-{i:06d}.color.png" for i in range(FRAMES)]
+__all__ = ["SAMPLES", "Sample", "write_sample"]
 
 
 @dataclass(frozen=True)
@@ -33,106 +47,44 @@ class Sample:
     arguments: tuple[str, ...] = ("check", "scene.yaml", "--quiet")
 
 
-def _points() -> np.ndarray:
-    rng = np.random.default_rng(7)
-    return np.c_[rng.uniform(-1.2, 1.2, 40), rng.uniform(-0.9, 0.9, 40), rng.uniform(2.5, 3.5, 40)]
-
-
-def _position(i: int) -> float:
-    return 0.1 * i
-
-
-def _pixels(i: int) -> np.ndarray:
-    p = _points() - (_position(i), 0.0, 0.0)
-    return FOCAL * p[:, :2] / p[:, 2:] + (WIDTH / 2, HEIGHT / 2)
-
-
-def _seen(i: int) -> np.ndarray:
-    p = _pixels(i)
-    return np.flatnonzero(((p > 0) & (p < (WIDTH, HEIGHT))).all(axis=1))
-
-
-def picture(i: int) -> np.ndarray:
-    """Picture (H, W, 3) of a pattern that moves with the camera."""
-    texture = np.random.default_rng(3).integers(0, 255, (HEIGHT // 4 + 1, WIDTH // 4 + 4, 3), dtype=np.uint8)
-    large = cv2.resize(texture, None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(large[:HEIGHT, i : i + WIDTH])
-
-
-def _text(folder: Path, name: str, lines: list[str]) -> None:
-    file = folder / name
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text("\n".join(lines) + "\n")
-
-
-def _bytes(folder: Path, name: str, data: bytes) -> None:
-    file = folder / name
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(data)
-
-
-def _scene(folder: Path, tracker: str, source: str = f"path: images, {INTRINSICS}") -> None:
-    _text(folder, "scene.yaml", [f"source: {{{source}}}", f"tracker: {{{tracker}}}", "output: out", "device: cpu"])
-
-
-def _images(folder: Path, names: list[str] = NAMES, inside: str = "images") -> None:
-    for i, name in enumerate(names):
-        suffix = Path(name).suffix
-        _bytes(folder, f"{inside}/{name}", cv2.imencode(suffix, picture(i))[1].tobytes())
-
-
-def _tum(i: int, per_second: float = 30.0) -> str:
-    return f"{i / per_second:.6f} {_position(i)} 0 0 0 0 0 1"
-
-
-def _points_text(folder: Path) -> None:
-    _text(folder, "points.txt", [" ".join(f"{v:.6f}" for v in row) for row in _points()])
-
-
-def _ply() -> bytes:
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 40\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz")
-    return (header + "end_header\n").encode() + _points().astype("<f4").tobytes()
-
-
 def _colmap_text(folder: Path, names: list[str] = NAMES) -> None:
-    _text(folder, "sparse/0/cameras.txt", [f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}"])
+    write_text(folder, "sparse/0/cameras.txt", [f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}"])
     images, tracks = [], {n: [] for n in range(40)}
     for i, name in enumerate(names):
-        images.append(f"{i + 1} 1 0 0 0 {-_position(i)} 0 0 1 {name}")
-        pixels, seen = _pixels(i), _seen(i)
+        images.append(f"{i + 1} 1 0 0 0 {-position(i)} 0 0 1 {name}")
+        pixels, seen = pixels_on(i), seen_on(i)
         images.append(" ".join(f"{pixels[n, 0]:.4f} {pixels[n, 1]:.4f} {n + 1}" for n in seen))
         for place, n in enumerate(seen):
             tracks[n].append(f"{i + 1} {place}")
-    _text(folder, "sparse/0/images.txt", images)
+    write_text(folder, "sparse/0/images.txt", images)
     points = [
         f"{n + 1} {x:.6f} {y:.6f} {z:.6f} 200 100 50 0.5 {' '.join(tracks[n])}"
-        for n, (x, y, z) in enumerate(_points())
+        for n, (x, y, z) in enumerate(wall())
         if len(tracks[n]) > 1
     ]
-    _text(folder, "sparse/0/points3D.txt", points)
+    write_text(folder, "sparse/0/points3D.txt", points)
 
 
 def _colmap_binary(folder: Path, names: list[str] = NAMES, inside: str = "sparse/0") -> None:
     cameras = struct.pack("<QiiQQ4d", 1, 1, 1, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     images, tracks = struct.pack("<Q", len(names)), dict.fromkeys(range(40), b"")
     for i, name in enumerate(names):
-        images += struct.pack("<i7di", i + 1, 1, 0, 0, 0, -_position(i), 0, 0, 1) + name.encode() + b"\0"
-        pixels, seen = _pixels(i), _seen(i)
+        images += struct.pack("<i7di", i + 1, 1, 0, 0, 0, -position(i), 0, 0, 1) + name.encode() + b"\0"
+        pixels, seen = pixels_on(i), seen_on(i)
         images += struct.pack("<Q", len(seen)) + b"".join(struct.pack("<ddq", *pixels[n], n + 1) for n in seen)
         for place, n in enumerate(seen):
             tracks[n] += struct.pack("<ii", i + 1, place)
     points = struct.pack("<Q", len(tracks))
-    for n, xyz in enumerate(_points()):
+    for n, xyz in enumerate(wall()):
         points += struct.pack("<Q3d3BdQ", n + 1, *xyz, 200, 100, 50, 0.5, len(tracks[n]) // 8) + tracks[n]
     for stem, data in (("cameras", cameras), ("images", images), ("points3D", points)):
-        _bytes(folder, f"{inside}/{stem}.bin", data)
+        write_bytes(folder, f"{inside}/{stem}.bin", data)
 
 
 def _write_scene(folder: Path) -> None:
-    _images(folder)
+    write_images(folder)
     _colmap_text(folder)
-    _text(
+    write_text(
         folder,
         "scene.yaml",
         ["source:", "  path: images", "  scale: 1.0", "tracker:", "  kind: colmap", "output: out", "device: cpu"],
@@ -140,98 +92,98 @@ def _write_scene(folder: Path) -> None:
 
 
 def _write_colmap_text(folder: Path) -> None:
-    _images(folder)
+    write_images(folder)
     _colmap_text(folder)
-    _scene(folder, "kind: colmap", "path: images")
+    scene_file(folder, "kind: colmap", "path: images")
 
 
 def _write_colmap_binary(folder: Path) -> None:
-    _images(folder)
+    write_images(folder)
     _colmap_binary(folder)
-    _scene(folder, "kind: colmap", "path: images")
+    scene_file(folder, "kind: colmap", "path: images")
 
 
 def _write_transforms(folder: Path) -> None:
-    _images(folder)
+    write_images(folder)
     frames = []
     for i, name in enumerate(NAMES):
-        rows = [[1.0, 0.0, 0.0, _position(i)], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        rows = [[1.0, 0.0, 0.0, position(i)], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": f"images/{name}", "transform_matrix": rows})
     data = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT, "frames": frames}
-    _text(folder, "transforms.json", [json.dumps({**data, "ply_file_path": "points.ply"}, indent=1)])
-    _bytes(folder, "points.ply", _ply())
-    _scene(folder, "kind: transforms", "path: images")
+    write_text(folder, "transforms.json", [json.dumps({**data, "ply_file_path": "points.ply"}, indent=1)])
+    write_bytes(folder, "points.ply", points_ply())
+    scene_file(folder, "kind: transforms", "path: images")
 
 
 def _write_tum(folder: Path) -> None:
-    _images(folder)
-    _text(folder, "trajectory.txt", ["# time tx ty tz qx qy qz qw", *(_tum(i) for i in range(FRAMES))])
-    _points_text(folder)
-    _scene(folder, "kind: tum, points: points.txt")
+    write_images(folder)
+    write_text(folder, "trajectory.txt", ["# time tx ty tz qx qy qz qw", *(tum_line(i) for i in range(FRAMES))])
+    points_file(folder)
+    scene_file(folder, "kind: tum, points: points.txt")
 
 
 def _write_points_ply(folder: Path) -> None:
     _write_tum(folder)
-    _bytes(folder, "points.ply", _ply())
-    _scene(folder, "kind: tum, points: points.ply")
+    write_bytes(folder, "points.ply", points_ply())
+    scene_file(folder, "kind: tum, points: points.ply")
 
 
 def _write_orbslam3(folder: Path) -> None:
-    _images(folder)
-    lines = [f"{1400000000000000000 + i * 50000000}.0 {_position(i)} 0 0 0 0 0 1" for i in range(FRAMES)]
-    _text(folder, "CameraTrajectory.txt", lines)
-    _points_text(folder)
-    _scene(folder, "kind: orbslam3, points: points.txt, time_offset: -1400000000.0, max_difference: 0.2")
+    write_images(folder)
+    lines = [f"{1400000000000000000 + i * 50000000}.0 {position(i)} 0 0 0 0 0 1" for i in range(FRAMES)]
+    write_text(folder, "CameraTrajectory.txt", lines)
+    points_file(folder)
+    scene_file(folder, "kind: orbslam3, points: points.txt, time_offset: -1400000000.0, max_difference: 0.2")
 
 
 def _write_tum_rgbd(folder: Path) -> None:
-    _images(folder, inside="rgb")
-    _text(folder, "rgb.txt", ["# freiburg1", *(f"{i / 30:.6f} rgb/{name}" for i, name in enumerate(NAMES))])
-    _text(folder, "groundtruth.txt", [_tum(i) for i in range(FRAMES)])
-    _points_text(folder)
-    _scene(folder, "kind: tum, points: points.txt", f"path: ., kind: tum_rgbd, {INTRINSICS}")
+    write_images(folder, inside="rgb")
+    write_text(folder, "rgb.txt", ["# freiburg1", *(f"{i / 30:.6f} rgb/{name}" for i, name in enumerate(NAMES))])
+    write_text(folder, "groundtruth.txt", [tum_line(i) for i in range(FRAMES)])
+    points_file(folder)
+    scene_file(folder, "kind: tum, points: points.txt", f"path: ., kind: tum_rgbd, {INTRINSICS}")
 
 
 def _matrix(i: int) -> list[str]:
-    return [f"1 0 0 {_position(i)}", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
+    return [f"1 0 0 {position(i)}", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
 
 
 def _write_replica(folder: Path) -> None:
-    _images(folder, [f"frame{i:06d}.jpg" for i in range(FRAMES)], "results")
-    _text(folder, "traj.txt", [" ".join(_matrix(i)) for i in range(FRAMES)])
-    _points_text(folder)
-    _scene(folder, "kind: replica, points: points.txt", f"path: ., kind: replica, {INTRINSICS}")
+    write_images(folder, [f"frame{i:06d}.jpg" for i in range(FRAMES)], "results")
+    write_text(folder, "traj.txt", [" ".join(_matrix(i)) for i in range(FRAMES)])
+    points_file(folder)
+    scene_file(folder, "kind: replica, points: points.txt", f"path: ., kind: replica, {INTRINSICS}")
 
 
 def _write_sevenscenes(folder: Path) -> None:
-    _images(folder, inside="seq")
+    write_images(folder, inside="seq")
     for i in range(FRAMES):
-        _text(folder, f"seq/frame-{i:06d}.pose.txt", _matrix(i))
-    _points_text(folder)
-    _scene(folder, "kind: sevenscenes, points: points.txt", f"path: seq, kind: sevenscenes, {INTRINSICS}")
+        write_text(folder, f"seq/frame-{i:06d}.pose.txt", _matrix(i))
+    points_file(folder)
+    scene_file(folder, "kind: sevenscenes, points: points.txt", f"path: seq, kind: sevenscenes, {INTRINSICS}")
 
 
 def _write_modp(folder: Path) -> None:
-    _images(folder, inside="rectified")
+    write_images(folder, inside="rectified")
     cameras = []
     for i, name in enumerate(NAMES):
-        rows = [[1.0, 0.0, 0.0, -_position(i)], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        rows = [[1.0, 0.0, 0.0, -position(i)], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
         cameras.append({"image": name, "T_camera_world": rows})
-        cloud = [" ".join(f"{v:.6f}" for v in row) for row in _points()[_seen(i)]]
+        cloud = [" ".join(f"{v:.6f}" for v in row) for row in wall()[seen_on(i)]]
         if i < 2:
-            _text(folder, f"point_cloud/point_cloud_{i}.txt", cloud)
+            write_text(folder, f"point_cloud/point_cloud_{i}.txt", cloud)
     with (folder / "point_cloud" / "point_cloud_2.npy").open("wb") as file:
-        np.save(file, _points()[_seen(2)].astype(np.float32))
-    _text(folder, "trajectory.json", [json.dumps({"cameras": cameras}, indent=1)])
-    _scene(folder, "kind: modp", f"path: ., kind: release, {INTRINSICS}")
+        np.save(file, wall()[seen_on(2)].astype(np.float32))
+    write_text(folder, "trajectory.json", [json.dumps({"cameras": cameras}, indent=1)])
+    scene_file(folder, "kind: modp", f"path: ., kind: release, {INTRINSICS}")
 
 
 def _write_aria(folder: Path) -> None:
-    _images(folder)
+    write_images(folder)
     axes = [f"{axis}_world_device" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
     header = ["graph_uid", "tracking_timestamp_us", "utc_timestamp_ns", *axes, "quality_score"]
-    rows = [f"g1,{round(1e6 * i / 30)},0,{_position(i)},0,0,0,0,0,1,1.0" for i in range(FRAMES)]
-    _text(folder, "closed_loop_trajectory.csv", [",".join(header), *rows])
+    rows = [f"g1,{round(1e6 * i / 30)},0,{position(i)},0,0,0,0,0,1,1.0" for i in range(FRAMES)]
+    write_text(folder, "closed_loop_trajectory.csv", [",".join(header), *rows])
     mount = {"Translation": [0.0, 0.0, 0.0], "UnitQuaternion": [1.0, [0.0, 0.0, 0.0]]}
     lines = [
         json.dumps(
@@ -242,14 +194,14 @@ def _write_aria(folder: Path) -> None:
         )
         for i in range(FRAMES)
     ]
-    _text(folder, "online_calibration.jsonl", lines)
+    write_text(folder, "online_calibration.jsonl", lines)
     table = ["uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"]
-    table += [f"{n},g1,{x:.5f},{y:.5f},{z:.5f},0.001,0.01" for n, (x, y, z) in enumerate(_points())]
-    _bytes(folder, "semidense_points.csv.gz", gzip.compress(("\n".join(table) + "\n").encode(), mtime=0))
+    table += [f"{n},g1,{x:.5f},{y:.5f},{z:.5f},0.001,0.01" for n, (x, y, z) in enumerate(wall())]
+    write_bytes(folder, "semidense_points.csv.gz", gzip.compress(("\n".join(table) + "\n").encode(), mtime=0))
     seen = ["uid,frame_tracking_timestamp_us,camera_serial,u,v"]
-    seen += [f"{n},{round(1e6 * i / 30)},c1,1.0,2.0" for i in range(FRAMES) for n in _seen(i)]
-    _text(folder, "semidense_observations.csv", seen)
-    _scene(folder, "kind: aria, path: .")
+    seen += [f"{n},{round(1e6 * i / 30)},c1,1.0,2.0" for i in range(FRAMES) for n in seen_on(i)]
+    write_text(folder, "semidense_observations.csv", seen)
+    scene_file(folder, "kind: aria, path: .")
 
 
 def _stella_map() -> dict:
@@ -258,12 +210,12 @@ def _stella_map() -> dict:
     camera |= dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
     keyframes = {}
     for i in range(FRAMES):
-        pixels, seen = _pixels(i), _seen(i)
+        pixels, seen = pixels_on(i), seen_on(i)
         keyframes[str(i)] = {
             "ts": i / 30,
             "cam": "lens",
             "rot_cw": [0.0, 0.0, 0.0, 1.0],
-            "trans_cw": [-_position(i), 0.0, 0.0],
+            "trans_cw": [-position(i), 0.0, 0.0],
             "n_keypts": len(seen),
             "undist_keypts": [{"pt": (pixels[n] - 0.5).tolist(), "ang": 0.0, "oct": 0} for n in seen],
             "lm_ids": seen.tolist(),
@@ -272,33 +224,33 @@ def _stella_map() -> dict:
         }
     landmarks = {
         str(n): {"1st_keyfrm": 0, "pos_w": xyz.tolist(), "ref_keyfrm": 0, "n_vis": 3, "n_fnd": 3}
-        for n, xyz in enumerate(_points())
+        for n, xyz in enumerate(wall())
     }
     return {"cameras": {"lens": camera}, "orb_params": {}, "keyframes": keyframes, "landmarks": landmarks}
 
 
 def _write_stella(folder: Path) -> None:
-    _images(folder)
-    _bytes(folder, "map.msg", msgpack.packb(_stella_map()))
-    _text(folder, "frame_trajectory.txt", [_tum(i) for i in range(FRAMES)])
-    _scene(folder, "kind: stella_vslam, path: map.msg", "path: images")
+    write_images(folder)
+    write_bytes(folder, "map.msg", msgpack.packb(_stella_map()))
+    write_text(folder, "frame_trajectory.txt", [tum_line(i) for i in range(FRAMES)])
+    scene_file(folder, "kind: stella_vslam, path: map.msg", "path: images")
 
 
 def _write_image(folder: Path) -> None:
     names = ["0.png", "1.jpg", "2.bmp", "3.tiff", "4.webp", "5.ppm"]
-    _images(folder, names)
+    write_images(folder, names)
     _colmap_text(folder, names)
-    _scene(folder, "kind: colmap", "path: images")
+    scene_file(folder, "kind: colmap", "path: images")
 
 
 def _write_mask(folder: Path) -> None:
-    _images(folder)
+    write_images(folder)
     _colmap_text(folder)
     for name in NAMES:
-        _bytes(folder, f"masks/{name}", cv2.imencode(".png", np.full((HEIGHT, WIDTH), 255, np.uint8))[1].tobytes())
+        write_bytes(folder, f"masks/{name}", cv2.imencode(".png", np.full((HEIGHT, WIDTH), 255, np.uint8))[1].tobytes())
     light = np.full((HEIGHT, WIDTH), 60000, np.uint16)
-    _bytes(folder, "vignette.png", cv2.imencode(".png", light)[1].tobytes())
-    _scene(folder, "kind: colmap", "path: images, masks: masks, vignette: vignette.png")
+    write_bytes(folder, "vignette.png", cv2.imencode(".png", light)[1].tobytes())
+    scene_file(folder, "kind: colmap", "path: images, masks: masks, vignette: vignette.png")
 
 
 def _write_video(folder: Path) -> None:
@@ -307,9 +259,9 @@ def _write_video(folder: Path) -> None:
     for i in range(FRAMES):
         writer.write(picture(i))
     writer.release()
-    _text(folder, "trajectory.txt", [_tum(i) for i in range(FRAMES)])
-    _points_text(folder)
-    _scene(folder, "kind: tum, points: points.txt", f"path: room.mp4, {INTRINSICS}")
+    write_text(folder, "trajectory.txt", [tum_line(i) for i in range(FRAMES)])
+    points_file(folder)
+    scene_file(folder, "kind: tum, points: points.txt", f"path: room.mp4, {INTRINSICS}")
 
 
 def splats() -> bytes:
@@ -317,7 +269,7 @@ def splats() -> bytes:
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     table = np.zeros((40, len(names)), "<f4")
-    table[:, :3] = _points()
+    table[:, :3] = wall()
     table[:, 10:13] = -3.0
     table[:, 13] = 1.0
     header = ["ply", "format binary_little_endian 1.0", "element vertex 40", *(f"property float {n}" for n in names)]
@@ -328,17 +280,17 @@ def _write_run(folder: Path) -> None:
     """The output folder of a finished run, `out`."""
     _write_colmap_binary(folder)
     _colmap_binary(folder, inside="out/colmap")
-    _bytes(folder, "out/splats.ply", splats())
-    _text(folder, "out/trajectory.txt", [_tum(i) for i in range(FRAMES)])
-    _text(folder, "path.txt", [_tum(i) for i in range(FRAMES)])
+    write_bytes(folder, "out/splats.ply", splats())
+    write_text(folder, "out/trajectory.txt", [tum_line(i) for i in range(FRAMES)])
+    write_text(folder, "path.txt", [tum_line(i) for i in range(FRAMES)])
     record = {"near": 0.1, "scene_depth": 3.0, "keyframes": [0, 2], "held_out": [1]}
-    _text(folder, "out/frames.json", [json.dumps(record)])
+    write_text(folder, "out/frames.json", [json.dumps(record)])
     matrix = np.eye(3, 4).tolist()
     frames = [{"index": i, "timestamp": i / 30, "keyframe": True, "matrix": matrix} for i in range(FRAMES)]
-    _text(folder, "out/exposure.json", [json.dumps({"frames": frames})])
+    write_text(folder, "out/exposure.json", [json.dumps({"frames": frames})])
     scores = ["index,name,held_out,stage,psnr,ssim,lpips"]
-    _text(folder, "out/scores.csv", [*scores, *(f"{i},{name},0,online,30.5,0.9," for i, name in enumerate(NAMES))])
-    _scene(folder, "kind: colmap", "path: images")
+    write_text(folder, "out/scores.csv", [*scores, *(f"{i},{name},0,online,30.5,0.9," for i, name in enumerate(NAMES))])
+    scene_file(folder, "kind: colmap", "path: images")
     (folder / "out" / "config.yaml").write_text((folder / "scene.yaml").read_text())
 
 
@@ -362,11 +314,11 @@ def wire() -> bytes:
     poses = []
     for i in range(FRAMES):
         T = np.eye(4)
-        T[0, 3] = -_position(i)
+        T[0, 3] = -position(i)
         poses.append(T)
         late = i == 1
         matrix = np.zeros((4, 4)) if late else T
-        points = b"".join(struct.pack("<q5d", n, *_points()[n], *_pixels(i)[n]) for n in _seen(i)[:5])
+        points = b"".join(struct.pack("<q5d", n, *wall()[n], *pixels_on(i)[n]) for n in seen_on(i)[:5])
         image = cv2.imencode(".jpg", picture(i))[1].tobytes()
         head = struct.pack("<IId16d", i, 0 if late else 1, i / 30, *matrix.ravel())
         block = b"" if late else points
@@ -379,7 +331,7 @@ def wire() -> bytes:
 
 
 def _write_door(folder: Path) -> None:
-    _bytes(folder, "wire", wire())
+    write_bytes(folder, "wire", wire())
 
 
 EXPORT = ("export", "out", "--format", "points", "-o", "written.ply", "--quiet")
