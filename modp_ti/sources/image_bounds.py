@@ -152,6 +152,8 @@ def _tiff(data: bytes) -> _Claim:
         first, entry, value = at + 2, 12, 8
     else:  # BigTIFF
         (at,) = struct.unpack_from(order + "Q", data, 8)
+        if at > len(data):  # beyond 2^63 an offset is none to Python
+            raise _UnknownError
         (entries,) = struct.unpack_from(order + "Q", data, at)
         first, entry, value = at + 8, 20, 12
     found: dict[int, int] = {}

@@ -66,7 +66,11 @@ def test_what_is_no_such_image_is_refused(data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [b"\x89PNG\r\n\x1a\n", b"BM", b"II*\0\xff\xff\xff\xff", b"RIFF1234WEBPVP8 ", b"P6 x y 255\n"]
+    "data",
+    [
+        *(b"\x89PNG\r\n\x1a\n", b"BM", b"II*\0\xff\xff\xff\xff", b"RIFF1234WEBPVP8 ", b"P6 x y 255\n"),
+        b"II+\0\x08\0\0\0" + b"\xff" * 8,  # a BigTIFF whose directory lies beyond what Python can address
+    ],
 )
 def test_a_header_without_its_rest_is_refused(data: bytes) -> None:
     assert why_undecodable(data) == "its header is damaged"
