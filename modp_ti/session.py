@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
@@ -18,7 +18,7 @@ from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 from modp_ti.errors import InputError
-from modp_ti.evaluation import evaluate, trajectory_errors
+from modp_ti.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.interruption import Interruption, RunStopped
 from modp_ti.lpips import open_lpips
 from modp_ti.mapper import Mapper
@@ -45,184 +45,288 @@ def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snap
     raised, which says so.
     """
     with ExitStack() as held:
-        return _run(config, console or Console(quiet=True), held, resumed)
+        return _Session(config, console or Console(quiet=True), held).run(resumed)
 
 
-def _run(config: SceneConfig, console: Console, held: ExitStack, resumed: Snapshot | None) -> Path:
-    """`run_scene`; held: takes what is to be closed at its end, however it ends."""
-    clock = RunClock()
-    record = RunRecord()
-    line = ProgressLine(console)
-    observer = _open_observer(config, console, record, held)
-    try:
-        backend = initialise(config.device, config.threads, config.seed)
-    except RuntimeError as error:
-        raise InputError(str(error)) from None
-    record.device = describe(backend)
-    console.print(f"device: {record.device}", highlight=False, soft_wrap=True)
-    tick = time.perf_counter()
-    tracker = open_tracker(config, line.prepare)
-    held.callback(close, tracker)
-    ahead = config.source.prefetch if may_read_ahead(tracker) else 0
-    stop = Interruption(lambda: console.print("stopping after this step; Ctrl-C again stops at once", highlight=False))
-    with FramesAhead(events(tracker), ahead) as arriving:
-        first = next(arriving, None)
-        if first is None:
-            raise InputError("the tracker delivered no frame: nothing to map")
-        if isinstance(first, PoseCorrection):
-            raise InputError("the tracker corrects poses before its first frame")
-        prepared = time.perf_counter() - tick
-        lpips, no_lpips = open_lpips(config.evaluation.lpips_weights, min(first.camera.width, first.camera.height))
-        notes = [*tracker.notes, *([no_lpips] if no_lpips else [])]
-        _say(notes, console, record)
+class _Session:
+    """A run on its way, and what its stages share. held: takes what is to be closed at its end, however it ends."""
 
-        mapper = build_mapper(config, first.camera)
-        watch = mapper.pipeline.stopwatch
-        watch.seconds["track"] = prepared
-        with line.working("compiling kernels (the first time on this machine takes longest)"):
-            mapper.pipeline.compile()
-        keeper = Keeper(config, mapper, record, clock, lambda text: _say([text], console, record))
-        rest: Iterator[TrackedFrame | PoseCorrection] = chain([first], arriving)
+    def __init__(self, config: SceneConfig, console: Console, held: ExitStack) -> None:
+        self.config = config
+        self.console = console
+        self.held = held
+        self.clock = RunClock()
+        self.record = RunRecord()
+        self.line = ProgressLine(console)
+        self.observer = self._open_observer()  # there before anything that takes minutes
+        self.stop = Interruption(lambda: self._print("stopping after this step; Ctrl-C again stops at once"))
+        try:
+            self.backend = initialise(config.device, config.threads, config.seed)
+        except RuntimeError as error:
+            raise InputError(str(error)) from None
+        self.record.device = describe(self.backend)
+        self._print(f"device: {self.record.device}")
+        # There once the first frame is.
+        self.tracker: Tracker
+        self.mapper: Mapper
+        self.keeper: Keeper
+
+    def run(self, resumed: Snapshot | None) -> Path:
+        """All of it; the output folder."""
+        self._map_the_stream(resumed)
+        self._say_which_frames_were_refused()
+        self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
+        versions = self._versions()
+        self.observer.on_stage("evaluating the saved map")
+        self._write(versions)
+        return self.config.output
+
+    # ---- the stream ------------------------------------------------------------------------------------------
+
+    def _map_the_stream(self, resumed: Snapshot | None) -> None:
+        """Open the tracker, make the mapper for its first frame, and map what comes; or what comes after `resumed`."""
+        tick = time.perf_counter()
+        self.tracker = open_tracker(self.config, self.line.prepare)
+        self.held.callback(close, self.tracker)
+        self.ahead = self.config.source.prefetch if may_read_ahead(self.tracker) else 0
+        with FramesAhead(events(self.tracker), self.ahead) as arriving:
+            first = next(arriving, None)
+            if first is None:
+                raise InputError("the tracker delivered no frame: nothing to map")
+            if isinstance(first, PoseCorrection):
+                raise InputError("the tracker corrects poses before its first frame")
+            prepared = time.perf_counter() - tick
+            self._open_lpips(first.camera)
+            notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
+            self._say(*notes)
+            self.mapper = build_mapper(self.config, first.camera)
+            self.mapper.pipeline.stopwatch.seconds["track"] = prepared
+            with self.line.working("compiling kernels (the first time on this machine takes longest)"):
+                self.mapper.pipeline.compile()
+            rest: Iterator[TrackedFrame | PoseCorrection] = chain([first], arriving)
+            self._open_keeper(resumed, rest)
+            self.observer.begin(self.mapper, frame_count(self.tracker))
+            self.held.enter_context(self.stop)
+            self.clock.begin_mapping()
+            try:
+                self._map(rest)
+            except RunStopped:
+                raise self._stopped() from None
+            self.clock.end_mapping(self.observer.waited)
+        # How a live tracker's frames ended.
+        self._say(*(note for note in self.tracker.notes if note not in notes))
+
+    def _open_lpips(self, camera: PinholeCamera) -> None:
+        side = min(camera.width, camera.height)
+        self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
+
+    def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
+        """What takes the snapshots; with the map and the stream at the place where `resumed` was taken."""
+        self.keeper = keeper = Keeper(self.config, self.mapper, self.record, self.clock, self._say)
         if resumed is not None:
-            with line.working(f"reading again what {resumed.path} was made of"):
-                replay(resumed, mapper, rest, keeper.digest)
+            with self.line.working(f"reading again what {resumed.path} was made of"):
+                replay(resumed, self.mapper, arriving, keeper.digest)
             keeper.go_on_from(resumed)
         elif keeper.path.exists():
-            _say([f"{keeper.path} is of an earlier run: the first one of this run takes its place"], console, record)
-        observer.begin(mapper, frame_count(tracker))
-        held.enter_context(stop)
-        clock.begin_mapping()
-        try:
-            done = len(mapper.frames)
-            line.start_mapping(frame_count(tracker), "reading" if config.mode == "offline" else "mapping", done)
-            _map(mapper, _timed(rest, watch, stop), config, line, record, observer, keeper, stop)
-        except RunStopped:
-            raise _stopped(config, mapper, keeper) from None
-        clock.end_mapping(observer.waited)
-    # How a live tracker's frames ended.
-    _say([note for note in tracker.notes if note not in notes], console, record)
-    refused = {
-        reason: count for reason, count in _left_out(tracker, mapper).items() if count and reason != "unreadable"
-    }
-    if refused:
-        text = ", ".join(f"{count} {reason}" for reason, count in refused.items())
-        _say([f"frames that did not touch the map (mapping.gate): {text}"], console, record)
-    breakdown = breakdown_percent(watch.seconds, clock.mapping)
-    frames, keyframes = mapper.frames, mapper.pipeline.keyframes
-    if len(keyframes) == 0:
-        raise InputError(
-            f"no frame became a keyframe: none has {config.mapping.keyframes.min_points} tracked points; "
-            "give a tracker with points or lower mapping.keyframes.min_points"
-        )
-    versions = {config.mode: keeper.online or mapper.version()}
-    if config.refine.steps and config.mode != "offline":
-        try:
-            keeper.after_mapping()
-            keeper.online = versions[config.mode]
-            _refine(mapper, config, line, record, observer, keeper, stop)
-        except RunStopped:
-            raise _stopped(config, mapper, keeper) from None
-        versions["refined"] = mapper.version()
-    last = list(versions)[-1]
-    observer.on_stage("evaluating the saved map")
-    results = Results(config, frames)
-    metrics = None
-    try:
-        with results.writing():
-            # What is scored is what a reader of the file gets.
-            with line.working("writing the map"):
-                versions[last] = results.write_map(versions[last], keyframes, mapper.pipeline.near)
+            self._say(f"{keeper.path} is of an earlier run: the first one of this run takes its place")
 
-            def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
-                stop.check()
-                line.evaluated()
-                if stage == last:
-                    results.write_frame(frame, render)
+    def _map(self, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
+        """Take in all frames and corrections, in their order, and finish the map. Raises RunStopped between two."""
+        mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
+        line.start_mapping(frame_count(self.tracker), "reading" if offline else "mapping", len(mapper.frames))
+        size = None
+        self.record.begin()
+        try:
+            for frame in _timed(arriving, mapper.pipeline.stopwatch, self.stop):
+                self.keeper.digest.add(frame)
+                if isinstance(frame, PoseCorrection):
+                    mapper.correct(frame)
+                    continue
+                size = size or (frame.camera.width, frame.camera.height)
+                if (frame.camera.width, frame.camera.height) != size:
+                    raise InputError(
+                        f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
+                        f"{size[0]}x{size[1]}: all images of a scene must have one size"
+                    )
+                report = mapper.add(frame)
+                line.frame(report)
+                self.record.frame(frame.index, report)
+                self.observer.on_frame(frame, report)
+                self.keeper.after_frame()
+            if offline:
+                line.start_offline(self.config.offline.steps)
+                mapper.finish(self._optimised)
+            else:
+                mapper.finish()
+            self.stop.check()
+        finally:
+            line.stop()
 
-            line.start_evaluating(len(frames) * len(versions))
+    def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
+        """A step of the offline map is done."""
+        self.line.optimised(step, gaussians, psnr)
+        self.record.optimised(step, gaussians, psnr)
+        self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
+        self.stop.check()
+
+    def _say_which_frames_were_refused(self) -> None:
+        refused = [f"{count} {why}" for why, count in self._left_out().items() if count and why != "unreadable"]
+        if refused:
+            self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
+
+    def _left_out(self) -> dict[str, int]:
+        """How many frames did not touch the map because something is wrong with them, by what."""
+        gate = getattr(self.mapper.pipeline, "gate", None)
+        return {"unreadable": len(getattr(self.tracker, "unreadable", ())), **({} if gate is None else gate.refused)}
+
+    # ---- the finished map ------------------------------------------------------------------------------------
+
+    def _versions(self) -> dict[str, MapVersion]:
+        """The map as it was made, and as it is refined where it is to be; the last one is the run's."""
+        config, keeper = self.config, self.keeper
+        if len(self.mapper.pipeline.keyframes) == 0:
+            raise InputError(
+                f"no frame became a keyframe: none has {config.mapping.keyframes.min_points} tracked points; "
+                "give a tracker with points or lower mapping.keyframes.min_points"
+            )
+        versions = {config.mode: keeper.online or self.mapper.version()}
+        if config.refine.steps and config.mode != "offline":
             try:
-                with watch.measure("evaluate"), FramesAhead(tracker, ahead) as again:
-                    scores = evaluate(mapper.pipeline, again, versions, lpips, keep)
+                keeper.after_mapping()
+                keeper.online = versions[config.mode]
+                self._refine()
             except RunStopped:
-                scores = None  # the map is whole, its figures are not
-            finally:
-                line.stop()
-            if scores is not None:
-                ground_truth = getattr(tracker, "ground_truth", list)()
-                caught = mapper.pipeline.caught()
-                _say([caught.warning()] if caught.warning() else [], console, record)
-                metrics = {
-                    "keyframes": len(keyframes),
-                    "gaussians": len(mapper.pipeline.gaussians),
-                    "backend": backend,
-                    "seed": config.seed,
-                    "frames_per_second": round(len(frames) / clock.mapping, 4),
-                    "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-                    "snapshots": {"written": keeper.written, "failed": keeper.failed, "resumed": keeper.resumed},
-                    "guards": caught.counts(),
-                    "frames_left_out": _left_out(tracker, mapper),
-                    "lpips_note": no_lpips,
-                    "breakdown_percent": breakdown,
-                    **metrics_of(scores, versions, frames, watch.seconds | {"total": clock.total}),
-                    **trajectory_errors(frames.T_tracked, versions[last].trajectory, ground_truth),
-                }
-                results.write_scores(scores, metrics)
-                if config.export.report:
-                    with line.working("writing the report"):
-                        problem = results.write_report(record, metrics, scores, versions, keyframes, ground_truth)
-                    _say([problem] if problem else [], console, record)
-    except InputError as error:
-        raise InputError(f"{error}{keeper.way_on()}") from None
-    if metrics is None:
-        results.remove_figures()
-        more = f"; modp-ti run --resume {config.output} scores it" if keeper.path.is_file() else ""
-        raise KeyboardInterrupt(f"interrupted: the finished map is in {config.output}, without its scores{more}")
-    keeper.remove()
-    line.summary(metrics)
-    return config.output
+                raise self._stopped() from None
+            versions["refined"] = self.mapper.version()
+        return versions
 
+    def _refine(self) -> None:
+        """Refine the map, or go on with it. Raises RunStopped between two steps."""
+        refine = self.config.refine
+        self.line.start_refining(refine.steps, self.keeper.refined)
+        try:
+            self.mapper.refine(refine.steps, refine, self._refined, self.keeper.refined)
+        finally:
+            self.line.stop()
 
-def _left_out(tracker: Tracker, mapper: Mapper) -> dict[str, int]:
-    """How many frames did not touch the map because something is wrong with them, by what."""
-    gate = getattr(mapper.pipeline, "gate", None)
-    return {"unreadable": len(getattr(tracker, "unreadable", ())), **({} if gate is None else gate.refused)}
+    def _refined(self, step: int, psnr: float) -> None:
+        """A step of refinement is done."""
+        steps = self.config.refine.steps
+        self.line.refined(step, psnr)
+        self.record.refined(step, psnr)
+        self.observer.on_step("refining", step, steps, psnr)
+        self.keeper.after_step(step, steps)
+        self.stop.check()
 
-
-def _stopped(config: SceneConfig, mapper: Mapper, keeper: Keeper) -> KeyboardInterrupt:
-    """Leave a snapshot and the map so far; what is to be said of it."""
-    resumable = keeper.keep()
-    frames, keyframes = mapper.frames, mapper.pipeline.keyframes
-    said = f"interrupted after {len(frames)} frames"
-    if len(keyframes):
-        results = Results(config, frames)
+    def _write(self, versions: dict[str, MapVersion]) -> None:
+        """Write the map, score it as a reader gets it, and write what came of it."""
+        pipeline = self.mapper.pipeline
+        results = Results(self.config, self.mapper.frames)
+        last = list(versions)[-1]
         try:
             with results.writing():
-                results.write_map(mapper.version(), keyframes, mapper.pipeline.near)
+                with self.line.working("writing the map"):
+                    versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
+                scores = self._score(versions, results)
+                metrics = None if scores is None else self._write_figures(scores, versions, results)
         except InputError as error:
-            raise InputError(f"{error}{keeper.way_on()}") from None
-        results.remove_figures()
-        said += f"; the map so far is in {config.output}"
-    return KeyboardInterrupt(f"{said}; modp-ti run --resume {config.output} goes on" if resumable else said)
+            raise InputError(f"{error}{self.keeper.way_on()}") from None
+        if metrics is None:
+            results.remove_figures()
+            output = self.config.output
+            more = f"; modp-ti run --resume {output} scores it" if self.keeper.path.is_file() else ""
+            raise KeyboardInterrupt(f"interrupted: the finished map is in {output}, without its scores{more}")
+        self.keeper.remove()
+        self.line.summary(metrics)
 
+    def _score(self, versions: dict[str, MapVersion], results: Results) -> list[FrameScore] | None:
+        """Score all frames, and keep the last map's pictures; None where that was interrupted: the map is whole."""
+        last = list(versions)[-1]
 
-def _say(notes: Iterable[str], console: Console, record: RunRecord) -> None:
-    """Show remarks, and keep them for the report."""
-    for note in notes:
-        console.print(f"note: {note}", highlight=False, soft_wrap=True, markup=False)
-        record.notes.append(note)
+        def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+            self.stop.check()
+            self.line.evaluated()
+            if stage == last:
+                results.write_frame(frame, render)
 
+        self.line.start_evaluating(len(self.mapper.frames) * len(versions))
+        pipeline = self.mapper.pipeline
+        try:
+            with pipeline.stopwatch.measure("evaluate"), FramesAhead(self.tracker, self.ahead) as again:
+                return evaluate(pipeline, again, versions, self.lpips, keep)
+        except RunStopped:
+            return None
+        finally:
+            self.line.stop()
 
-def _open_observer(config: SceneConfig, console: Console, record: RunRecord, held: ExitStack) -> Observer:
-    """The viewer where the scene asks for it; it is there before anything that takes minutes."""
-    if not config.view.enabled:
-        return Unobserved()
-    # Imported here: viser is an extra.
-    from modp_ti.viewer.live import LiveViewer
+    def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
+        """Write the scores, the metrics, which are returned, and the report."""
+        pipeline, frames, keeper = self.mapper.pipeline, self.mapper.frames, self.keeper
+        truth = getattr(self.tracker, "ground_truth", list)()
+        caught = pipeline.caught()
+        if warning := caught.warning():
+            self._say(warning)
+        metrics = {
+            "keyframes": len(pipeline.keyframes),
+            "gaussians": len(pipeline.gaussians),
+            "backend": self.backend,
+            "seed": self.config.seed,
+            "frames_per_second": round(len(frames) / self.clock.mapping, 4),
+            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "snapshots": {"written": keeper.written, "failed": keeper.failed, "resumed": keeper.resumed},
+            "guards": caught.counts(),
+            "frames_left_out": self._left_out(),
+            "lpips_note": self.no_lpips,
+            "breakdown_percent": self.breakdown,
+            **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
+            **trajectory_errors(frames.T_tracked, list(versions.values())[-1].trajectory, truth),
+        }
+        results.write_scores(scores, metrics)
+        if self.config.export.report:
+            with self.line.working("writing the report"):
+                problem = results.write_report(self.record, metrics, scores, versions, pipeline.keyframes, truth)
+            if problem:
+                self._say(problem)
+        return metrics
 
-    viewer = LiveViewer(config.view, lambda text: _say([text], console, record))
-    held.callback(viewer.close)
-    console.print(f"viewer: {viewer.url}", highlight=False, soft_wrap=True)
-    return viewer
+    # ---- beside it -------------------------------------------------------------------------------------------
+
+    def _stopped(self) -> KeyboardInterrupt:
+        """Leave a snapshot and the map so far; what is to be said of it."""
+        resumable = self.keeper.keep()
+        frames, keyframes, output = self.mapper.frames, self.mapper.pipeline.keyframes, self.config.output
+        said = f"interrupted after {len(frames)} frames"
+        if len(keyframes):
+            results = Results(self.config, frames)
+            try:
+                with results.writing():
+                    results.write_map(self.mapper.version(), keyframes, self.mapper.pipeline.near)
+            except InputError as error:
+                raise InputError(f"{error}{self.keeper.way_on()}") from None
+            results.remove_figures()
+            said += f"; the map so far is in {output}"
+        return KeyboardInterrupt(f"{said}; modp-ti run --resume {output} goes on" if resumable else said)
+
+    def _open_observer(self) -> Observer:
+        """The viewer where the scene asks for it."""
+        if not self.config.view.enabled:
+            return Unobserved()
+        # Imported here: viser is an extra.
+        from modp_ti.viewer.live import LiveViewer
+
+        viewer = LiveViewer(self.config.view, self._say)
+        self.held.callback(viewer.close)
+        self._print(f"viewer: {viewer.url}")
+        return viewer
+
+    def _say(self, *notes: str) -> None:
+        """Show remarks, and keep them for the report."""
+        for note in notes:
+            self._print(f"note: {note}")
+            self.record.notes.append(note)
+
+    def _print(self, text: str) -> None:
+        self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
@@ -232,79 +336,6 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
         return Mapper(camera.width, camera.height, settings, config.seed)
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def _map(
-    mapper: Mapper,
-    arriving: Iterable[TrackedFrame | PoseCorrection],
-    config: SceneConfig,
-    line: ProgressLine,
-    record: RunRecord,
-    observer: Observer,
-    keeper: Keeper,
-    stop: Interruption,
-) -> None:
-    """Take all frames and corrections in, in their order, and finish the map. Raises RunStopped between two of them."""
-    size = None
-    record.begin()
-    try:
-        for frame in arriving:
-            keeper.digest.add(frame)
-            if isinstance(frame, PoseCorrection):
-                mapper.correct(frame)
-                continue
-            size = size or (frame.camera.width, frame.camera.height)
-            if (frame.camera.width, frame.camera.height) != size:
-                raise InputError(
-                    f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame {size[0]}x{size[1]}: "
-                    "all images of a scene must have one size"
-                )
-            report = mapper.add(frame)
-            line.frame(report)
-            record.frame(frame.index, report)
-            observer.on_frame(frame, report)
-            keeper.after_frame()
-        if config.mode == "offline":
-            line.start_offline(config.offline.steps)
-
-            def optimised(step: int, gaussians: int, psnr: float) -> None:
-                line.optimised(step, gaussians, psnr)
-                record.optimised(step, gaussians, psnr)
-                observer.on_step("optimising", step, config.offline.steps, psnr)
-                stop.check()
-
-            mapper.finish(optimised)
-        else:
-            mapper.finish()
-        stop.check()
-    finally:
-        line.stop()
-
-
-def _refine(
-    mapper: Mapper,
-    config: SceneConfig,
-    line: ProgressLine,
-    record: RunRecord,
-    observer: Observer,
-    keeper: Keeper,
-    stop: Interruption,
-) -> None:
-    """Refine the map, or go on with it. Raises RunStopped between two steps."""
-    steps = config.refine.steps
-    line.start_refining(steps, keeper.refined)
-
-    def refined(step: int, psnr: float) -> None:
-        line.refined(step, psnr)
-        record.refined(step, psnr)
-        observer.on_step("refining", step, steps, psnr)
-        keeper.after_step(step, steps)
-        stop.check()
-
-    try:
-        mapper.refine(steps, config.refine, refined, keeper.refined)
-    finally:
-        line.stop()
 
 
 def _timed(
