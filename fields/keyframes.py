@@ -16,10 +16,21 @@ from fields.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.similarity import moved_points, scale_of
 from fields.tracked_frame import SparsePoints, TrackedFrame
 
-__all__ = ["Keyframe", "KeyframeStore"]
+__all__ = ["NO_MOTION", "Keyframe", "KeyframeStore"]
 
 
-@dataclass
+def _unchanging(array: NDArray[np.float64]) -> NDArray[np.float64]:
+    """One array for all keyframes whose value it still is: a long recording has thousands."""
+    array.flags.writeable = False
+    return array
+
+
+NO_MOTION = _unchanging(np.eye(4))
+NO_POSE_MOMENT = _unchanging(np.zeros(6))
+NO_EXPOSURE_MOMENT = _unchanging(np.zeros((3, 4)))
+
+
+@dataclass(slots=True)
 class Keyframe:
     """One keyframe. Images stay in host memory with 8 bits a channel.
 
@@ -30,6 +41,8 @@ class Keyframe:
     optimised last (err(j) of Eq. 2). vignette: as in `TrackedFrame`, at full size. exposure: (3, 4) affine colour
     transform (A, b), image = (A colour + b) vignette; None for an identity that is not estimated. lag: the motion
     (4, 4) of the world around it, by corrections of the tracker, that its Gaussians have not followed yet.
+
+    Arrays are replaced, never written into: they may be other views' as well.
     """
 
     index: int
@@ -41,15 +54,15 @@ class Keyframe:
     median_depth: float
     error: float
     pyramid: tuple[ImageLevel, ...] = ()
-    pose_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
-    pose_v: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
+    pose_m: NDArray[np.float64] = field(default_factory=lambda: NO_POSE_MOMENT)
+    pose_v: NDArray[np.float64] = field(default_factory=lambda: NO_POSE_MOMENT)
     pose_steps: int = 0
     vignette: NDArray[np.float32] | None = None
     exposure: NDArray[np.float64] | None = None
-    exposure_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 4)))
-    exposure_v: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 4)))
+    exposure_m: NDArray[np.float64] = field(default_factory=lambda: NO_EXPOSURE_MOMENT)
+    exposure_v: NDArray[np.float64] = field(default_factory=lambda: NO_EXPOSURE_MOMENT)
     exposure_steps: int = 0
-    lag: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    lag: NDArray[np.float64] = field(default_factory=lambda: NO_MOTION)
 
     @property
     def view_scale(self) -> float:
@@ -167,7 +180,7 @@ class KeyframeStore:
             index=frame.index,
             rgba=frame.rgba,
             camera=frame.camera,
-            T_tracked=frame.T_camera_world.copy(),
+            T_tracked=frame.T_camera_world,
             T_camera_world=self.corrected(frame.index, frame.T_camera_world),
             points=frame.points,
             median_depth=_median_depth(frame.points, frame.T_camera_world, self.scene_depth),

@@ -19,7 +19,7 @@ MAX_LEVELS = 8
 MIN_SIDE = 22
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ImageLevel:
     """One level: rgba (H, W, 4) uint8, 255 in the last channel where the pixel is valid, and its camera."""
 

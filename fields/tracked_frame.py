@@ -23,7 +23,7 @@ def _empty(*shape: int) -> NDArray[np.float64]:
     return np.zeros(shape, dtype=np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SparsePoints:
     """Tracked 3D points observed in one frame (P_i of the paper).
 

@@ -13,7 +13,7 @@ from fields.camera import PinholeCamera
 from fields.gaussian_motion import GaussianMotion
 from fields.gaussians import GaussianField
 from fields.keyframe_state import KeyframeRows, keyframe_arrays
-from fields.keyframes import Keyframe, KeyframeStore
+from fields.keyframes import NO_MOTION, Keyframe, KeyframeStore
 from fields.occupancy import OccupancyVoxels
 from fields.pose_correction import PoseCorrection
 from fields.se3 import inverse_se3
@@ -52,7 +52,7 @@ class FrameReport:
     psnr: float | None
 
 
-@dataclass
+@dataclass(slots=True)
 class Anchor:
     """A view that placed Gaussians: the keyframe that they move with, and the spacing asked for [scene units]."""
 
@@ -181,7 +181,7 @@ class OnlineMapper:
             self.voxels.settle(self.voxels.coarsest * float(scale_of(first)), origin)
             self._mark()
         for view in self.keyframes:
-            view.lag = np.eye(4)
+            view.lag = NO_MOTION
 
     def _mark(self) -> None:
         """Mark the voxels of all Gaussians, each to the level that its view had asked for."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["FrameNote", "RunRecord", "StepNote"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class FrameNote:
     """A frame that was taken in. done: seconds since the first began. gaussians: in the map when it was done.
 
@@ -28,7 +28,7 @@ class FrameNote:
     psnr: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class StepNote:
     """A step of refinement or of offline optimisation. psnr: mean of its views [dB]. gaussians: where it says."""
 

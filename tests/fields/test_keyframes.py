@@ -87,7 +87,8 @@ def test_a_new_keyframe_starts_with_the_exposure_of_the_last_but_shares_no_memor
     new = store.append(frame(1))
     np.testing.assert_array_equal(new.exposure, np.full((3, 4), 2.0))
     new.exposure += 1.0
-    new.exposure_m += 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        new.exposure_m += 1.0
     np.testing.assert_array_equal(store[0].exposure, np.full((3, 4), 2.0))
     np.testing.assert_array_equal(store[0].exposure_m, 0.0)
 
