@@ -8,8 +8,8 @@ from modp_ti.errors import InputError
 from modp_ti.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.sources.frame_reader import FrameReader, Picture
 from modp_ti.sources.image_folder import ImageFolder
-from modp_ti.sources.intrinsics import Intrinsics, given_intrinsics, require_intrinsics
-from modp_ti.sources.protocol import ImageSource
+from modp_ti.sources.intrinsics import Intrinsics, given_intrinsics
+from modp_ti.sources.protocol import ImageSource, require_intrinsics
 from modp_ti.sources.recognition import recognised_kind
 from modp_ti.sources.release import open_release
 from modp_ti.sources.replica import open_replica

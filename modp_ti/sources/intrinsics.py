@@ -12,9 +12,8 @@ from modp_ti.sources.undistortion import Undistorter
 
 if TYPE_CHECKING:
     from modp_ti.settings import IntrinsicsSettings
-    from modp_ti.sources.protocol import ImageSource
 
-__all__ = ["MAX_SIDE", "Intrinsics", "given_intrinsics", "require_intrinsics", "require_plausible"]
+__all__ = ["MAX_SIDE", "Intrinsics", "given_intrinsics", "require_plausible"]
 
 MAX_SIDE = 1 << 16
 """Pixels on a side of an image; no camera has more."""
@@ -77,18 +76,3 @@ def require_plausible(camera: PinholeCamera, lens: Distortion, what: str) -> tup
     if not all(abs(value) <= MAX_COEFFICIENT for value in (*lens.numerator, *lens.denominator, *lens.tangential)):
         raise InputError(f"{what}: the lens's coefficients are none that a lens has")
     return camera, lens
-
-
-def require_intrinsics(images: ImageSource) -> Intrinsics:
-    """The camera of the source, for a tracker that brings none; its note goes to the source's.
-
-    Raises InputError where it is not known.
-    """
-    if images.intrinsics is None:
-        raise InputError(
-            f"{images.path}: the camera is not known: give source.intrinsics: {{fx: ..., fy: ..., cx: ..., cy: ...}} "
-            "in pixels of the stored images"
-        )
-    if images.intrinsics.note is not None:
-        images.notes.append(images.intrinsics.note)
-    return images.intrinsics

@@ -1,4 +1,4 @@
-"""What a source of images is."""
+"""What a source of images is, and its camera for those who need one."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.errors import InputError
 from modp_ti.sources.intrinsics import Intrinsics
 
-__all__ = ["ImageSource"]
+__all__ = ["ImageSource", "require_intrinsics"]
 
 
 class ImageSource(Protocol):
@@ -67,3 +68,18 @@ class ImageSource(Protocol):
     def close(self) -> None:
         """Let go of what is open: a camera, a file."""
         ...
+
+
+def require_intrinsics(images: ImageSource) -> Intrinsics:
+    """The camera of the source, for a tracker that brings none; its note goes to the source's.
+
+    Raises InputError where it is not known.
+    """
+    if images.intrinsics is None:
+        raise InputError(
+            f"{images.path}: the camera is not known: give source.intrinsics: {{fx: ..., fy: ..., cx: ..., cy: ...}} "
+            "in pixels of the stored images"
+        )
+    if images.intrinsics.note is not None:
+        images.notes.append(images.intrinsics.note)
+    return images.intrinsics

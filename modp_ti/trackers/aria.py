@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from modp_ti.errors import InputError
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import ImageSource, open_source
-from modp_ti.sources.intrinsics import require_intrinsics
+from modp_ti.sources.protocol import require_intrinsics
 from modp_ti.trackers.aria_mps import (
     CameraMounts,
     DeviceTrajectory,

@@ -12,7 +12,7 @@ from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
-from modp_ti.sources.intrinsics import require_intrinsics
+from modp_ti.sources.protocol import require_intrinsics
 from modp_ti.trackers.point_cloud import visible_points
 from modp_ti.trackers.point_file import read_point_file
 from modp_ti.trackers.protocol import Progress

@@ -14,7 +14,7 @@ from modp_ti.errors import InputError
 from modp_ti.reading import LARGEST, open_file, read_json
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.sources import Undistorter, open_source
-from modp_ti.sources.intrinsics import require_intrinsics
+from modp_ti.sources.protocol import require_intrinsics
 from modp_ti.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
 from modp_ti.trackers.number_rows import read_number_rows
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
