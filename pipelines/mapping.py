@@ -140,7 +140,7 @@ class OnlineMapper:
                 # wanted: a share of the steps for each.
                 steps = -(-self.settings.optimise.steps // self.settings.keyframes.max_gap)
                 count = 1 + self.settings.views.local_views + self.settings.views.global_views
-                self._optimise_evenly(np.arange(len(self.keyframes)), steps, count)
+                psnr = self._optimise_evenly(np.arange(len(self.keyframes)), steps, count)
         return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr)
 
     def correct(self, correction: PoseCorrection) -> CorrectionReport:
@@ -191,17 +191,20 @@ class OnlineMapper:
         order = np.argsort(spacing, kind="stable")  # a GPU takes the places of one level together
         self.voxels.update(position[order], spacing[order])
 
-    def _optimise_evenly(self, among: NDArray[np.int64], steps: int, views: int) -> None:
-        """Optimise the map, and no pose, for so many keyframes `among` (N,) a step, drawn by their errors alone."""
+    def _optimise_evenly(self, among: NDArray[np.int64], steps: int, views: int) -> float | None:
+        """Optimise the map, and no pose, for so many keyframes `among` (N,) a step, drawn by their errors alone.
+
+        Returns the last step's mean PSNR.
+        """
         if len(self.gaussians) == 0:
-            return
+            return None
         with self.stopwatch.measure("optimise"):
             for _ in range(steps):
                 p = global_probabilities(self.keyframes, self.settings.views.error_weight, 0.0)[among]
                 batch = [int(j) for j in self.rng.choice(among, views, p=p / p.sum())]
                 rates = self.optimiser.rates(self.keyframes.scene_depth)
                 self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
-            self.optimiser.settle()
+            return self.optimiser.settle() if steps > 0 else None
 
     def finish(self) -> float | None:
         """After the last frame: more steps on the last keyframe, and a last removal of transparent Gaussians."""
