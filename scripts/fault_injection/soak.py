@@ -72,9 +72,7 @@ def _there_and_back(frames: list[TrackedFrame], count: int) -> Iterator[TrackedF
 
 def _must_be_kept(mapper: Mapper) -> int:
     """Bytes of keyframes' images and points, and of what every frame saw."""
-    seen = mapper.frames.points
-    points = sum(rows.nbytes + pixels.nbytes for rows, pixels in zip(seen.rows, seen.pixels, strict=True))
-    return mapper.pipeline.keyframes.nbytes + points
+    return mapper.pipeline.keyframes.nbytes + mapper.frames.points.nbytes
 
 
 def _resident() -> float:
