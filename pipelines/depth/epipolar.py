@@ -158,12 +158,13 @@ class EpipolarDepth:
         # Replicating the border keeps patches at the edge usable.
         left, top = ti.cast(ti.floor(pixels[n, 0]), ti.i32) - RADIUS, ti.cast(ti.floor(pixels[n, 1]), ti.i32) - RADIUS
         right, bottom = grey.shape[1] - 1, grey.shape[0] - 1
-        mean, square = 0.0, 0.0
+        mean = 0.0
         for dy, dx in ti.ndrange(SIDE, SIDE):
-            value = grey[ti.min(ti.max(top + dy, 0), bottom), ti.min(ti.max(left + dx, 0), right)]
-            mean += value / PATCH
+            mean += grey[ti.min(ti.max(top + dy, 0), bottom), ti.min(ti.max(left + dx, 0), right)] / PATCH
+        square = 0.0
+        for dy, dx in ti.ndrange(SIDE, SIDE):
+            value = grey[ti.min(ti.max(top + dy, 0), bottom), ti.min(ti.max(left + dx, 0), right)] - mean
             square += value * value
-        square -= PATCH * mean * mean
         textured = square > PATCH * MIN_CONTRAST * MIN_CONTRAST
         for place in range(begin, end):
             w = inverse[first[n] + place]
@@ -219,7 +220,9 @@ class EpipolarDepth:
                 u, v = px - x0, py - y0
                 above = others[j, y0, x0] * (1.0 - u) + others[j, y0, x0 + 1] * u
                 below = others[j, y0 + 1, x0] * (1.0 - u) + others[j, y0 + 1, x0 + 1] * u
-                there = above * (1.0 - v) + below * v
+                # From the mean of the other patch: sums of squares of the values themselves would leave four digits of
+                # the variance, and a flat peak's parabola to rounding.
+                there = above * (1.0 - v) + below * v - mean
                 sum_ += there
                 square_ += there * there
                 product += there * (here - mean)

@@ -98,16 +98,18 @@ def test_patches_that_leave_the_image_have_no_score(store: KeyframeStore) -> Non
 
 
 def test_a_sample_is_given_up_only_where_it_cannot_reach_the_floor(store: KeyframeStore) -> None:
-    grey, *others = np.random.default_rng(0).uniform(size=(4, 48, 64)).astype(np.float32)
-    others = np.stack([others[0], others[1], grey])
-    warps = np.stack([EpipolarDepth._warp(store[2], store[i]) for i in (0, 1, 2)]).astype(np.float32)
+    """The view itself agrees wholly; once the second neighbour has not, the third cannot lift the mean to the floor."""
+    grey, *others = np.random.default_rng(0).uniform(size=(3, 48, 64)).astype(np.float32)
+    others = np.stack([grey, *others])
+    warps = np.stack([EpipolarDepth._warp(store[2], store[i]) for i in (2, 0, 1)]).astype(np.float32)
     pixels, inverse = PIXELS.astype(np.float32), np.linspace(0.15, 0.4, 30).astype(np.float32)
     exact = score(grey, others, warps, pixels, inverse)
-    bounds = score(grey, others, warps, pixels, inverse, floor=0.5)
-    given_up = bounds != exact
+    bounds = score(grey, others, warps, pixels, inverse, floor=0.7)
+    given_up = bounds - exact > 0.01  # the third would have to agree to 0.97; rounding is 1e-6
     assert 0.3 < given_up.mean() < 0.99
     assert (exact <= bounds + 1e-6).all()
-    assert (bounds[given_up] < 0.5).all()
+    assert (bounds[given_up] < 0.7).all()
+    np.testing.assert_allclose(bounds[bounds >= 0.7], exact[bounds >= 0.7], rtol=1e-6)
 
 
 def test_a_blank_wall_is_left_out(store: KeyframeStore) -> None:
