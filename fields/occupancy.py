@@ -138,6 +138,23 @@ class OccupancyVoxels:
         """Mark each position (N, 3) as occupied on the levels from the coarsest to that of its target size."""
         self.admit(position, size)
 
+    def bytes_to_mark(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.int64]:
+        """Upper bound (N,) on the bytes that `nbytes` grows by when each position is marked after those before it.
+
+        A brick counts as new if the position's coarsest cell in it is not marked, though another of its cells may be.
+        """
+        cells, level = self._cells(position, size)
+        cost = np.zeros(len(cells), dtype=np.int64)
+        asked = (self.levels - 1 - level) // BRICK_LEVELS
+        for stack in range(-(-self.levels // BRICK_LEVELS)):
+            coarsest = np.full(len(cells), max(self.levels - BRICK_LEVELS * (stack + 1), 0), dtype=np.int32)
+            marked = np.empty(len(cells), dtype=np.uint8)
+            self._query(cells, coarsest, marked)
+            new = np.flatnonzero((stack >= asked) & (marked == 0))
+            bricks = cells[new] >> (BRICK_LEVELS * (stack + 1))
+            cost[new[np.unique(bricks, axis=0, return_index=True)[1]]] += WORDS * 8
+        return cost
+
     def admit(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:
         """Which of the positions (N, 3) may hold a new Gaussian at target size (N,) or (): the first of each free cell.
 

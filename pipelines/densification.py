@@ -32,7 +32,7 @@ class Seeds:
     def __len__(self) -> int:
         return len(self.size)
 
-    def __getitem__(self, keep: NDArray) -> Seeds:
+    def __getitem__(self, keep: NDArray | slice) -> Seeds:
         return Seeds(self.xyz[keep], self.size[keep], self.colour[keep])
 
 
@@ -118,12 +118,14 @@ def grow(
 ) -> int:
     """Add isotropic Gaussians at the seeds that the voxels admit at spacing `target` [scene units]; return how many.
 
-    The first of them, as far as the budget has room. anchor: of the new ones, see `GaussianField`.
+    If the budget has no room for all of them, the first ones are taken. anchor: of the new ones, see `GaussianField`.
     """
-    # A place that is marked and stays empty would be refused for ever.
-    if voxels is not None and budget.room() > 0:
+    if voxels is not None:
+        seeds = seeds[~voxels.query(seeds.xyz, target)]
+    # A cell that is marked and stays empty would refuse every later Gaussian: only what has room is marked.
+    seeds = seeds[: budget.take_gaussians(seeds.xyz, target)]
+    if voxels is not None:
         seeds = seeds[voxels.admit(seeds.xyz, target)]
-    seeds = seeds[np.arange(len(seeds)) < budget.take_gaussians(len(seeds))]
     n = len(seeds)
     log_scale = np.log(settings.initial_scale * seeds.size) + settings.scale_offset
     sh = np.zeros((n, gaussians.sh_count, 3))

@@ -362,6 +362,7 @@ class OnlineMapper:
                 T[0, 3] = 0.1 * i
                 view = store.append(TrackedFrame(i, 0.0, "compile", image, camera, T, points))
             if self.voxels is not None:
+                self.voxels.query(np.zeros((0, 3)), 1.0)
                 self.voxels.admit(np.zeros((0, 3)), 1.0)
             grow(self.gaussians, tracked_seeds(view), None, 1.0, self.settings.densify, self.budget)
             self.optimiser.exposure.begin(view, self.renderer, self.settings.near)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fields.gaussians import GaussianField
 from fields.keyframes import KeyframeStore
 from fields.occupancy import OccupancyVoxels
@@ -19,8 +22,8 @@ class MemoryBudget:
 
     It is reckoned from what the map holds, and not asked of the system: two runs refuse the same. What has no room is
     left out and counted in `guards`: Gaussians are not added, and a frame that would have been a keyframe is one like
-    those between keyframes. The map goes on being optimised with what it has. Voxels are counted once they are marked:
-    those of one keyframe's Gaussians may come on top.
+    those between keyframes. The map goes on being optimised with what it has. A Gaussian is taken only if there is room
+    for the voxels that it may mark too, so the limit is never exceeded.
 
     limit: in bytes, None for none; the pool of `gaussians` is a limit in any case. beside: bytes that others than the
     map keep of the frames.
@@ -46,17 +49,19 @@ class MemoryBudget:
         voxels = 0 if self.voxels is None else self.voxels.nbytes
         return len(self.gaussians) * self.gaussians.bytes_each + self.keyframes.nbytes + voxels + self.beside
 
-    def room(self) -> int:
-        """How many further Gaussians there is room for."""
-        room = self.gaussians.capacity - len(self.gaussians)
-        if self.limit is not None:
-            room = min(room, int(self.limit - self.held()) // self.gaussians.bytes_each)
-        return max(room, 0)
+    def take_gaussians(self, position: NDArray[np.float64], size: float) -> int:
+        """Reserve room for Gaussians at positions (N, 3) with voxel target size `size`, in their order.
 
-    def take_gaussians(self, wanted: int) -> int:
-        """How many of so many further Gaussians there is room for; the others are counted."""
-        taken = min(wanted, self.room())
-        self.guards.gaussians_without_room += wanted - taken
+        Returns:
+            How many of the leading positions have room, with the voxels that they may mark; the others are counted.
+        """
+        taken = min(len(position), self.gaussians.capacity - len(self.gaussians))
+        if self.limit is not None:
+            cost = np.full(taken, self.gaussians.bytes_each)
+            if self.voxels is not None:
+                cost += self.voxels.bytes_to_mark(position[:taken], size)
+            taken = int(np.searchsorted(np.cumsum(cost), self.limit - self.held(), side="right"))
+        self.guards.gaussians_without_room += len(position) - taken
         return taken
 
     def takes_keyframe(self, frame: TrackedFrame) -> bool:

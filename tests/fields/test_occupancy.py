@@ -201,3 +201,17 @@ def test_points_of_another_shape_are_refused(
     for ask in (ours.query, ours.admit, ours.update):
         with pytest.raises(ValueError, match=complaint):
             ask(points, size)
+
+
+def test_marking_adds_at_most_the_bytes_foretold_and_just_those_in_empty_voxels(
+    voxels: Callable[..., OccupancyVoxels],
+) -> None:
+    ours = voxels(1.0, levels=6, resolution=64)
+    rng = np.random.default_rng(3)
+    for n, size in enumerate((0.05, 0.3, 2.0, 0.03, 0.05)):
+        points = rng.uniform(-3, 3, (500, 3))
+        points = points[~ours.query(points, size)]
+        before, foretold = ours.nbytes, int(ours.bytes_to_mark(points, size).sum())
+        ours.update(points, size)
+        assert ours.nbytes <= before + foretold
+        assert n > 0 or ours.nbytes == foretold > 0
