@@ -1,13 +1,101 @@
-"""Taichi, started anew for every test module."""
+"""Taichi, started anew for every test module; marks; what is made once for all modules and workers."""
 
 from __future__ import annotations
 
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import pytest
+from filelock import FileLock
 
 from fields.backend import initialise
+
+if TYPE_CHECKING:
+    from tests.room import Room, RoomRecording
+
+pytest_plugins = ["tests.spread"]
+
+# Kernels that the tests compile have a cache of their own: Taichi's holds 100 MB, and the whole suite fills more.
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modp-ti" / "test-kernels"
+os.environ.setdefault("TI_OFFLINE_CACHE_FILE_PATH", str(CACHE))
+os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(1 << 30))
+
+HERE = Path(__file__).resolve().parent
+SHARED_DATA = HERE.parents[1] / "shared" / "data"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests by what they need, and put the slow modules first, so that no worker ends alone with one of them."""
+    for item in items:
+        if "shared_data" in getattr(item, "fixturenames", ()):
+            item.add_marker("real_data")
+        if HERE / "pipelines" / "gpu" in item.path.parents:
+            item.add_marker("gpu")
+    slow = {item.path for item in items if any(item.iter_markers("slow")) or any(item.iter_markers("gpu"))}
+    items.sort(key=lambda item: item.path not in slow)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """A run that leaves out the GPU's kernels must not pass for one that tested them."""
+    left_out = [r for r in terminalreporter.getreports("skipped") if "tests/pipelines/gpu/" in r.nodeid]
+    if left_out:
+        terminalreporter.write_line(
+            f"NOT TESTED: the GPU's kernels ({len(left_out)} tests skipped): neither CUDA nor a Vulkan driver starts; "
+            "install mesa-vulkan-drivers",
+            red=True,
+        )
 
 
 @pytest.fixture(autouse=True, scope="module")
 def taichi_on_the_cpu() -> None:
     """Fields of an earlier module are gone: Taichi 1.7.4 writes beyond its memory once fields fill its first GB."""
     initialise("cpu")
+
+
+@pytest.fixture
+def shared_data() -> Callable[[str], Path]:
+    """The folder of a real data set; skips the test where it is not there."""
+
+    def folder(name: str) -> Path:
+        if not (SHARED_DATA / name).is_dir():
+            pytest.skip(f"no ../shared/data/{name}")
+        return SHARED_DATA / name
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """A folder that the first worker to ask for it fills, by a key. Nobody may write to it afterwards."""
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent
+
+    def folder(key: str, fill: Callable[[Path], None]) -> Path:
+        place = base / f"shared-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+        with FileLock(f"{place}.lock"):
+            if not (place / "filled").exists():
+                (place / "content").mkdir(parents=True)
+                fill(place / "content")
+                (place / "filled").touch()
+        return place / "content"
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def room() -> Room:
+    from tests.room import Room  # which loads Open3D
+
+    return Room()
+
+
+@pytest.fixture(scope="session")
+def room_recording(room: Room) -> RoomRecording:
+    """Nine frames of 80x60 in the room."""
+    from tests.room import RoomRecording, pinhole, walk
+
+    return RoomRecording(room, pinhole(80, 60), walk(9))

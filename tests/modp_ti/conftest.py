@@ -6,28 +6,20 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+from fields.camera import PinholeCamera
+from tests.modp_ti.runs import SHORT_RUN, finished_run
 
-
-@pytest.fixture
-def shared_data() -> Callable[[str], Path]:
-    """The folder of a real data set; skips the test where it is not there."""
-
-    def folder(name: str) -> Path:
-        if not (SHARED_DATA / name).is_dir():
-            pytest.skip(f"no ../shared/data/{name}")
-        return SHARED_DATA / name
-
-    return folder
+if TYPE_CHECKING:
+    from tests.room import RoomRecording
 
 
 @dataclass(frozen=True)
@@ -65,39 +57,19 @@ class PlaneScene:
 
     def write_colmap(self, points: NDArray[np.float64], text: bool = False) -> Path:
         """A COLMAP model in sparse/0 in which every image observes every point that it sees."""
-        model = pycolmap.Reconstruction()
-        camera = pycolmap.Camera(
-            camera_id=1,
-            model="PINHOLE",
-            width=self.size[0],
-            height=self.size[1],
-            params=[self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2]],
-        )
-        model.add_camera_with_trivial_rig(camera)
-        observations: list[list[tuple[int, int]]] = [[] for _ in points]
-        for i, (name, T) in enumerate(zip(self.names, self.T_camera_world, strict=True)):
+        from tests.room import write_colmap
+
+        seen, pixels = [], []
+        for T in self.T_camera_world:
             p = points @ T[:3, :3].T + T[:3, 3]
-            uv = (p / p[:, 2:]) @ self.K.T
-            seen = np.flatnonzero(
-                (p[:, 2] > 0) & (uv[:, :2] > 0).all(axis=1) & (uv[:, 0] < self.size[0]) & (uv[:, 1] < self.size[1])
-            )
-            image = pycolmap.Image(
-                name=name,
-                camera_id=1,
-                image_id=i + 1,
-                points2D=pycolmap.Point2DList([pycolmap.Point2D(uv[j, :2]) for j in seen]),
-            )
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
-            for place, j in enumerate(seen):
-                observations[j].append((i + 1, place))
-        for j, xyz in enumerate(points):
-            track = pycolmap.Track()
-            for image_id, place in observations[j]:
-                track.add_element(image_id, place)
-            model.add_point3D(xyz, track)
+            uv = ((p / p[:, 2:]) @ self.K.T)[:, :2]
+            visible = (p[:, 2] > 0) & (uv > 0).all(axis=1) & (uv < self.size).all(axis=1)
+            seen.append(np.flatnonzero(visible))
+            pixels.append(uv[visible])
         folder = self.folder.parent / "sparse" / "0"
         folder.mkdir(parents=True, exist_ok=True)
-        model.write_text(str(folder)) if text else model.write_binary(str(folder))
+        camera = PinholeCamera(self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2], *self.size)
+        write_colmap(folder, camera, self.names, list(self.T_camera_world), points, seen, pixels, text)
         return folder
 
 
@@ -155,3 +127,14 @@ def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.save(alexnet, folder / "alexnet-owt-7be5be79.pth")
     torch.save(linear, folder / "alex.pth", _use_new_zipfile_serialization=False)  # the package's is of the old format
     return folder
+
+
+@pytest.fixture(scope="session")
+def finished(made_once: Callable[[str, Callable[[Path], None]], Path], room_recording: RoomRecording) -> Path:
+    """The output folder of one short run of the room, beside its scene.yaml and images. Not to be written to."""
+
+    def fill(folder: Path) -> None:
+        room_recording.write(folder)
+        finished_run(folder, SHORT_RUN, "device: CPU")
+
+    return made_once(SHORT_RUN, fill) / "out"

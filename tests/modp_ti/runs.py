@@ -18,6 +18,16 @@ FILES = [
     "splats.ply",
     "trajectory.txt",
 ]
+# Of the room's recording: nine frames of 80x60.
+SHORT_RUN = """
+source:  {path: images, holdout: 4, fps: 10}
+tracker: {kind: colmap, path: sparse/0}
+output:  out
+device:  cpu
+seed:    3
+mapping: {optimise: {steps: 8, last_steps: 10}, densify: {warm_up: 3}}
+refine:  {steps: 20}
+"""
 
 
 def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -13,6 +13,8 @@ from modp_ti.synthetic.renderer import RoomRenderer
 from pipelines.mapping import OnlineMapper
 from pipelines.settings import MappingSettings
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 112, 84
 # Wanders faster than the map could pass for the mean of, and slowly enough to be interpolated between keyframes.
 LIGHT = LightChange(gain=0.4, white_balance=0.1, bias=0.02, drift=3.0, vignette=0.5)

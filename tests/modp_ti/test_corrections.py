@@ -6,22 +6,25 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from fields.backend import initialise
 from fields.camera import PinholeCamera
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
+from modp_ti.config import load_scene
 from modp_ti.delivered_frames import DeliveredFrames
 from modp_ti.evaluation import absolute_trajectory_error
 from modp_ti.exports.trajectory import read_trajectory
 from modp_ti.synthetic import Loop, SyntheticTracker
 from modp_ti.synthetic.renderer import RoomRenderer
-from modp_ti.trackers import events
+from modp_ti.trackers import events, open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.settings import MappingSettings
 from tests.modp_ti.runs import finished_run
 
+pytestmark = pytest.mark.slow
 SIZE = 112, 84
 SETTINGS = MappingSettings(optimise={"steps": 6, "last_steps": 20}, densify={"pixels": 3000})
 
@@ -100,11 +103,28 @@ refine:  {steps: 2}
 """
 
 
-def test_a_run_writes_the_corrected_trajectory_and_counts_corrections(tmp_path: Path) -> None:
-    folder = finished_run(tmp_path, SCENE, "21 frames")
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of a run whose tracker corrects its poses once."""
+    return finished_run(tmp_path_factory.mktemp("corrected"), SCENE, "21 frames")
+
+
+def test_a_run_writes_the_corrected_trajectory_and_counts_corrections(folder: Path) -> None:
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["corrections"] == {"received": 1, "moved": 1}
     assert metrics["ate_rmse"] < 0.03 and metrics["ate_rmse_tracked"] < 0.03
     times, poses = read_trajectory(folder / "trajectory.txt")
     truth = SyntheticTracker(frames=84, select=slice(0, None, 4), loop=Loop()).ground_truth()
     assert len(times) == 21 and absolute_trajectory_error(list(poses), truth, with_scale=False) < 0.03
+
+
+def test_the_trajectory_errors_are_those_of_the_written_and_of_the_tracked_poses(folder: Path) -> None:
+    tracker = open_tracker(load_scene(folder / "config.yaml"))
+    truth = tracker.ground_truth()
+    written = list(read_trajectory(folder / "trajectory.txt")[1])
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["ate_rmse"] == pytest.approx(absolute_trajectory_error(written, truth), abs=1e-6)
+    assert metrics["ate_rmse_rigid"] == pytest.approx(absolute_trajectory_error(written, truth, False), abs=1e-6)
+    assert metrics["ate_rmse"] <= metrics["ate_rmse_rigid"]  # a scale to align as well can only help
+    assert metrics["ate_rmse_tracked"] == pytest.approx(absolute_trajectory_error(tracker._tracked, truth), abs=1e-6)
+    assert len({metrics[f"ate_rmse{of}"] for of in ("", "_rigid", "_tracked")}) == 3

@@ -12,6 +12,8 @@ import pytest
 from modp_ti.exports.splats_ply import read_splats
 from tests.pipelines.wall import frame
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "api.md"
 BLOCKS = re.findall(r"^## ([^\n]+)\n.*?```python\n(.*?)```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d as o3d
 import pycolmap
 import pytest
 from numpy.typing import NDArray
@@ -25,23 +24,19 @@ from modp_ti.playback.map_renderer import MapRenderer
 from modp_ti.settings import SourceSettings, TrackerSettings
 from modp_ti.trackers.transforms import open_transforms
 from tests.modp_ti.exports.splat_readers import READERS
-from tests.modp_ti.runs import finished_run
+from tests.room import HIGH, LOW
 
-SCENE = """
-source:  {scale: 0.25, holdout: 4, stop: 9, fps: 10}
-tracker: {kind: synthetic}
-output:  out
-device:  cpu
-mapping: {optimise: {steps: 8, last_steps: 10}, densify: {warm_up: 3}}
-refine:  {steps: 20}
-"""
 DEFAULTS = {"splat": "splats.splat", "spz": "splats.spz", "compressed-ply": "splats.compressed.ply"}
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The output folder of one run of nine frames, 80x60."""
-    return finished_run(tmp_path_factory.mktemp("finished"), SCENE, "device: CPU")
+def out(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the finished run's folder: exports are written into it."""
+    folder = tmp_path_factory.mktemp("finished")
+    return shutil.copytree(finished, folder / "out")
 
 
 def invoke(*arguments: str | Path) -> Result:
@@ -70,7 +65,7 @@ def test_frames_json_says_which_frames_are_what(out: Path) -> None:
     assert len(data["keyframes"]) == metrics["keyframes"]
     assert not set(data["keyframes"]) & {0, 4, 8}
     assert data["near"] == pytest.approx(0.01 * data["scene_depth"])
-    assert 1.0 < data["scene_depth"] < 4.0  # metres, in the demo room
+    assert 1.0 < data["scene_depth"] < 4.0  # metres, in the test room
 
 
 def test_the_recorded_path_shows_what_the_run_itself_showed(out: Path, tmp_path: Path) -> None:
@@ -133,8 +128,8 @@ def test_a_path_of_ones_own_and_a_wider_view(out: Path, tmp_path: Path) -> None:
     _, render = held_out_pairs(out)[4]
     same = cv2.imread(str(folder / "000000.png"))[..., ::-1]
     np.testing.assert_array_equal(same, render)
-    # The recorded camera sees 2 atan(1 / 1.6) degrees across: at twice the tangent, all is half as large.
-    wide = 2 * np.degrees(np.arctan(2 * 0.625))
+    # The recorded camera sees 2 atan(2 / 3) degrees across: at twice the tangent, all is half as large.
+    wide = 2 * np.degrees(np.arctan(2 * 2 / 3))
     folder = done("render", out, "--path", tmp_path / "mine.txt", "--fov", wide, "-o", tmp_path / "wide")
     wide = cv2.imread(str(folder / "000000.png"))[..., ::-1].astype(np.float64)
     half = cv2.resize(same, (40, 30), interpolation=cv2.INTER_AREA).astype(np.float64)
@@ -207,6 +202,8 @@ def test_every_form_of_the_splats_shows_the_same_map(out: Path, renderer: Callab
 
 
 def test_points_are_the_opaque_gaussians(out: Path, tmp_path: Path) -> None:
+    import open3d as o3d
+
     cloud = o3d.io.read_point_cloud(str(done("export", out, "--format", "points", "-o", tmp_path / "p.ply")))
     state = read_splats(out / "splats.ply")
     solid = state["opacity_logit"] >= 0
@@ -216,18 +213,22 @@ def test_points_are_the_opaque_gaussians(out: Path, tmp_path: Path) -> None:
 
 
 def test_a_mesh_lies_in_the_room(out: Path, tmp_path: Path) -> None:
+    import open3d as o3d
+
     mesh = o3d.io.read_triangle_mesh(str(done("export", out, "--format", "mesh", "-o", tmp_path / "m.ply")))
     vertices = np.asarray(mesh.vertices)
     assert len(mesh.triangles) > 1000
-    inside = ((vertices > [-2.7, -2.3, -0.3]) & (vertices < [2.7, 2.3, 2.9])).all(axis=1)
+    inside = ((vertices > LOW - 0.2) & (vertices < HIGH + 0.2)).all(axis=1)
     assert inside.mean() > 0.8
     assert np.asarray(mesh.vertex_colors).std() > 0.05
 
 
 def test_a_mesh_is_made_of_the_map_s_own_pictures_where_the_images_are_gone(out: Path, tmp_path: Path) -> None:
+    import open3d as o3d
+
     run = shutil.copytree(out, tmp_path / "run")
     config = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(config.replace("  stop: 9", "  stop: 8"))
+    (run / "config.yaml").write_text(config.replace("  stop: null", "  stop: 8"))
     result = invoke("export", run, "--format", "mesh")
     assert result.exit_code == 0
     assert "note: matching the map's own pictures, for want of the images: " in result.stderr

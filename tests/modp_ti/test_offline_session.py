@@ -1,9 +1,11 @@
-"""Runs of the demo room in `mode: offline`, as a user starts them: in processes of their own."""
+"""Runs of a small room in `mode: offline`, as a user starts them: in processes of their own."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,21 +15,27 @@ from modp_ti.exports.trajectory import read_trajectory
 from tests.modp_ti.report.made_up_run import Page
 from tests.modp_ti.runs import FILES, finished_run, run
 
+if TYPE_CHECKING:
+    from tests.room import RoomRecording
+
 SCENE = """
 mode:    offline
-source:  {scale: 0.25, holdout: 4, stop: 9, fps: 10}
-tracker: {kind: synthetic}
+source:  {path: images, holdout: 4, fps: 10}
+tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
 seed:    3
 offline: {steps: 90, sh_every: 3000}
 """
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(room_recording: RoomRecording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of one run."""
-    return finished_run(tmp_path_factory.mktemp("session"), SCENE, "9 frames, 6 keyframes")
+    place = tmp_path_factory.mktemp("offline")
+    room_recording.write(place)
+    return finished_run(place, SCENE, "9 frames, 6 keyframes")
 
 
 def test_a_run_leaves_the_files_that_an_online_run_leaves(folder: Path) -> None:
@@ -66,11 +74,13 @@ def test_the_written_configuration_gives_the_same_map_byte_for_byte(folder: Path
     assert (tmp_path / "again" / "splats.ply").read_bytes() == (folder / "splats.ply").read_bytes()
 
 
-def test_frames_without_points_are_an_error_of_one_line(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.yaml"
-    scene.write_text(SCENE.replace("stop: 9", "stop: 1"))  # only a frame that is held out
-    result = run(scene, "--quiet", "--set", "offline.sh_degree=0")
+def test_frames_without_points_are_an_error_of_one_line(folder: Path, tmp_path: Path) -> None:
+    for name in ("images", "sparse"):
+        (tmp_path / name).symlink_to(folder.parent / name)
+    scene = Path(shutil.copy(folder.parent / "scene.yaml", tmp_path))
+    # Only a frame that is held out.
+    result = run(scene, "--quiet", "--set", "offline.sh_degree=0", "source.stop=1")
     assert result.returncode == 2
     assert result.stderr.startswith("error: `mode: offline` starts from tracked points: ")
     assert result.stderr.count("\n") == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["scene.yaml"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "scene.yaml", "sparse"]

@@ -12,6 +12,8 @@ from modp_ti.synthetic import SyntheticTracker, TrackerNoise
 from pipelines.mapping import OnlineMapper
 from pipelines.settings import MappingSettings
 
+pytestmark = pytest.mark.slow
+
 # Half a percent of the scene's depth and half a degree an axis, another error in every frame; points lie where the
 # wrong pose of the frame that saw them first puts them.
 NOISE = TrackerNoise(pixel=0.3, depth=0.01, translation=0.005, rotation=0.5, drift=0.0)

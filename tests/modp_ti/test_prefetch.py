@@ -120,6 +120,7 @@ assert errors[0][0] == "UnreadableImageError" and "view11.png" in errors[0][1], 
 """
 
 
+@pytest.mark.slow
 def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scene) -> None:
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 9), np.linspace(-0.9, 0.9, 7))
     plane_scene.write_colmap(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))

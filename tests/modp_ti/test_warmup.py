@@ -41,6 +41,7 @@ def test_bad_input_gets_one_line_and_exit_code_two(arguments: list[str], complai
     assert complaint in result.stderr
 
 
+@pytest.mark.slow
 def test_a_run_after_the_warm_up_compiles_nothing(plane_scene, tmp_path) -> None:
     plane_scene.write_colmap(np.random.default_rng(0).uniform(-1, 1, (60, 3)) * [1.8, 1.8, 0])
     scene = plane_scene.folder.parent / "scene.yaml"

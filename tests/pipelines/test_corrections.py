@@ -18,6 +18,8 @@ from pipelines.settings import MappingSettings, OfflineSettings
 
 from .wall import CAMERA, frame, pose
 
+pytestmark = pytest.mark.slow
+
 # The world after a correction by the world before: turned, shifted, grown.
 S = np.diag([1.2, 1.2, 1.2, 1.0]) @ exp_se3([0.4, -0.1, 0.3, 0.05, 0.2, -0.1])
 

@@ -6,6 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
 PROJECT = Path(__file__).resolve().parents[2]
 # The wall of test_mapping.py: every stage, with a correction, pruning, pose refinement and post refinement.
 CODE = """

@@ -18,6 +18,8 @@ from pipelines.settings import ExposureSettings, MappingSettings
 
 from .test_mapping import CAMERA, frame
 
+pytestmark = pytest.mark.slow
+
 EXPOSURE = IDENTITY + np.random.default_rng(1).normal(scale=0.1, size=(3, 4))
 
 

@@ -16,6 +16,8 @@ from pipelines.rendering import Renderer
 from .differences import STEP, central_differences
 from .scenes import CAMERA, NEAR, POSE, random_gaussians
 
+pytestmark = pytest.mark.slow
+
 
 def scene(degree: int) -> dict[str, NDArray[np.float64]]:
     """Gaussians that reach across the whole picture above the cut at 1/255, so that the picture is smooth in all."""

@@ -18,6 +18,8 @@ from pipelines.settings import ExposureSettings, RefineSettings
 from tests.pipelines.test_mapping import SETTINGS
 from tests.pipelines.wall import frame
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 6
 REFINE = RefineSettings(steps=12)
 MIDDLE = 7

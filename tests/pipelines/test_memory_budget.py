@@ -16,6 +16,8 @@ from pipelines.settings import MappingSettings
 
 from .wall import frame
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 6
 VIEWS = MappingSettings().views
 

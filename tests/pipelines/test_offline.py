@@ -14,6 +14,8 @@ from pipelines.settings import OfflineSettings
 from tests.pipelines.test_determinism import PROJECT
 from tests.pipelines.test_mapping import CAMERA, frame
 
+pytestmark = pytest.mark.slow
+
 STEPS = 600
 HELD_OUT = 3
 # The cameras move little before a wide wall: the published sizes, which follow the cameras, would prune all of it.

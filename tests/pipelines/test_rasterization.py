@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 import torch
@@ -50,6 +52,14 @@ def gradients_of(picture: RasterizedView, inputs: dict[str, Tensor]) -> dict[str
 @pytest.fixture
 def scene() -> dict[str, Tensor]:
     return tensors(random_gaussians(60, seed=4, degree=1))
+
+
+@pytest.fixture
+def anew(taichi_on_the_cpu: None) -> Iterator[None]:
+    """Taichi without any fields, before and after: a process keeps those of two kinds of call."""
+    initialise("cpu")
+    yield
+    initialise("cpu")
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------
@@ -141,17 +151,18 @@ def test_what_does_not_fit_is_told_in_one_line(
     assert "\n" not in str(told.value)
 
 
-# ---- room, and Taichi started anew: from here on, tests follow one another ------------------------------------
+# ---- room, and Taichi started anew ----------------------------------------------------------------------------
 
 
-def test_a_third_set_of_fields_is_refused_with_the_way_out(scene: dict[str, Tensor]) -> None:
+def test_a_third_set_of_fields_is_refused_with_the_way_out(anew: None, scene: dict[str, Tensor]) -> None:
     view(scene)
     view(scene, camera=LARGE)
     with pytest.raises(RuntimeError, match=r"begin with the largest image, or call modp_ti\.initialise"):
         view(scene | {"sh": scene["sh"][:, :1]})
 
 
-def test_a_gradient_outlives_a_new_start_of_taichi(scene: dict[str, Tensor]) -> None:
+@pytest.mark.slow
+def test_a_gradient_outlives_a_new_start_of_taichi(anew: None, scene: dict[str, Tensor]) -> None:
     expected = gradients_of(view(scene), scene)
     picture = view(scene)
     initialise("cpu", threads=1)
@@ -180,7 +191,8 @@ def loss_in_torch(render: Tensor, keyframe: Keyframe) -> Tensor:
     return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim[:, 0][:, valid].mean())
 
 
-def test_a_plain_torch_loop_trains_as_our_own_does() -> None:
+@pytest.mark.slow
+def test_a_plain_torch_loop_trains_as_our_own_does(anew: None) -> None:
     """The same start, views, loss and rates: the curves lie on one another, though rounding parts the paths."""
     store = store_of_views([POSE, exp_se3(MOTION) @ POSE, exp_se3(-np.array(MOTION)) @ POSE])
     start = random_gaussians(200, seed=32, degree=1, size=(1.5, 5.0))
@@ -230,9 +242,9 @@ def test_a_plain_torch_loop_trains_as_our_own_does() -> None:
 # ---- in float64 ----------------------------------------------------------------------------------------------
 
 
-def test_gradcheck_in_float64_by_every_input() -> None:
+@pytest.mark.slow
+def test_gradcheck_in_float64_by_every_input(anew: None) -> None:
     """All sixteen numbers of the pose too, the background, and each of the three outputs."""
-    initialise("cpu", threads=1)
     camera = PinholeCamera(9.0, 8.0, 4.2, 2.8, 9, 6)
     # Across the whole picture above the cut at 1/255, so that it is smooth in all.
     state = random_gaussians(3, seed=3, degree=1, camera=camera, size=(4.0, 8.0), logit=(0.0, 1.5), beyond=-0.2)
@@ -248,7 +260,7 @@ def test_gradcheck_in_float64_by_every_input() -> None:
     assert torch.autograd.gradcheck(outputs, (*inputs.values(), T, background))
 
 
-def test_a_colour_is_the_constant_harmonic(scene: dict[str, Tensor]) -> None:
+def test_a_colour_is_the_constant_harmonic(anew: None, scene: dict[str, Tensor]) -> None:
     sh = scene["sh"][:, :1]
     colour = 0.5 + SH_C0 * sh[:, 0]
     geometry = {name: value for name, value in scene.items() if name != "sh"}

@@ -11,6 +11,8 @@ from pipelines.settings import MappingSettings
 
 from .wall import frame
 
+pytestmark = pytest.mark.slow
+
 # Few and short steps: a step on a gradient of pure rounding is as long as any other.
 SETTINGS = MappingSettings(
     optimise={"steps": 2, "last_steps": 2, "batch": 6, "scale_rate": 3e-3}, densify={"warm_up": 2}

@@ -19,6 +19,8 @@ from fields.gaussians import GaussianField
 from fields.tiles import TILE_HEIGHT, TILE_WIDTH
 from pipelines.rendering import Renderer
 
+pytestmark = pytest.mark.slow
+
 SMALL = Size(96, 64, 300)
 
 

@@ -55,6 +55,7 @@ def test_impossible_settings_are_refused_before_the_first_run(scene: Path, tmp_p
     assert started == []
 
 
+@pytest.mark.slow
 def test_a_real_run_that_fails_says_which(scene: Path, tmp_path: Path) -> None:
     # The frames asked for do not exist; the folder's name passes through the command line and YAML unharmed.
     job = Job("beyond the end", scene, scene.parent / "out", {"source.start": "900", "source.stop": "901"})

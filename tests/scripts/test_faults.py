@@ -53,6 +53,7 @@ def test_a_tenth_of_the_frames_is_spoilt_each_in_its_way_and_no_other(recording:
     assert after[spoilt["pose of NaN"] + 1].count("nan") == 7
 
 
+@pytest.mark.slow
 def test_the_recording_is_one_that_a_run_takes(tmp_path: Path) -> None:
     write_recording(tmp_path, frames=12, scale=0.2, steps=2, refine=3)
     frames = list(open_tracker(load_scene(tmp_path / "scene.yaml")))
@@ -71,6 +72,7 @@ def test_a_run_is_killed_when_it_is_time(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["scene.yaml"]
 
 
+@pytest.mark.slow
 def test_a_run_is_killed_in_the_midst_of_mapping(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(KILLS_SCENE)
     snapshot = tmp_path / "reference" / "snapshot.npz"

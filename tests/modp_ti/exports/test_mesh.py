@@ -60,6 +60,7 @@ def test_a_slanted_plane_is_fused_where_it_is() -> None:
     assert coloured.mean() > 0.995
 
 
+@pytest.mark.slow
 def test_the_room_is_fused_to_its_true_surface() -> None:
     """From true depth at true poses: nine tenths within one percent of the room's size, both ways."""
     tracker = SyntheticTracker(width=160, height=120, frames=20, room=RoomRenderer(texel=1.0))

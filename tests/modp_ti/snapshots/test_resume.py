@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import pytest
 
 from modp_ti.errors import InputError
 from modp_ti.snapshots import load_resumed
 from modp_ti.snapshots.file import FILE, read_arrays, write_arrays
-from modp_ti.synthetic import SyntheticTracker
 from tests.modp_ti.runs import finished_run
 
-# Exposure, drift with a correction and pruning: all that a snapshot must hold.
+if TYPE_CHECKING:
+    from tests.room import Room
+
+pytestmark = pytest.mark.slow
+
+# Exposure and pruning; corrections come from klt, below: all that a snapshot must hold.
 SCENE = """
-source:  {scale: 0.2, holdout: 4, step: 6, fps: 10}
-tracker: {kind: synthetic, drift: 0.05, correction: true, exposure_change: 0.5}
+source:  {path: images, holdout: 4, fps: 10}
+tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
 seed:    3
@@ -37,8 +42,20 @@ FIGURES = ("frames", "keyframes", "gaussians", "corrections", "online", "refined
 
 
 @pytest.fixture(scope="module")
-def in_peace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return finished_run(tmp_path_factory.mktemp("peace"), SCENE, "device: CPU")
+def in_peace(tmp_path_factory: pytest.TempPathFactory, room: Room) -> Path:
+    from tests.room import RoomRecording, pinhole, walk
+
+    folder = tmp_path_factory.mktemp("peace")
+    RoomRecording(room, pinhole(64, 48), walk(14)).write(folder, gains=np.exp(0.3 * np.sin(np.arange(14))))
+    return finished_run(folder, SCENE, "device: CPU")
+
+
+@pytest.fixture
+def scene(in_peace: Path, tmp_path: Path) -> Path:
+    """The same scene with the same images, in a folder of its own."""
+    for name in ("images", "sparse"):
+        (tmp_path / name).symlink_to(in_peace.parent / name)
+    return Path(shutil.copy(in_peace.parent / "scene.yaml", tmp_path))
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
@@ -92,10 +109,9 @@ def test_a_finished_run_keeps_no_snapshot(in_peace: Path) -> None:
         load_resumed(in_peace, None, [])
 
 
-def test_a_run_that_is_killed_and_interrupted_on_its_way_ends_as_one_in_peace(tmp_path: Path, in_peace: Path) -> None:
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    out = tmp_path / "out"
-    process = start(str(tmp_path / "scene.yaml"))
+def test_a_run_that_is_killed_and_interrupted_on_its_way_ends_as_one_in_peace(scene: Path, in_peace: Path) -> None:
+    out = scene.parent / "out"
+    process = start(str(scene))
     wait_for(process, out / FILE, (6, 0))
     process.kill()
     process.communicate()
@@ -121,12 +137,11 @@ def test_a_run_that_is_killed_and_interrupted_on_its_way_ends_as_one_in_peace(tm
 
 
 def test_a_run_that_is_interrupted_while_it_is_scored_keeps_its_map_and_is_scored_later(
-    tmp_path: Path, in_peace: Path
+    scene: Path, in_peace: Path
 ) -> None:
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    out = tmp_path / "out"
-    process = start(str(tmp_path / "scene.yaml"))
-    while process.poll() is None and not (tmp_path / "out.partial" / "splats.ply").exists():
+    out = scene.parent / "out"
+    process = start(str(scene))
+    while process.poll() is None and not (scene.parent / "out.partial" / "splats.ply").exists():
         time.sleep(0.002)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=300)
@@ -139,14 +154,13 @@ def test_a_run_that_is_interrupted_while_it_is_scored_keeps_its_map_and_is_score
     assert_resumed_ends_the_same(out, in_peace)
 
 
-def test_a_tracker_that_finds_the_poses_itself_finds_them_again(tmp_path: Path) -> None:
-    recording = SyntheticTracker(width=160, height=120, frames=90)
-    (tmp_path / "images").mkdir()
-    for frame in list(recording)[:24]:
-        cv2.imwrite(str(tmp_path / "images" / f"{frame.index:04d}.png"), frame.rgba[..., 2::-1])
-    c = recording.camera
+def test_a_tracker_that_finds_the_poses_itself_finds_them_again(tmp_path: Path, room: Room) -> None:
+    from tests.room import RoomRecording, pinhole, walk
+
+    camera = pinhole(160, 120)
+    RoomRecording(room, camera, walk(16)).write(tmp_path)
     scene = f"""
-source:  {{path: images, holdout: 8, fps: 10, intrinsics: {{fx: {c.fx}, fy: {c.fy}, cx: {c.cx}, cy: {c.cy}}}}}
+source:  {{path: images, holdout: 8, fps: 10, intrinsics: {{fx: {camera.fx}, fy: {camera.fy}, cx: 80, cy: 60}}}}
 tracker: {{kind: klt}}
 output:  out
 device:  cpu
@@ -156,6 +170,7 @@ export:  {{report: false}}
 snapshot_every: 3
 """
     peace = finished_run(tmp_path, scene, "device: CPU").rename(tmp_path / "peace")
+    assert json.loads((peace / "metrics.json").read_text())["corrections"]["received"] > 0
     out = tmp_path / "out"
     process = start(str(tmp_path / "scene.yaml"))
     wait_for(process, out / FILE, (6, 0))
@@ -197,7 +212,7 @@ def test_an_output_folder_that_was_moved_is_written_where_it_is_now(stopped: Pat
     [
         ("mapping.optimise.steps=5", "its mapping.optimise.steps is 3, here it is 5"),
         ("seed=4", "its seed is 3, here it is 4"),
-        ("source.scale=0.5", "its source.scale is 0.2, here it is 0.5"),
+        ("source.scale=0.5", "its source.scale is 1.0, here it is 0.5"),
         ("refine.steps=10", "its refine.steps is 9, here it is 10"),
     ],
 )

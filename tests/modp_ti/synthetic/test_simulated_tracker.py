@@ -19,6 +19,8 @@ from modp_ti.synthetic import SyntheticTracker, TrackerNoise, open_synthetic, si
 from modp_ti.synthetic.renderer import RoomRenderer
 from modp_ti.trackers.protocol import Tracker, frame_count
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def frames(perfect: SyntheticTracker) -> list[TrackedFrame]:

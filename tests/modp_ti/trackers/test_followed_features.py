@@ -141,6 +141,7 @@ def next_turns(poses: np.ndarray) -> Rotation:
     return Rotation.from_matrix((poses[1:] @ np.linalg.inv(poses[:-1]))[:, :3, :3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("few", [5, 60], ids=["followed", "matched"])
 def test_adjusted_poses_are_those_of_the_images_and_none_hangs_on_held_out_ones(video, tmp_path, monkeypatch, few):
     monkeypatch.setattr(triangulation, "FEW_FRAMES", few)

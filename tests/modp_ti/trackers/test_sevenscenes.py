@@ -39,6 +39,7 @@ def test_poses_are_found_beside_the_images_or_in_a_folder_of_their_own(posed):
     assert any("those of the depth camera" in note for note in tracker.notes)
 
 
+@pytest.mark.slow
 def test_poses_are_adjusted_to_the_images_unless_told_not_to(posed):
     given = posed.open("sevenscenes", adjust=False)
     assert any("nothing here knows by how much" in note for note in given.notes)

@@ -8,18 +8,22 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import browser
 import cv2
 import numpy as np
 import pytest
 
+if TYPE_CHECKING:
+    from tests.room import Room
+
 if browser.missing():
     pytest.skip(browser.missing(), allow_module_level=True)
 
 SCENE = """
-source:  {scale: 0.25, stop: 24, fps: 10}
-tracker: {kind: synthetic}
+source:  {path: images, fps: 10}
+tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
 mapping: {optimise: {steps: 3, last_steps: 4}}
@@ -29,9 +33,15 @@ view:    {port: 0, paused: true}
 PATIENCE = 240.0
 
 
+pytestmark = [pytest.mark.slow, pytest.mark.browser]
+
+
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[tuple[subprocess.Popen, str]]:
+def run(tmp_path: Path, room: Room) -> Iterator[tuple[subprocess.Popen, str]]:
     """A run that holds after its first frame, and where its page is."""
+    from tests.room import RoomRecording, pinhole, walk
+
+    RoomRecording(room, pinhole(80, 60), walk(24)).write(tmp_path)
     (tmp_path / "scene.yaml").write_text(SCENE)
     command = [sys.executable, "-m", "modp_ti.run", str(tmp_path / "scene.yaml")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

@@ -23,6 +23,8 @@ from modp_ti.viewer.finished import FinishedViewer
 from modp_ti.viewer.handover import BrowserCamera
 from modp_ti.viewer.modes import MODES, UNSEEN
 
+pytestmark = pytest.mark.slow
+
 CAMERA = PinholeCamera(90.0, 90.0, 48.0, 32.0, 96, 64)
 NAMES = ["a.png", "b.png", "c.png"]
 

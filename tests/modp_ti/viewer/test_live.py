@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from itertools import count
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ from fields.backend import initialise
 from fields.se3 import inverse_se3, quaternion_from_matrix
 from fields.tracked_frame import TrackedFrame
 from modp_ti.mapper import Mapper
-from modp_ti.settings import SceneConfig, ViewSettings
-from modp_ti.trackers import open_tracker
+from modp_ti.settings import ViewSettings
 from modp_ti.viewer.handover import BrowserCamera
 from modp_ti.viewer.live import PATIENCE, LiveViewer
 from modp_ti.viewer.modes import LEAST_SIDE, MODES
 from pipelines.settings import MappingSettings
+
+if TYPE_CHECKING:
+    from tests.room import RoomRecording
 
 SETTINGS = MappingSettings.model_validate({"optimise": {"steps": 3, "last_steps": 4}, "densify": {"warm_up": 3}})
 WINDOWS = [(640, 480), (300, 500), (1600, 200)]
@@ -69,12 +72,9 @@ def mapped(frames: list[TrackedFrame], viewer: LiveViewer | None) -> tuple[dict[
     return mapper.pipeline.gaussians.to_numpy(), mapper.trajectory()
 
 
-def test_a_map_that_is_looked_at_is_the_same_bit_for_bit():
-    initialise("cpu")
-    config = SceneConfig.model_validate(
-        {"source": {"scale": 0.25, "stop": 5}, "tracker": {"kind": "synthetic"}, "output": "out"}
-    )
-    frames = list(open_tracker(config))
+@pytest.mark.slow
+def test_a_map_that_is_looked_at_is_the_same_bit_for_bit(room_recording: RoomRecording):
+    frames = room_recording.frames()[:5]
     alone, trajectory = mapped(frames, None)
     viewer = Visited()
     seen, seen_trajectory = mapped(frames, viewer)

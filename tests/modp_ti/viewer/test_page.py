@@ -104,6 +104,7 @@ def resident() -> int:
     return 4096 * int(Path("/proc/self/statm").read_text().split()[1])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc")
 def test_a_browser_that_does_not_listen_neither_blocks_nor_fills_the_memory(page: Page):
     from websockets.sync.client import connect

@@ -1,0 +1,199 @@
+"""How far every threshold of the suite lies from what is measured: `pytest --spread N`, `scripts/spread`.
+
+A test that passes may hang on rounding, on one random draw or on where an optimiser happened to end. With `--spread N`
+(N from 1) the same promises are asked of the N-th disturbance: another stream from every seed, one to three threads,
+and inputs moved by one unit in the last place where a test's scene passes them through `disturbed`. All must hold.
+
+With `--spread-report FILE` each assertion that compares numbers appends its slack to the file: the signed distance of
+the value from its bound (for `assert_allclose` and `approx`, one less the share of the tolerance that is used up).
+`python -m tests.spread FILE` reads the files of several disturbances and lists the assertions whose smallest slack is
+less than `MARGIN` times the spread of the slacks: their thresholds would fail on another machine or draw.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+__all__ = ["disturbance", "disturbed"]
+
+# A bound lies this many spreads beyond the worst of the draws.
+MARGIN = 1.0
+NUMBER = r"(?:np\.\w+\()?(-?(?:\d+\.?\d*(?:e[+-]?\d+)?|inf))\)?"
+COMPARISON = re.compile(rf"(?<![\w.]){NUMBER} (<=|>=|<|>) {NUMBER}(?![\w.])")
+
+_number = 0
+_report: Path | None = None
+_site: tuple[str, int, str] | None = None
+_slacks: dict[tuple[str, int, str], float] = {}
+
+
+def disturbance() -> int:
+    """N of `--spread N`; 0 in an ordinary run."""
+    return _number
+
+
+def disturbed(values: NDArray) -> NDArray:
+    """The same values in an ordinary run; under `--spread`, each one unit in the last place up or down."""
+    if not _number:
+        return values
+    up = _default_rng([_number, values.size]).random(values.shape) < 0.5
+    return np.nextafter(values, np.where(up, np.inf, -np.inf).astype(values.dtype))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--spread", type=int, default=0, metavar="N", help="the N-th disturbance of seeds, threads, inputs"
+    )
+    parser.addoption("--spread-report", type=Path, metavar="FILE", help="append the slack of every compared number")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    global _number, _report
+    _number, _report = config.getoption("--spread"), config.getoption("--spread-report")
+    if _number:
+        os.environ["TI_CPU_MAX_NUM_THREADS"] = str(1 + _number % 3)
+        np.random.default_rng = _other_stream
+    if _report:
+        np.testing.assert_allclose = _recording_allclose
+        _record_approx()
+
+
+_default_rng = np.random.default_rng
+
+
+def _other_stream(seed: object = None) -> np.random.Generator:
+    """`np.random.default_rng`, of another stream for every disturbance; a generator stays what it is."""
+    if isinstance(seed, int | np.integer):
+        seed = [int(seed), _number]
+    elif isinstance(seed, list | tuple):
+        seed = [*seed, _number]
+    return _default_rng(seed)
+
+
+# ---- recording -----------------------------------------------------------------------------------------------
+
+
+def _keep(site: tuple[str, int, str], slack: float) -> None:
+    _slacks[site] = min(_slacks.get(site, np.inf), float(slack))
+
+
+def _caller() -> tuple[str, int]:
+    """File below the project, and line, of the nearest frame of a test."""
+    frame = sys._getframe(2)
+    while (frame and "/tests/" not in frame.f_code.co_filename) or frame.f_code.co_filename == __file__:
+        frame = frame.f_back
+    return frame.f_code.co_filename.rpartition("/tests/")[2], frame.f_lineno
+
+
+def _used(actual: object, desired: object, rtol: object, atol: object) -> float:
+    """The largest share of the tolerance that a difference takes."""
+    a, d = np.broadcast_arrays(np.asarray(actual, dtype=np.float64), np.asarray(desired, dtype=np.float64))
+    finite = np.isfinite(a) & np.isfinite(d)
+    allowed = np.broadcast_to(atol + rtol * np.abs(d), a.shape)[finite]
+    off = np.abs(a - d)[finite]
+    return float((off[off > 0] / np.maximum(allowed[off > 0], 1e-300)).max(initial=0.0))
+
+
+_assert_allclose = np.testing.assert_allclose
+
+
+def _recording_allclose(actual, desired, rtol=1e-7, atol=0, *arguments, **options) -> None:
+    _assert_allclose(actual, desired, rtol, atol, *arguments, **options)
+    _keep((*_caller(), "assert_allclose"), 1.0 - _used(actual, desired, rtol, atol))
+
+
+def _record_approx() -> None:
+    from _pytest.python_api import ApproxScalar
+
+    compare = ApproxScalar.__eq__
+
+    def recording(self: ApproxScalar, actual: object) -> bool:
+        equal = compare(self, actual)
+        if equal and isinstance(actual, int | float | np.number) and np.isfinite(self.tolerance):
+            _keep((*_caller(), "approx"), 1.0 - _used(actual, self.expected, 0.0, self.tolerance))
+        return equal
+
+    ApproxScalar.__eq__ = recording
+
+
+def pytest_assertion_pass(item: pytest.Item, lineno: int, orig: str, expl: str) -> None:
+    """Needs `-o enable_assertion_pass_hook=true`, which `scripts/spread` sets."""
+    if _report is None:
+        return
+    site = (str(item.path).rpartition("/tests/")[2], lineno, orig)
+    for left, operator, right in COMPARISON.findall(expl.partition("\n")[0]):
+        slack = float(right) - float(left)
+        _keep(site, slack if operator[0] == "<" else -slack)
+        for bound, above in _bounds_before(orig):  # of a chain, the explanation holds the last comparison alone
+            _keep((*site[:2], f"{orig} [{bound}]"), float(left) - bound if above else bound - float(left))
+
+
+def _bounds_before(source: str) -> Iterator[tuple[float, bool]]:
+    """Numbers that stand before the value in `low < value < high`, and whether the value lies above them."""
+    try:
+        test = ast.parse(source.strip(), mode="eval").body
+    except SyntaxError:
+        return
+    if isinstance(test, ast.Compare) and len(test.ops) == 2 and isinstance(test.left, ast.Constant):
+        if isinstance(test.ops[0], ast.Lt | ast.LtE) and isinstance(test.left.value, int | float):
+            yield float(test.left.value), True
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    if _report is None or not _slacks:
+        return
+    with open(f"{_report}.{os.environ.get('PYTEST_XDIST_WORKER', 'main')}", "a") as file:
+        for (where, line, text), slack in _slacks.items():
+            about = {"test": item.nodeid, "site": f"{where}:{line}", "text": text, "draw": _number, "slack": slack}
+            file.write(json.dumps(about) + "\n")
+    _slacks.clear()
+
+
+# ---- the table -----------------------------------------------------------------------------------------------
+
+
+def table(files: list[Path]) -> list[tuple[float, str]]:
+    """(smallest slack in spreads, row) of every assertion, those nearest to failing first."""
+    slacks: dict[tuple[str, str, str], dict[int, float]] = defaultdict(dict)
+    for file in files:
+        for line in file.read_text().splitlines():
+            row = json.loads(line)
+            key = (row["test"], row["site"], row["text"])
+            slacks[key][row["draw"]] = min(slacks[key].get(row["draw"], np.inf), row["slack"])
+    rows = []
+    for (test, site, text), by_draw in slacks.items():
+        found = np.array(list(by_draw.values()))
+        spread = float(np.ptp(found))
+        if spread > 0 and np.isfinite(found).all():
+            ratio = float(found.min()) / spread
+            of = test.partition("::")[2]
+            rows.append(
+                (ratio, f"{ratio:8.2f} {found.min():12.4g} {spread:12.4g} {len(found):3d}  {site} {of}: {text}")
+            )
+    return sorted(rows)
+
+
+def main() -> None:
+    rows = table([Path(name) for name in sys.argv[1:]])
+    print("  margin smallest slack    spread draws")
+    for ratio, row in rows:
+        if ratio < MARGIN:
+            print(row)
+    near = sum(ratio < MARGIN for ratio, _ in rows)
+    print(f"{len(rows)} assertions vary; {near} have less than {MARGIN:g} spread between the worst draw and the bound")
+
+
+if __name__ == "__main__":
+    main()
