@@ -39,7 +39,7 @@ def write_colmap(
     order in which frames saw them first. Points are where the tracker has them; their errors are those under the given
     poses.
     """
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
     model = pycolmap.Reconstruction()
     camera_ids: dict[PinholeCamera, int] = {}

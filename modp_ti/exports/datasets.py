@@ -41,7 +41,7 @@ def dataset_folder(folder: Path) -> Iterator[Path]:
 
 def rename_images(model: Path, target: Path, names: Sequence[str]) -> None:
     """Write the COLMAP model of a run into the new folder `target`, its images called `names`, in their order."""
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
     reconstruction = pycolmap.Reconstruction(str(model))
     for number, name in zip(sorted(reconstruction.images), names, strict=True):

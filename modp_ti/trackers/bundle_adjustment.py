@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
 __all__ = ["Bundle", "adjusted_bundle"]
 
@@ -52,7 +52,7 @@ def adjusted_bundle(
     loss_width: of Cauchy's loss [px]. tolerance: share of the cost below which a step is the last. focal, distortion:
     whether these of the camera are refined too.
     """
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)

@@ -26,7 +26,7 @@ from modp_ti.trackers.replay import (
 )
 
 if TYPE_CHECKING:
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
 __all__ = ["open_colmap"]
 

@@ -17,7 +17,7 @@ from modp_ti.errors import InputError
 from modp_ti.reading import read_bytes, text_lines
 
 if TYPE_CHECKING:
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
 __all__ = ["read_colmap_model"]
 
@@ -32,7 +32,7 @@ MAX_TEXT_LINE = 1 << 24
 
 def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     """The model in a folder, binary or text. Raises InputError for one that is incomplete or damaged."""
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
     if not any(all((folder / f"{stem}{suffix}").exists() for stem in STEMS) for suffix in (".bin", ".txt")):
         missing = [stem for stem in STEMS if not any((folder / f"{stem}{s}").exists() for s in (".bin", ".txt"))]

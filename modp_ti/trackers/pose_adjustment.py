@@ -76,7 +76,7 @@ def _adjusted_stretch(
     loss_width: float,
 ) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64], NDArray[np.float64]] | None:
     """Poses by frame, numbers (P,) of points and their places (P, 3), brought onto the given poses as a whole."""
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
     # Rays in pixels of detection: a camera of that focal length, its middle at 0.
     focal = 1.0 / float(np.median(seen.sigma))

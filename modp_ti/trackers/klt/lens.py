@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 
 if TYPE_CHECKING:
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
 __all__ = ["Lens"]
 
@@ -23,7 +23,7 @@ class Lens:
 
     @classmethod
     def pinhole(cls, camera: PinholeCamera) -> Lens:
-        import pycolmap
+        from modp_ti.quiet_pycolmap import pycolmap
 
         parameters = [camera.fx, camera.fy, camera.cx, camera.cy]
         size = {"width": camera.width, "height": camera.height}
@@ -32,7 +32,7 @@ class Lens:
     @classmethod
     def radial(cls, focal: float, k: float, width: int, height: int) -> Lens:
         """One focal length [px], one radial coefficient, the principal point in the middle."""
-        import pycolmap
+        from modp_ti.quiet_pycolmap import pycolmap
 
         parameters = [focal, width / 2, height / 2, k]
         return cls(pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", params=parameters, width=width, height=height))

@@ -70,7 +70,7 @@ def pose_from_points(
 
     xyz: (N, 3). rays: (N, 2) ideal coordinates. max_error: in ideal coordinates.
     """
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
     if len(xyz) < 4:
         return None

@@ -38,7 +38,7 @@ def two_views(
     The essential matrix or, where a homography explains as much, that of a plane. min_angle: least parallax, degrees.
     A view that only turned has none.
     """
-    import pycolmap
+    from modp_ti.quiet_pycolmap import pycolmap
 
     if len(pixels_a) < FEWEST:
         return None
