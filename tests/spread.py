@@ -44,9 +44,9 @@ def disturbance() -> int:
 
 
 def disturbed(values: NDArray) -> NDArray:
-    """The same values in an ordinary run; under `--spread`, each one unit in the last place up or down."""
+    """A copy of the values in an ordinary run; under `--spread`, each one unit in the last place up or down."""
     if not _number:
-        return values
+        return values.copy()
     up = _default_rng([_number, values.size]).random(values.shape) < 0.5
     return np.nextafter(values, np.where(up, np.inf, -np.inf).astype(values.dtype))
 
@@ -114,11 +114,11 @@ def _recording_allclose(actual, desired, rtol=1e-7, atol=0, *arguments, **option
 
 
 def _record_approx() -> None:
-    from _pytest.python_api import ApproxScalar
+    ApproxScalar = type(pytest.approx(1.0))
 
     compare = ApproxScalar.__eq__
 
-    def recording(self: ApproxScalar, actual: object) -> bool:
+    def recording(self: object, actual: object) -> bool:
         equal = compare(self, actual)
         if equal and isinstance(actual, int | float | np.number) and np.isfinite(self.tolerance):
             _keep((*_caller(), "approx"), 1.0 - _used(actual, self.expected, 0.0, self.tolerance))

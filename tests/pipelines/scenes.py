@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fields.camera import PinholeCamera
 from fields.se3 import exp_se3, inverse_se3
+from tests.spread import disturbed
 
 NEAR = 0.05
 # Neither square, nor a multiple of the tiles, nor centred.
@@ -36,10 +37,11 @@ def random_gaussians(
     T_world_camera = inverse_se3(pose)
     sh = rng.uniform(-0.1, 0.1, (n, (degree + 1) ** 2, 3))
     sh[:, 0] = rng.uniform(-1.0, 1.5, (n, 3))
-    return {
+    state = {
         "position": camera.unproject(pixels, z) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3],
         "log_scale": np.log(np.exp(rng.uniform(*np.log(size), (n, 3))) * np.abs(z)[:, None] / camera.focal),
         "quaternion": rng.normal(size=(n, 4)) * rng.uniform(0.5, 2.0, (n, 1)),
         "opacity_logit": rng.uniform(*logit, n),
         "sh": sh,
     }
+    return {name: disturbed(value) for name, value in state.items()}

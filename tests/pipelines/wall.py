@@ -7,6 +7,7 @@ import numpy as np
 from fields.camera import PinholeCamera
 from fields.se3 import exp_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
+from tests.spread import disturbed
 
 CAMERA = PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)
 NORMAL, OFFSET = np.array([0.2, 0.1, -1.0]), -4.0  # the plane n . x = d
@@ -35,7 +36,8 @@ def frame(i: int, held_out: bool = False, scale: float = 1.0) -> TrackedFrame:
     x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
     image = texture(on_the_plane(np.stack([x.ravel(), y.ravel()], axis=1), T)).reshape(48, 64, 3)
     pixels = np.random.default_rng(i).uniform([1, 1], [63, 47], (120, 2))
-    points = SparsePoints(scale * on_the_plane(pixels, T), pixels, np.arange(120) + 1000 * i)
-    T = T.copy()
+    xyz = disturbed(scale * on_the_plane(pixels, T))
+    points = SparsePoints(xyz, pixels, np.arange(120) + 1000 * i)
+    T = disturbed(T)
     T[:3, 3] *= scale
-    return TrackedFrame(i, i / 30, f"{i}", image.astype(np.float32), CAMERA, T, points, held_out=held_out)
+    return TrackedFrame(i, i / 30, f"{i}", disturbed(image.astype(np.float32)), CAMERA, T, points, held_out=held_out)
