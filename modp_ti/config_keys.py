@@ -84,9 +84,9 @@ def markdown_of_keys(model: type[BaseModel]) -> str:
     text = [
         "# Settings",
         "",
-        "This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path` for",
-        "most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the nearest",
-        "right one. Units are in square brackets. To override a key on the command line, use `--set`:",
+        "This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`",
+        "for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the",
+        "nearest right one. Units are in square brackets. To override a key on the command line, use `--set`:",
         "",
         "```sh",
         "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",

@@ -34,8 +34,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Insert the example programs, and resolve the public names."""
+    """Insert the example programs, and resolve the public names and the links to pages beside docs/."""
     folder = Path(config.docs_dir, page.file.src_uri).parent
+    markdown = markdown.replace("](../CONTRIBUTING.md)", "](contributing.md)")
     markdown = PROGRAM.sub(lambda link: _with_program(link, folder), markdown)
     return ENTRY.sub(_resolved, markdown)
 
