@@ -82,11 +82,17 @@ def markdown_of_keys(model: type[BaseModel]) -> str:
     for entry in documented_keys(model):
         sections.setdefault(entry.key.rpartition(".")[0], []).append(entry)
     text = [
-        "# Configuration",
+        "# Settings",
         "",
-        "Every key of `scene.yaml`. Relative paths are relative to the file. Any key can be set on the",
-        "command line: `modp-ti run scene.yaml --set source.scale=0.5`.",
-        "This page is written by `python -m modp_ti.config`.",
+        "This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`",
+        "for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the",
+        "nearest right one. Units are in square brackets. To override a key on the command line, use `--set`:",
+        "",
+        "```sh",
+        "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
+        "```",
+        "",
+        "The tables are generated: `python -m modp_ti.config > docs/configuration.md`.",
     ]
     for section, entries in sections.items():
         text += ["", f"## {f'`{section}`' if section else 'Top level'}", ""]
