@@ -66,8 +66,8 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
     from modp_ti.progress import ProgressLine
     from modp_ti.trackers import close, frame_count, open_tracker
 
-    if config.tracker.kind == "synthetic":
-        initialise("cpu", config.threads, config.seed)  # its frames are rendered
+    if config.tracker.renders_frames:
+        initialise("cpu", config.threads, config.seed)
     line = ProgressLine(console)
     tracker = open_tracker(config, line.prepare)
     try:

@@ -1,4 +1,7 @@
-"""The settings of a scene: one strict model, of which `modp_ti.config` reads and writes the files."""
+"""The settings of a scene: one strict model, of which `modp_ti.config` reads and writes the files.
+
+The `tracker` section is in `modp_ti.tracker_settings`, what happens to the map in `pipelines.settings`.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from modp_ti.errors import InputError
+from modp_ti.tracker_settings import AnyTrackerSettings
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
 __all__ = [
@@ -15,17 +20,11 @@ __all__ = [
     "IntrinsicsSettings",
     "SceneConfig",
     "SourceSettings",
-    "TrackerSettings",
     "ViewSettings",
     "VrsSettings",
 ]
 
-# Trackers that bring images too, those that bring cameras, those whose files hold poses alone, and those that need
-# nothing but images, and so can follow a camera.
-WITHOUT_SOURCE = ("synthetic", "socket")
-WITH_CAMERAS = ("colmap", "transforms", *WITHOUT_SOURCE)
-WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
-LIVE_TRACKERS = ("klt",)
+NO_PATH = "source.path is missing: give the folder that holds the images"
 
 
 class IntrinsicsSettings(StrictModel):
@@ -133,6 +132,16 @@ class SourceSettings(StrictModel):
         "vignetting mask, of the recorded image; empty for none, or for the source's own",
     )
 
+    def require_path(self) -> Path:
+        """`path`, for those who cannot do without it.
+
+        Raises:
+            InputError: Where it is not given.
+        """
+        if self.path is None:
+            raise InputError(NO_PATH)
+        return self.path
+
     @field_validator("mask_colour")
     @classmethod
     def _colour_has_8_bits(cls, colour: tuple[int, int, int] | None) -> tuple[int, int, int] | None:
@@ -155,86 +164,6 @@ class SourceSettings(StrictModel):
         if self.stop is not None and self.stop <= self.start:
             raise ValueError(f"source.stop ({self.stop}) must be larger than source.start ({self.start})")
         return self
-
-
-class TrackerSettings(StrictModel):
-    """Where the camera poses and the sparse points come from."""
-
-    kind: Literal[
-        "colmap",
-        "transforms",
-        "klt",
-        "tum",
-        "orbslam3",
-        "stella_vslam",
-        "aria",
-        "modp",
-        "replica",
-        "sevenscenes",
-        "socket",
-        "synthetic",
-    ] = Field(
-        description="`colmap` (a model), `transforms` (transforms.json), `klt` (the images alone: our own tracker), "
-        "`tum` (any trajectory in TUM's format), `orbslam3`, `stella_vslam` (its map.msg), `aria` (what MPS writes), "
-        "`modp` (the paper's release), `replica`, `sevenscenes`, `socket` (another program sends frames and poses: "
-        "docs/door.md) or `synthetic` (the embedded demo)"
-    )
-    path: Path | None = Field(
-        None,
-        description="model folder or file; empty: the file of the kind's usual name near the images. `socket`: a Unix "
-        "socket to be made there, instead of tracker.address",
-    )
-    points: Path | None = Field(
-        None,
-        description="world points for `tum`, `orbslam3`, `replica` and `sevenscenes`: PLY, or text with `x y z` a "
-        "line; empty to have features tracked and triangulated with the poses",
-    )
-    adjust: bool | None = Field(
-        None,
-        description="for these four without `points`: bundle adjust the poses with the triangulated points before the "
-        "first frame, where they are those of another sensor or not exact to a pixel; empty: for `sevenscenes` alone",
-    )
-    max_points: int = Field(
-        2000, ge=10, description="points of a point file, or of MPS, that one frame is shown at most"
-    )
-    max_difference: float = Field(
-        0.02, gt=0, description="seconds by which a pose's time may differ from its image's time"
-    )
-    time_offset: float = Field(
-        0.0, description="seconds added to the times of the poses, where their clock is not that of the images"
-    )
-    camera: str = Field("camera-rgb", description="`aria` only: label of the camera in online_calibration.jsonl")
-    max_inv_dist_std: float = Field(
-        0.005, gt=0, description="`aria` only: points whose inverse distance is less certain [1/m] are left out"
-    )
-    max_dist_std: float = Field(
-        0.05, gt=0, description="`aria` only: points whose distance is less certain [m] are left out"
-    )
-    address: str | None = Field(
-        None,
-        description="`socket` only: host:port to listen at; empty: 127.0.0.1:7007, which only this machine reaches",
-    )
-    patience: float = Field(
-        120.0, gt=0, description="`socket` only: seconds without a whole message after which the stream counts as ended"
-    )
-    exposure_change: float = Field(
-        0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
-    )
-    drift: float = Field(
-        0.0,
-        ge=0,
-        le=0.5,
-        description="`synthetic` only: the camera walks in a loop, at whose end the world is off by this: shift in "
-        "scene depths, turn in radians, scale by its exponential",
-    )
-    correction: bool = Field(
-        False, description="`synthetic` only: where the loop closes, the tracker corrects all that has drifted"
-    )
-
-    @property
-    def adjusts(self) -> bool:
-        """Whether given poses are adjusted: 7-Scenes' are those of the depth camera, and noisy."""
-        return self.kind == "sevenscenes" if self.adjust is None else self.adjust
 
 
 class EvaluationSettings(StrictModel):
@@ -295,7 +224,7 @@ class SceneConfig(StrictModel):
     """Everything that a run depends on."""
 
     source: SourceSettings = SourceSettings()
-    tracker: TrackerSettings
+    tracker: AnyTrackerSettings
     output: Path = Field(description="folder of the results, made where it is missing")
     device: Literal["cpu", "cuda", "auto"] = Field("auto", description="`auto` takes CUDA where there is a GPU")
     mode: Literal["online", "offline"] = Field(
@@ -318,9 +247,14 @@ class SceneConfig(StrictModel):
     view: ViewSettings = ViewSettings()
 
     @property
+    def is_live(self) -> bool:
+        """Whether the frames are gone when the run is, so that nothing can read them again."""
+        return self.source.stream is not None or self.tracker.is_live
+
+    @property
     def can_be_resumed(self) -> bool:
-        """Whether a snapshot is of use: what arrives live is gone when the process is."""
-        return self.mode == "online" and self.source.stream is None and self.tracker.kind != "socket"
+        """Whether a snapshot is of use: it does not hold the frames, which are read again."""
+        return self.mode == "online" and not self.is_live
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
@@ -333,22 +267,12 @@ class SceneConfig(StrictModel):
         return self
 
     @model_validator(mode="after")
-    def _images_are_named(self) -> SceneConfig:
-        if self.source.path is None and self.source.stream is None and self.tracker.kind not in WITHOUT_SOURCE:
-            raise ValueError("source.path is missing: give the folder that holds the images")
-        if self.source.intrinsics.given and self.tracker.kind in WITH_CAMERAS:
-            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
-        if self.source.stream is not None and self.tracker.kind not in LIVE_TRACKERS:
-            raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
-        if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
-            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")
-        if self.tracker.adjust and (self.tracker.kind not in WITHOUT_POINTS or self.tracker.points is not None):
-            raise ValueError(f"tracker.adjust is for {', '.join(WITHOUT_POINTS)} without tracker.points; take it out")
-        if self.tracker.address is not None and self.tracker.kind != "socket":
-            raise ValueError("tracker.address is for tracker.kind: socket alone; take it out")
-        if self.tracker.address is not None and self.tracker.path is not None:
-            raise ValueError("tracker.address and tracker.path both say where to listen: take one out")
-        for key in ("exposure_change", "drift", "correction"):
-            if getattr(self.tracker, key) and self.tracker.kind != "synthetic":
-                raise ValueError(f"tracker.{key} is for tracker.kind: synthetic alone; take it out")
+    def _source_and_tracker_fit(self) -> SceneConfig:
+        source, tracker = self.source, self.tracker
+        if source.path is None and source.stream is None and tracker.needs_source:
+            raise ValueError(NO_PATH)
+        if source.intrinsics.given and tracker.brings_cameras:
+            raise ValueError(f"tracker.kind: {tracker.kind} brings its own cameras; take source.intrinsics out")
+        if source.stream is not None and not tracker.follows_streams:
+            raise ValueError(f"tracker.kind: {tracker.kind} cannot follow source.stream: it knows past images")
         return self

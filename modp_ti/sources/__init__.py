@@ -52,11 +52,11 @@ def open_source(source: SourceSettings) -> ImageSource:
         except InputError:
             live.close()
             raise
-    assert source.path is not None, "the configuration asks for it"
-    kind = recognised_kind(source.path) if source.kind == "auto" else source.kind
-    images = _opened(kind, source.path, source)
+    path = source.require_path()
+    kind = recognised_kind(path) if source.kind == "auto" else source.kind
+    images = _opened(kind, path, source)
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
-        images.notes.insert(0, f"{source.path} is read as what `source.kind: {kind}` says")
+        images.notes.insert(0, f"{path} is read as what `source.kind: {kind}` says")
     return _with_camera(images, source)
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, Undistorter
+from modp_ti.tracker_settings import SocketSettings
 from modp_ti.trackers.door.connection import GLANCE, Connection, SenderGoneError
 from modp_ti.trackers.door.history import Delivered, History
 from modp_ti.trackers.door.listening import listen, open_to_others
@@ -43,7 +44,7 @@ BREATH, LONGEST_BREATH = 0.01, 0.5
 FEW_UNFIT, UNFIT_SHARE = 3, 0.1
 
 
-def open_door(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> DoorTracker:
+def open_door(source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> DoorTracker:
     """Listen where the configuration says; frames come once a sender is there.
 
     Raises InputError for an address where this cannot be, and for settings that choose among files.
@@ -65,7 +66,7 @@ class DoorTracker:
     was sent is kept in a temporary folder until `close`.
     """
 
-    def __init__(self, source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> None:
+    def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
         self._source = source
         self._patience = tracker.patience
         self._path = tracker.path

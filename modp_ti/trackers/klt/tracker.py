@@ -14,7 +14,7 @@ from fields.pose_correction import PoseCorrection
 from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.errors import InputError, UnreadableImageError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
 from modp_ti.sources.exif import focal_length_35mm
 from modp_ti.trackers.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
@@ -36,17 +36,11 @@ MOVED = 0.2
 DIAGONAL_35MM = 43.27  # mm
 
 
-def open_klt(
-    source: SourceSettings, tracker: TrackerSettings, seed: int = 0, progress: Progress | None = None
-) -> KltTracker:
+def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = None) -> KltTracker:
     """The tracker over the source's images, its camera known: the source's own, of EXIF, or estimated now.
 
     Raises InputError for images that are missing, unreadable or of more than one size.
     """
-    if tracker.path is not None:
-        raise InputError(
-            f"tracker.path ({tracker.path}) is not for tracker.kind: klt, which tracks the images; take it out"
-        )
     images = open_source(source)
     reader = FrameReader(images, source)
     arrived = _Arrived(images, source)
