@@ -16,7 +16,7 @@ from modp_ti.errors import InputError
 from modp_ti.exports.colmap_model import image_names, write_image
 from modp_ti.playback.finished_run import FinishedRun
 from modp_ti.progress import ProgressLine
-from modp_ti.trackers import close, open_tracker
+from modp_ti.trackers import open_tracker
 
 __all__ = ["dataset_names", "grey_images", "write_images"]
 
@@ -60,7 +60,7 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
         if count < len(run):
             raise other
     finally:
-        close(tracker)
+        tracker.close()
 
 
 def grey_images(run: FinishedRun, positions: Sequence[int], line: ProgressLine) -> list[NDArray[np.uint8]]:

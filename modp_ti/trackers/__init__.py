@@ -8,12 +8,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from modp_ti.trackers.openers import OPENERS, Opening
-from modp_ti.trackers.protocol import Progress, Tracker, close, events, frame_count, may_read_ahead
+from modp_ti.trackers.protocol import Progress, Tracker
 
 if TYPE_CHECKING:
     from modp_ti.settings import SceneConfig
 
-__all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ahead", "open_tracker"]
+__all__ = ["Progress", "Tracker", "open_tracker"]
 
 
 def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:

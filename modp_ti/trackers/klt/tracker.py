@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from modp_ti.trackers.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
 from modp_ti.trackers.klt.lens import Lens
 from modp_ti.trackers.klt.odometry import Odometry, View
 from modp_ti.trackers.klt.pose import ray_errors
-from modp_ti.trackers.protocol import Progress
+from modp_ti.trackers.protocol import Progress, Tracker
 from modp_ti.trackers.replay import is_held_out, points_inside, require_few, unmasked, unreadable_note
 
 __all__ = ["KltTracker", "open_klt"]
@@ -166,7 +167,7 @@ class _Told:
     T_camera_world: NDArray[np.float64]
 
 
-class KltTracker:
+class KltTracker(Tracker):
     """A `Tracker` that finds poses and points in the images of `reader`'s source, as they arrive.
 
     `events` may be iterated over once; it delivers frames and, where bundle adjustment has moved earlier ones, their
@@ -175,7 +176,7 @@ class KltTracker:
     which grow until the last frame. All of it depends on the images and the seed alone.
     """
 
-    reads_ahead = True
+    reads_ahead: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -196,7 +197,7 @@ class KltTracker:
         self._delivered = intrinsics.undistorter(source.scale)
         self._odometry = Odometry([Lens.pinhole(self._followed.camera)], seed)
         self._told: list[_Told] = []
-        self.unreadable: dict[str, UnreadableImageError] = {}  # images that were left out
+        self._unreadable: dict[str, UnreadableImageError] = {}
         self._told_keyframes: dict[int, NDArray[np.float64]] = {}
         self._told_xyz = np.zeros((0, 3))
         self._progress = self._tracked()
@@ -221,6 +222,10 @@ class KltTracker:
         """What the source has to say, and what the tracker has found so far."""
         return [*self._reader.images.notes, *self._notes]
 
+    @property
+    def unreadable(self) -> Mapping[str, UnreadableImageError]:
+        return self._unreadable
+
     def close(self) -> None:
         self._reader.images.close()
 
@@ -232,8 +237,8 @@ class KltTracker:
             try:
                 raw = _read(self._reader.images, name, raw_camera.width, raw_camera.height)
             except UnreadableImageError as error:
-                self.unreadable[name] = error
-                require_few(list(self.unreadable.values()), max(len(names), len(self._known())))
+                self._unreadable[name] = error
+                require_few(list(self._unreadable.values()), max(len(names), len(self._known())))
                 continue
             grey, valid = self._followed.grey(raw, self._reader.valid(name, raw))
             keyframes = self._keyframe_count()
@@ -255,16 +260,16 @@ class KltTracker:
 
     def _sum_up(self, names: Sequence[str]) -> None:
         counts = self._odometry.counts
-        without = len(names) - len(self._told) - len(self.unreadable)
+        without = len(names) - len(self._told) - len(self._unreadable)
         if not self._told:
             raise InputError(
                 f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
                 "and a camera that moves sideways and does not only turn"
             )
-        if self.unreadable:
-            self._notes.append(unreadable_note(list(self.unreadable.values()), len(names)))
+        if self._unreadable:
+            self._notes.append(unreadable_note(list(self._unreadable.values()), len(names)))
         if without:
-            placed = {told.name for told in self._told} | set(self.unreadable)
+            placed = {told.name for told in self._told} | set(self._unreadable)
             first = next(name for name in names if name not in placed)
             self._notes.append(
                 f"{without} of {len(names)} images could not be placed (the first is {first}): skipped; the camera was "

@@ -18,7 +18,7 @@ from modp_ti.settings import SourceSettings
 from modp_ti.synthetic import SyntheticTracker, TrackerNoise, open_synthetic, simulated_tracker
 from modp_ti.synthetic.renderer import RoomRenderer
 from modp_ti.tracker_settings import SyntheticSettings
-from modp_ti.trackers.protocol import Tracker, frame_count
+from modp_ti.trackers.protocol import Tracker
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def test_open_synthetic_follows_the_scene(room: RoomRenderer, monkeypatch: pytes
     monkeypatch.setattr(simulated_tracker, "RoomRenderer", lambda: room)
     tracker = SyntheticSettings()
     opened = open_synthetic(SourceSettings(scale=0.25, holdout=3, fps=5, start=4, stop=12, step=2), tracker)
-    assert isinstance(opened, Tracker) and frame_count(opened) == 4
+    assert isinstance(opened, Tracker) and opened.frame_count == 4
     assert "demo room" in opened.notes[0]
     got = list(opened)
     assert [frame.index for frame in got] == [0, 1, 2, 3]

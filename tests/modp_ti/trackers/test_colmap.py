@@ -13,7 +13,7 @@ import pytest
 from modp_ti.errors import InputError
 from modp_ti.settings import SourceSettings
 from modp_ti.tracker_settings import ColmapSettings
-from modp_ti.trackers import Tracker, frame_count
+from modp_ti.trackers import Tracker
 from modp_ti.trackers.colmap import open_colmap
 
 
@@ -40,7 +40,7 @@ def test_frames_come_with_poses_and_points_that_project_onto_their_pixels(plane_
     plane_scene.write_colmap(xyz, text)
     tracker = opened(plane_scene, scale=scale)
     assert isinstance(tracker, Tracker)
-    assert frame_count(tracker) == 7
+    assert tracker.frame_count == 7
     assert tracker.notes == []
     frames = list(tracker)
     assert [frame.name for frame in frames] == [f"view{i}.png" for i in range(8, 15)]

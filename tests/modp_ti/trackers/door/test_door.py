@@ -19,7 +19,7 @@ from fields.tracked_frame import TrackedFrame
 from modp_ti.errors import InputError
 from modp_ti.settings import SourceSettings
 from modp_ti.tracker_settings import ColmapSettings, SocketSettings
-from modp_ti.trackers import Tracker, events
+from modp_ti.trackers import Tracker
 from modp_ti.trackers.colmap import open_colmap
 from modp_ti.trackers.door import open_door
 from tests.modp_ti.trackers.door.doors import (
@@ -131,7 +131,7 @@ def test_a_correction_names_delivered_frames_and_they_are_there_again_with_it(tm
         moved = {10: pose(2.0), 14: pose(3.4)}
         connection.sendall(message(CORRECTION, correction(moved, {5: (1.0, 0, 3), 99: (0, 0, 1)})))
         connection.sendall(message(FRAME, frame(16)) + message(END))
-        arrived = list(events(tracker))
+        arrived = list(tracker.events())
         again = list(tracker)
     assert [type(e) for e in arrived] == [TrackedFrame] * 4 + [PoseCorrection] + [TrackedFrame]
     revised = arrived[4]
