@@ -107,7 +107,7 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
 
 def _recorded_mount(images: ImageSource, file: Path, label: str) -> tuple[CameraMounts, list[str]]:
     """Where a VRS recording says that its camera sits, in place of the calibration over time, and a remark on that."""
-    mount = getattr(images, "T_device_camera", None)
+    mount = images.T_device_camera
     lost = f"{file} is missing: it would have brought where the camera {label} sits on the device (T_device_camera)"
     if mount is None:
         raise InputError(f"{lost}, without which device poses are no camera poses")
