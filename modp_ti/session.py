@@ -176,8 +176,7 @@ class _Session:
 
     def _left_out(self) -> dict[str, int]:
         """How many frames did not touch the map because something is wrong with them, by what."""
-        gate = getattr(self.mapper.pipeline, "gate", None)
-        return {"unreadable": len(self.tracker.unreadable), **({} if gate is None else gate.refused)}
+        return {"unreadable": len(self.tracker.unreadable), **self.mapper.pipeline.refused}
 
     # ---- the finished map ------------------------------------------------------------------------------------
 

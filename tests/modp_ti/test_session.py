@@ -271,6 +271,9 @@ class DeafPipeline:
     keyframes = ()
     stopwatch = Stopwatch()
 
+    def __init__(self) -> None:
+        self.refused = {}
+
     def compile(self) -> None: ...
 
 

@@ -23,7 +23,7 @@ from modp_ti.report.record import RunRecord
 from modp_ti.results import metrics_of
 from modp_ti.settings import ExportSettings, SceneConfig, SourceSettings
 from modp_ti.tracker_settings import SyntheticSettings
-from pipelines.mapping import FrameReport
+from pipelines.pipeline import FrameReport
 
 
 def cameras(count: int, radius: float = 1.0, height: float = 1.5) -> list[NDArray[np.float64]]:
