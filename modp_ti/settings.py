@@ -31,29 +31,29 @@ class IntrinsicsSettings(StrictModel):
     """The camera's calibration, for the stored size of the images."""
 
     fx: float | None = Field(
-        None,
+        default=None,
         gt=0,
         description="focal length in pixels of the stored images; this section wins over what the source itself says "
         "of its camera. Empty for no such section",
     )
-    fy: float | None = Field(None, gt=0, description="vertical focal length; empty for fx")
+    fy: float | None = Field(default=None, gt=0, description="vertical focal length; empty for fx")
     cx: float | None = Field(
-        None,
+        default=None,
         description="principal point; pixel centres lie at +0.5, so add 0.5 to what OpenCV or ROS calibrated. "
         "Empty for the middle",
     )
-    cy: float | None = Field(None, description="as cx")
-    k1: float = Field(0.0, description="radial distortion, as in OpenCV")
-    k2: float = Field(0.0, description="as k1")
-    p1: float = Field(0.0, description="tangential distortion, as in OpenCV")
-    p2: float = Field(0.0, description="as p1")
-    k3: float = Field(0.0, description="as k1")
-    k4: float = Field(0.0, description="as k1; with `fisheye` only")
-    fisheye: bool = Field(False, description="k1 to k4 are those of OpenCV's fisheye model")
+    cy: float | None = Field(default=None, description="as cx")
+    k1: float = Field(default=0.0, description="radial distortion, as in OpenCV")
+    k2: float = Field(default=0.0, description="as k1")
+    p1: float = Field(default=0.0, description="tangential distortion, as in OpenCV")
+    p2: float = Field(default=0.0, description="as p1")
+    k3: float = Field(default=0.0, description="as k1")
+    k4: float = Field(default=0.0, description="as k1; with `fisheye` only")
+    fisheye: bool = Field(default=False, description="k1 to k4 are those of OpenCV's fisheye model")
     width: int | None = Field(
-        None, ge=1, description="width that this calibration is for; the images are then checked against it"
+        default=None, ge=1, description="width that this calibration is for; the images are then checked against it"
     )
-    height: int | None = Field(None, ge=1, description="as width")
+    height: int | None = Field(default=None, ge=1, description="as width")
 
     @property
     def given(self) -> bool:
@@ -75,59 +75,63 @@ class IntrinsicsSettings(StrictModel):
 class VrsSettings(StrictModel):
     """The pinhole camera that Aria's fisheye images are undistorted to."""
 
-    width: int = Field(800, ge=8, description="width of the undistorted image (Aria VRS only)")
-    height: int = Field(800, ge=8, description="height of the undistorted image (Aria VRS only)")
-    focal: float = Field(400.0, gt=0, description="its focal length in pixels; 400 at 800x800 sees 90 degrees")
+    width: int = Field(default=800, ge=8, description="width of the undistorted image (Aria VRS only)")
+    height: int = Field(default=800, ge=8, description="height of the undistorted image (Aria VRS only)")
+    focal: float = Field(default=400.0, gt=0, description="its focal length in pixels; 400 at 800x800 sees 90 degrees")
 
 
 class SourceSettings(StrictModel):
     """Where the frames are."""
 
     kind: Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] = Field(
-        "auto",
+        default="auto",
         description="what `path` or `stream` is; `auto` recognises it. `images`: a folder of images; `release`: the "
         "folder of an Aria sequence as the paper's authors publish it; `vrs`: a Project Aria recording",
     )
     path: Path | None = Field(
-        None,
+        default=None,
         description="folder of the images (subfolders are searched too), data set, video file or recording "
         "(not used by `synthetic` and `socket`)",
     )
     stream: int | str | None = Field(
-        None, description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live"
+        default=None,
+        description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live",
     )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
-    scale: float = Field(1.0, gt=0, le=1, description="factor on width and height of every frame")
+    scale: float = Field(default=1.0, gt=0, le=1, description="factor on width and height of every frame")
     holdout: int | None = Field(
-        None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
+        default=None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
     )
     fps: float = Field(
-        30.0,
+        default=30.0,
         gt=0,
         description="frames per second: time stamp = position in the folder / fps, where the source has no times",
     )
-    start: int = Field(0, ge=0, description="first frame, as position in the folder")
-    stop: int | None = Field(None, ge=1, description="position after the last frame; empty for all")
-    step: int = Field(1, ge=1, description="every n-th frame")
+    start: int = Field(default=0, ge=0, description="first frame, as position in the folder")
+    stop: int | None = Field(default=None, ge=1, description="position after the last frame; empty for all")
+    step: int = Field(default=1, ge=1, description="every n-th frame")
     masks: Path | None = Field(
-        None,
+        default=None,
         description="folder with one mask an image, of its name and size: white valid, black ignored; empty for none",
     )
     mask_colour: tuple[int, int, int] | None = Field(
-        None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty for none"
+        default=None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty for none"
     )
     mask_tolerance: int = Field(
-        0, ge=0, le=255, description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG"
+        default=0,
+        ge=0,
+        le=255,
+        description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG",
     )
     prefetch: int = Field(
-        4,
+        default=4,
         ge=0,
         description="frames that a thread decodes, undistorts and halves ahead of the mapper; 0 for no thread. "
         "The map is the same",
     )
     vignette: Path | None = Field(
-        None,
+        default=None,
         description="image of how much light reaches each pixel, brightest where all does; with `vrs` Aria's "
         "vignetting mask, of the recorded image; empty for none, or for the source's own",
     )
@@ -170,7 +174,7 @@ class EvaluationSettings(StrictModel):
     """How the finished map is scored."""
 
     lpips_weights: Path | None = Field(
-        None,
+        default=None,
         description="folder with `alexnet-owt-7be5be79.pth` (torchvision) and `alex.pth` (the `lpips` package, v0.1); "
         "empty: torch's cache and the installed package; LPIPS is null where they are not",
     )
@@ -180,12 +184,12 @@ class ExportSettings(StrictModel):
     """What a run writes beside its map."""
 
     images: bool = Field(
-        False,
+        default=False,
         description="write the undistorted images, as mapped, into `colmap/images`: to go on with elsewhere, since the "
         "cameras of `colmap/` are theirs",
     )
     report: bool = Field(
-        True, description="write `report.html`: figures, curves, pictures and settings of the run on one page"
+        default=True, description="write `report.html`: figures, curves, pictures and settings of the run on one page"
     )
 
 
@@ -193,21 +197,26 @@ class ViewSettings(StrictModel):
     """The live viewer."""
 
     enabled: bool = Field(
-        False,
+        default=False,
         description="serve a web page that shows the map as it grows (docs/viewer.md). `view: true` is short for it, "
         "and a section that says anything else means it too",
     )
     host: str = Field(
-        "127.0.0.1",
+        default="127.0.0.1",
         description="address to serve at: this machine alone sees 127.0.0.1; 0.0.0.0 is for all that reach it",
     )
-    port: int = Field(8080, ge=0, le=65535, description="port, or the next one that is free; 0 for any")
-    paused: bool = Field(False, description="hold after the first frame until a browser says to go on")
+    port: int = Field(default=8080, ge=0, le=65535, description="port, or the next one that is free; 0 for any")
+    paused: bool = Field(default=False, description="hold after the first frame until a browser says to go on")
     max_cost: float = Field(
-        5.0, gt=0, le=100, description="percent of the mapping time that the viewer may take; it shows less instead"
+        default=5.0,
+        gt=0,
+        le=100,
+        description="percent of the mapping time that the viewer may take; it shows less instead",
     )
     max_splats: int = Field(
-        100_000, ge=100, description="splats that a browser draws; of larger maps a subsample, grown to cover the rest"
+        default=100_000,
+        ge=100,
+        description="splats that a browser draws; of larger maps a subsample, grown to cover the rest",
     )
 
     @model_validator(mode="before")
@@ -226,19 +235,19 @@ class SceneConfig(StrictModel):
     source: SourceSettings = SourceSettings()
     tracker: AnyTrackerSettings
     output: Path = Field(description="folder of the results, made where it is missing")
-    device: Literal["cpu", "cuda", "auto"] = Field("auto", description="`auto` takes CUDA where there is a GPU")
+    device: Literal["cpu", "cuda", "auto"] = Field(default="auto", description="`auto` takes CUDA where there is a GPU")
     mode: Literal["online", "offline"] = Field(
-        "online",
+        default="online",
         description="`online` maps while frames arrive and then refines; `offline` is 3DGS on all frames at once",
     )
-    seed: int = Field(0, ge=0, description="seed of all randomness")
+    seed: int = Field(default=0, ge=0, description="seed of all randomness")
     snapshot_every: int | None = Field(
-        None,
+        default=None,
         ge=0,
         description="frames after which everything is kept in `snapshot.npz`, for `modp-ti run --resume` after a crash "
         "or a power cut; empty or 0 for none. Ctrl-C keeps it in any case",
     )
-    threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
+    threads: int | None = Field(default=None, ge=1, description="CPU threads; empty for one per core")
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
