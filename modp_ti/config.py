@@ -123,7 +123,7 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         place = _place(first["loc"])
         text = first["msg"].removeprefix("Value error, ")
         if first["type"].startswith("union_tag"):  # a kind that is missing, or that there is not
-            place += "." + first["ctx"]["discriminator"].strip("'")
+            place += "." + first.get("ctx", {})["discriminator"].strip("'")
             text = _no_such_kind(place, first)
         elif first["type"] == "missing":
             text = f"{place} is missing: {_description(place) or 'it has no default'}"

@@ -25,7 +25,7 @@ from modp_ti.trackers.klt.pose import ray_errors
 from modp_ti.trackers.protocol import Progress, Tracker
 from modp_ti.trackers.replay import is_held_out, points_inside, require_few, unmasked, unreadable_note
 
-__all__ = ["KltTracker", "open_klt"]
+__all__ = ["ArrivingNames", "KltTracker", "open_klt"]
 
 FOLLOWED_SIDE = 640  # px: features are followed in images of this longer side at most
 MAX_ERROR = 2.5  # px of those: a point farther from where it is seen is not delivered
@@ -44,7 +44,7 @@ def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = 
     """
     images = open_source(source)
     reader = FrameReader(images, source)
-    arrived = _Arrived(images, source)
+    arrived = ArrivingNames(images, source)
     first = next(iter(arrived), None)
     if first is None:
         raise InputError(f"{images.path}: brought no image")
@@ -66,7 +66,7 @@ def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = 
     return KltTracker(reader, arrived, intrinsics, source, seed, notes)
 
 
-class _Arrived:
+class ArrivingNames:
     """Names of a source's images, each once it is there; may be iterated over again, and goes on where it was."""
 
     def __init__(self, images: ImageSource, source: SourceSettings) -> None:
@@ -111,7 +111,7 @@ def _require_one_size(images: ImageSource, names: Sequence[str], width: int, hei
 
 
 def _estimated(
-    reader: FrameReader, arrived: _Arrived, blank: Intrinsics, seed: int, progress: Progress | None
+    reader: FrameReader, arrived: ArrivingNames, blank: Intrinsics, seed: int, progress: Progress | None
 ) -> tuple[Intrinsics, str]:
     """The camera by EXIF and by the images, and what to tell the user."""
     width, height = blank.camera.width, blank.camera.height
@@ -181,7 +181,7 @@ class KltTracker(Tracker):
     def __init__(
         self,
         reader: FrameReader,
-        names: _Arrived | Sequence[str],
+        names: ArrivingNames,
         intrinsics: Intrinsics,
         source: SourceSettings,
         seed: int = 0,
@@ -238,7 +238,7 @@ class KltTracker(Tracker):
                 raw = _read(self._reader.images, name, raw_camera.width, raw_camera.height)
             except UnreadableImageError as error:
                 self._unreadable[name] = error
-                require_few(list(self._unreadable.values()), max(len(names), len(self._known())))
+                require_few(list(self._unreadable.values()), max(len(names), len(self._names.there)))
                 continue
             grey, valid = self._followed.grey(raw, self._reader.valid(name, raw))
             keyframes = self._keyframe_count()
@@ -251,9 +251,6 @@ class KltTracker(Tracker):
         if self._told:
             yield from self._corrections(MOVED)
         self._sum_up(names)
-
-    def _known(self) -> Sequence[str]:
-        return self._names.there if isinstance(self._names, _Arrived) else self._names
 
     def _keyframe_count(self) -> int:
         return 0 if self._odometry.map is None else len(self._odometry.map.keyframes)

@@ -14,14 +14,13 @@ from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.sources.distortion import Distortion
 from modp_ti.trackers.klt import KltTracker, open_klt
+from modp_ti.trackers.klt.tracker import ArrivingNames
 
 
 def known_camera(source: SourceSettings, box_room, distortion: Distortion | None = None) -> KltTracker:
     images = ImageFolder(source.path)
     intrinsics = Intrinsics(box_room.camera, distortion or Distortion())
-    return KltTracker(
-        FrameReader(images, source), images.selected(source.start, source.stop, source.step), intrinsics, source
-    )
+    return KltTracker(FrameReader(images, source), ArrivingNames(images, source), intrinsics, source)
 
 
 @pytest.fixture(scope="module")
