@@ -64,10 +64,10 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
     from modp_ti.inspection.scale import judge_scale, measure_scale
     from modp_ti.inspection.survey import survey
     from modp_ti.progress import ProgressLine
-    from modp_ti.trackers import close, frame_count, open_tracker
+    from modp_ti.trackers import open_tracker
 
-    if config.tracker.kind == "synthetic":
-        initialise("cpu", config.threads, config.seed)  # its frames are rendered
+    if config.tracker.renders_frames:
+        initialise("cpu", config.threads, config.seed)
     line = ProgressLine(console)
     tracker = open_tracker(config, line.prepare)
     try:
@@ -75,7 +75,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
         first = next(frames, None)
         if first is None:
             raise InputError("the tracker delivered no frame: nothing to check")
-        total = frame_count(tracker)
+        total = tracker.frame_count
         line.start_mapping(total, "checking")
         try:
             seen = survey(chain([first], frames), total, lambda _: line.frame(None))
@@ -90,15 +90,14 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
         ]
         return Report(seen.frames, geometry, scale, _lens(tracker), list(tracker.notes), findings)
     finally:
-        close(tracker)
+        tracker.close()
 
 
 def _lens(tracker: Tracker) -> str:
     """The distortion that the tracker's images are freed from; empty where it does not say."""
-    frames = getattr(tracker, "frames", ())
-    if not len(frames) or not hasattr(frames[0], "undistorter"):
+    undistorter = tracker.undistorter
+    if undistorter is None:
         return ""
-    undistorter = frames[0].undistorter
     size = f"images of {undistorter.raw.width}x{undistorter.raw.height}"
     d = undistorter.distortion
     if d.is_identity:

@@ -8,14 +8,18 @@ __all__ = ["matching_settings"]
 
 
 def matching_settings(incomplete: str) -> list[tuple[str, str]]:
-    """`key=default` of all settings that begin so, with their meanings; of those without a plain default `key=`."""
+    """`key=default` of all settings that begin so, with their meanings; of those without a plain default `key=`.
+
+    A key that several kinds of a section have is offered once; the key that tells the kind, with each of them.
+    """
     from modp_ti.config_keys import documented_keys
     from modp_ti.settings import SceneConfig
 
-    found = []
+    found: dict[str, str] = {}
     for entry in documented_keys(SceneConfig):
-        default = (entry.default or "").strip('"')
+        default = entry.variant if entry.selects else (entry.default or "").strip('"')
         plain = default if re.fullmatch(r"[\w./:+-]*", default) else ""
-        if entry.key.startswith(incomplete):
-            found.append((f"{entry.key}={plain}", entry.description))
-    return found
+        offered = f"{entry.key}={plain}"
+        if (offered if entry.selects else entry.key).startswith(incomplete):
+            found.setdefault(offered, entry.description)
+    return list(found.items())

@@ -11,19 +11,26 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
 
 from modp_ti.atomic import replace_text
-from modp_ti.config_keys import as_yaml, documented_keys, markdown_of_keys, sections_of
+from modp_ti.config_keys import as_yaml, documented_keys, markdown_of_keys, sections_of, variants_of
 from modp_ti.errors import InputError
+from modp_ti.old_settings import without_leftovers
 from modp_ti.reading import read_text
 from modp_ti.settings import SceneConfig
+from modp_ti.unknown_keys import refuse_unknown_keys
 
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
+
+M = TypeVar("M", bound=BaseModel)
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneConfig:
@@ -50,11 +57,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
             f"{file}: a scene file has keys such as `source:`, `tracker:` and `output:`; this one holds none"
         )
     where = {key: f"{file}:{line}" for key, line in lines.items()}
-    _refuse_unknown_keys(data, SceneConfig, where, str(file))
-    for override in overrides:
-        _apply_override(data, override, where)
-    config = _validated(data, where, str(file))
-    return _with_absolute_paths(config, file.resolve().parent)
+    return _with_absolute_paths(_resolved(data, where, str(file), overrides), file.resolve().parent)
 
 
 def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = ()) -> SceneConfig:
@@ -62,12 +65,8 @@ def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = 
 
     Raises InputError for settings that this version does not have, and as `load_scene` does.
     """
-    where: dict[str, str] = {}
-    _refuse_unknown_keys(data, SceneConfig, where, name)
     data = json.loads(json.dumps(data))
-    for override in overrides:
-        _apply_override(data, override, where)
-    return _with_absolute_paths(_validated(data, where, name), Path.cwd())
+    return _with_absolute_paths(_resolved(data, {}, name, overrides), Path.cwd())
 
 
 def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
@@ -78,10 +77,9 @@ def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
     replace_text(path, text)
 
 
-def _with_absolute_paths(model: Any, base: Path) -> Any:
+def _with_absolute_paths(model: M, base: Path) -> M:
     update: dict[str, Any] = {}
-    for name in type(model).model_fields:
-        value = getattr(model, name)
+    for name, value in model:
         if isinstance(value, Path):
             update[name] = _absolute_path(value, base, name)
         elif isinstance(value, BaseModel):
@@ -101,8 +99,20 @@ def _absolute_path(value: Path, base: Path, name: str) -> Path:
         raise InputError(f"{name}: {value}: is no path: {error}") from None
 
 
+def _resolved(data: dict[str, Any], where: dict[str, str], name: str, overrides: Iterable[str]) -> SceneConfig:
+    """The model of the raw data, which the overrides change.
+
+    where: file and line that wrote a dotted key; overrides take the place of what they change.
+    """
+    for override in overrides:
+        _apply_override(data, override, where)
+    # Only now: an override may say another `tracker.kind`, on which the keys of its section depend.
+    data = without_leftovers(data)
+    refuse_unknown_keys(data, SceneConfig, where, name)
+    return _validated(data, where, name)
+
+
 def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
-    """The model of the raw data. where: file and line, or the override, that wrote a dotted key."""
     try:
         # Strict JSON keeps `scale: "0.5"` and `holdout: true` from passing as numbers, and still takes text
         # as path.
@@ -110,14 +120,46 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
     except ValidationError as error:
         problems = error.errors()
         first = problems[0]
-        place = ".".join(str(part) for part in first["loc"])
+        place = _place(first["loc"])
         text = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "missing":
+        if first["type"].startswith("union_tag"):  # a kind that is missing, or that there is not
+            place += "." + first.get("ctx", {})["discriminator"].strip("'")
+            text = _no_such_kind(place, first)
+        elif first["type"] == "missing":
             text = f"{place} is missing: {_description(place) or 'it has no default'}"
         elif place and first["type"] != "value_error":
             text = f"{place}: {text.replace('Input should be', 'must be')}, not {as_yaml(first['input'])}"
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise InputError(f"{where.get(place, name)}: {text}{more}") from None
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    """The dotted key that an error of pydantic is about, which names the kind of a section as well."""
+    parts: list[str] = []
+    fields: Mapping[str, FieldInfo] = SceneConfig.model_fields
+    remaining = iter(location)
+    for part in remaining:
+        parts.append(str(part))
+        info = fields.get(str(part))
+        if info is None:
+            fields = {}
+            continue
+        variants = variants_of(info)
+        sections = [variants[str(tag)] for tag in islice(remaining, 1)] if variants else sections_of(info.annotation)
+        fields = sections[0].model_fields if sections else {}
+    return ".".join(parts)
+
+
+def _no_such_kind(key: str, error: ErrorDetails) -> str:
+    """What is wrong with the key that tells which keys its section has. error: pydantic's, of that section."""
+    if error["type"] == "union_tag_not_found":
+        return f"{key} is missing: {_description(key)}"
+    given = error["input"][key.rpartition(".")[2]]
+    kinds = [entry.variant for entry in documented_keys(SceneConfig) if entry.key == key]
+    near = difflib.get_close_matches(str(given), kinds, n=1, cutoff=0.6)
+    hint = f"; did you mean `{near[0]}`?" if near else ""
+    names = ", ".join(f"'{kind}'" for kind in kinds[:-1])
+    return f"{key}: must be {names} or '{kinds[-1]}', not {as_yaml(given)}{hint}"
 
 
 # Of a scene file: characters, values and marks between them, sections in sections; digits of a whole number.
@@ -213,7 +255,7 @@ def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) 
     nested: dict[str, Any] = {parts[-1]: value}
     for part in reversed(parts[:-1]):
         nested = {part: nested}
-    _refuse_unknown_keys(nested, SceneConfig, {}, origin, whole_key=key)
+    refuse_unknown_keys(nested, SceneConfig, {}, origin, whole_key=key)
 
     section = data
     for part in parts[:-1]:
@@ -229,58 +271,13 @@ def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) 
 def _description(key: str) -> str:
     """What a key means; for a section, the keys that it needs."""
     keys = list(documented_keys(SceneConfig))
-    for entry in keys:
-        if entry.key == key:
-            return f"{entry.description} ({entry.type})"
-    needed = [entry.key for entry in keys if entry.key.startswith(key + ".") and entry.default is None]
+    found = [entry for entry in keys if entry.key == key]
+    if found and found[0].selects:
+        return "one of " + ", ".join(f"`{entry.variant}` ({entry.description})" for entry in found)
+    if found:
+        return f"{found[0].description} ({found[0].type})"
+    needed = dict.fromkeys(entry.key for entry in keys if entry.key.startswith(key + ".") and entry.default is None)
     return f"it needs {', '.join(needed)}" if needed else ""
-
-
-def _refuse_unknown_keys(
-    data: Mapping[str, Any],
-    model: type[BaseModel],
-    where: Mapping[str, str],
-    origin: str,
-    prefix: str = "",
-    whole_key: str | None = None,
-) -> None:
-    """Raises InputError for the first key that the model does not have, with the nearest one that it has.
-
-    whole_key: the dotted key of an override, compared as a whole with all dotted keys.
-    """
-    for key, value in data.items():
-        place = prefix + key
-        if key not in model.model_fields:
-            hint = _nearest(place, prefix, model, whole_key)
-            raise InputError(f"{where.get(place, origin)}: unknown key `{place}`{hint}")
-        sections = sections_of(model.model_fields[key].annotation)
-        if not isinstance(value, Mapping):
-            continue
-        if not sections and whole_key is not None:
-            raise InputError(f"{origin}: `{place}` is a value, it has no keys of its own")
-        if len(sections) == 1:
-            _refuse_unknown_keys(value, sections[0], where, origin, f"{place}.", whole_key)
-
-
-def _nearest(place: str, prefix: str, model: type[BaseModel], whole_key: str | None) -> str:
-    siblings = [prefix + name for name in model.model_fields]
-    every = [entry.key for entry in documented_keys(SceneConfig)]
-    leaf = place.removeprefix(prefix)
-    in_section = difflib.get_close_matches(leaf, list(model.model_fields), n=1, cutoff=0.6)
-    same_leaf = [key for key in every if key.rpartition(".")[2] == leaf]
-    whole = difflib.get_close_matches(whole_key or place, every, n=1, cutoff=0.6)
-    if in_section:
-        found = prefix + in_section[0]
-        if whole_key is not None and whole_key != place:  # the wrong part is a section: name the key below it
-            below = difflib.get_close_matches(whole_key, [k for k in every if k.startswith(found)], n=1, cutoff=0)
-            found = below[0] if below else found
-    elif same_leaf:
-        found = same_leaf[0]
-    elif whole:
-        found = whole[0]
-    else:
-        return f"; {'this section has' if prefix else 'the keys are'} {', '.join(siblings)}"
-    return f"; did you mean `{found}`?"
 
 
 if __name__ == "__main__":

@@ -7,12 +7,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-__all__ = ["KeyDoc", "as_yaml", "documented_keys", "markdown_of_keys", "sections_of"]
+__all__ = [
+    "KeyDoc",
+    "as_yaml",
+    "documented_keys",
+    "documented_values",
+    "markdown_of_keys",
+    "sections_of",
+    "variants_of",
+]
 
 
 def as_yaml(value: Any) -> str:
@@ -22,27 +31,75 @@ def as_yaml(value: Any) -> str:
 
 @dataclass(frozen=True)
 class KeyDoc:
-    """One setting: dotted key, type, default as YAML text (None where the key is required), meaning."""
+    """One setting: dotted key, type, default as YAML text (None where the key is required), meaning.
+
+    variant: the kind of its section, where that has keys of its own for each kind; otherwise empty. selects: whether it
+    is the key that says which kind that is.
+    """
 
     key: str
     type: str
     default: str | None
     description: str
+    variant: str = ""
+    selects: bool = False
 
 
 def documented_keys(model: type[BaseModel], prefix: str = "") -> Iterator[KeyDoc]:
-    """Every setting of a model in its order; prefix: of the dotted keys."""
+    """Every setting of a model in its order, of a section with several kinds those of one kind after the other.
+
+    Args:
+        model: The settings.
+        prefix: Of the dotted keys.
+    """
+    return _keys(model, prefix, "", "")
+
+
+def _keys(model: type[BaseModel], prefix: str, variant: str, tells_kind: str) -> Iterator[KeyDoc]:
     for name, info in model.model_fields.items():
+        for tag, section in variants_of(info).items():
+            yield from _keys(section, f"{prefix}{name}.", tag, str(info.discriminator))
         sections = sections_of(info.annotation)
-        if sections:
+        if info.discriminator is None:
             for section in sections:
-                yield from documented_keys(section, f"{prefix}{name}.")
+                yield from _keys(section, f"{prefix}{name}.", variant, "")
+        if not sections:
+            yield _documented(prefix + name, info, variant, name == tells_kind)
+
+
+def documented_values(settings: BaseModel) -> Iterator[tuple[KeyDoc, Any]]:
+    """Every setting of these settings with its value, in their order."""
+    return _values(settings, "", "", "")
+
+
+def _values(section: BaseModel, prefix: str, variant: str, tells_kind: str) -> Iterator[tuple[KeyDoc, Any]]:
+    for name, value in section:
+        info = type(section).model_fields[name]
+        if not isinstance(value, BaseModel):
+            yield _documented(prefix + name, info, variant, name == tells_kind), value
             continue
-        default = None
-        if info.default_factory is not None or info.default is not PydanticUndefined:
-            value = info.get_default(call_default_factory=True, validated_data={})
-            default = "" if value is None else as_yaml(value)
-        yield KeyDoc(prefix + name, _type_name(info.annotation), default, info.description or "")
+        tag = next((tag for tag, section in variants_of(info).items() if section is type(value)), variant)
+        told_by = info.discriminator if isinstance(info.discriminator, str) else ""
+        yield from _values(value, f"{prefix}{name}.", tag, told_by)
+
+
+def _documented(key: str, info: FieldInfo, variant: str, selects: bool) -> KeyDoc:
+    default = None
+    if not selects and (info.default_factory is not None or info.default is not PydanticUndefined):
+        value = info.get_default(call_default_factory=True, validated_data={})
+        default = "" if value is None else as_yaml(value)
+    return KeyDoc(key, _type_name(info.annotation), default, info.description or "", variant, selects)
+
+
+def variants_of(info: FieldInfo) -> dict[str, type[BaseModel]]:
+    """The models of a discriminated union by the values of the key that tells them apart; empty for other fields."""
+    if not isinstance(info.discriminator, str):
+        return {}
+    return {
+        str(tag): model
+        for model in sections_of(info.annotation)
+        for tag in get_args(model.model_fields[info.discriminator].annotation)
+    }
 
 
 def sections_of(annotation: Any) -> list[type[BaseModel]]:
@@ -50,7 +107,7 @@ def sections_of(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     arguments = get_args(annotation)
-    if getattr(annotation, "__origin__", None) in (list, tuple, dict):
+    if get_origin(annotation) in (list, tuple, dict):
         return []
     return [model for argument in arguments for model in sections_of(argument)]
 
@@ -66,7 +123,7 @@ def _type_name(annotation: Any) -> str:
     }
     if annotation in names:
         return names[annotation]
-    origin, arguments = getattr(annotation, "__origin__", None), get_args(annotation)
+    origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return " or ".join(f"`{argument}`" for argument in arguments)
     if origin in (list, tuple):
@@ -77,10 +134,10 @@ def _type_name(annotation: Any) -> str:
 
 
 def markdown_of_keys(model: type[BaseModel]) -> str:
-    """The reference of all keys as Markdown tables, one a section."""
-    sections: dict[str, list[KeyDoc]] = {}
+    """The reference of all keys as Markdown tables, one a section, and in a section of several kinds one a kind."""
+    sections: dict[str, dict[str, list[KeyDoc]]] = {}
     for entry in documented_keys(model):
-        sections.setdefault(entry.key.rpartition(".")[0], []).append(entry)
+        sections.setdefault(entry.key.rpartition(".")[0], {}).setdefault(entry.variant, []).append(entry)
     text = [
         "# Settings",
         "",
@@ -94,11 +151,26 @@ def markdown_of_keys(model: type[BaseModel]) -> str:
         "",
         "The tables are generated: `python -m modp_ti.config > docs/configuration.md`.",
     ]
-    for section, entries in sections.items():
+    for section, variants in sections.items():
         text += ["", f"## {f'`{section}`' if section else 'Top level'}", ""]
-        text += ["| key | type | default | meaning |", "|---|---|---|---|"]
-        for entry in entries:
-            default = "required" if entry.default is None else f"`{entry.default}`" if entry.default else "empty"
-            cells = [f"`{entry.key}`", entry.type, default, entry.description]
-            text.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        if "" in variants:
+            text += _table(variants[""])
+            continue
+        selecting = [entry for entries in variants.values() for entry in entries if entry.selects]
+        key = selecting[0].key
+        text += [f"Its keys depend on `{key}`, which is required:", "", f"| `{key}` | meaning |", "|---|---|"]
+        text += [
+            f"| [`{entry.variant}`](#{section}-of-kind-{entry.variant}) | {entry.description} |" for entry in selecting
+        ]
+        for variant, entries in variants.items():
+            text += ["", f"### `{section}` of kind `{variant}`", "", *_table(entries)]
     return "\n".join(text) + "\n"
+
+
+def _table(entries: list[KeyDoc]) -> list[str]:
+    lines = ["| key | type | default | meaning |", "|---|---|---|---|"]
+    for entry in entries:
+        default = "required" if entry.default is None else f"`{entry.default}`" if entry.default else "empty"
+        cells = [f"`{entry.key}`", entry.type, default, entry.description]
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return lines

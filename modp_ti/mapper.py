@@ -20,9 +20,9 @@ from modp_ti.exports.colmap_model import image_names
 from modp_ti.exports.map_folder import appearing, write_map
 from modp_ti.exports.splats_ply import write_splats
 from pipelines.map_state import MapState
-from pipelines.mapping import FrameReport, OnlineMapper
+from pipelines.mapping import OnlineMapper
 from pipelines.offline import OfflineMapper
-from pipelines.refinement import refine
+from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
 from pipelines.rendering import RenderedView
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings
 
@@ -42,7 +42,7 @@ class Mapper:
         self, width: int, height: int, settings: MappingSettings | OfflineSettings | None = None, seed: int = 0
     ) -> None:
         program()
-        self.pipeline: OnlineMapper | OfflineMapper
+        self.pipeline: Pipeline
         if isinstance(settings, OfflineSettings):
             self.pipeline = OfflineMapper(settings, width, height, seed)
         else:
@@ -70,12 +70,8 @@ class Mapper:
 
     def _keep(self, frame: TrackedFrame) -> None:
         """Keep what is kept of every frame, as far as there is room beside the map."""
-        if isinstance(self.pipeline, OfflineMapper):
-            self.frames.add(frame)
-            return
-        budget = self.pipeline.budget
-        self.frames.add(frame, with_points=budget.takes_observations(len(frame.points)))
-        budget.beside = self.frames.points.nbytes
+        self.frames.add(frame, with_points=self.pipeline.takes_observations(len(frame.points)))
+        self.pipeline.count_beside(self.frames.points.nbytes)
 
     def correct(self, correction: PoseCorrection) -> None:
         """Take over poses and points that the tracker has revised. Raises InputError for frames that have not come."""
@@ -95,14 +91,10 @@ class Mapper:
         if self._finished:
             return
         self._finished = True
-        if isinstance(self.pipeline, OfflineMapper):
-            try:
-                self.pipeline.initialise()
-            except ValueError as error:
-                raise InputError(f"`mode: offline` starts from tracked points: {error}") from None
-            self.pipeline.optimise(progress)
-        else:
-            self.pipeline.finish()
+        try:
+            self.pipeline.finish(progress)
+        except NothingToMapError as error:
+            raise InputError(f"`mode: offline` starts from tracked points: {error}") from None
 
     def refine(
         self,
@@ -116,11 +108,11 @@ class Mapper:
         settings: all but its own number of steps. progress, done: see `pipelines.refinement.refine`. Raises ValueError
         for an offline map, which has been.
         """
-        if isinstance(self.pipeline, OfflineMapper):
+        if not self.pipeline.can_be_refined:
             raise ValueError("an offline map is not refined: give its settings more steps")
         self.finish()
         settings = RefineSettings() if settings is None else settings
-        refine(self.pipeline, settings.model_copy(update={"steps": steps}), progress, done)
+        self.pipeline.refine(settings.model_copy(update={"steps": steps}), progress, done)
 
     @property
     def finished(self) -> bool:
@@ -134,8 +126,7 @@ class Mapper:
         """
         self.pipeline.restore(state, again)
         self.frames = frames
-        if isinstance(self.pipeline, OnlineMapper):
-            self.pipeline.budget.beside = frames.points.nbytes
+        self.pipeline.count_beside(frames.points.nbytes)
         self._finished = finished
 
     def trajectory(self) -> list[NDArray[np.float64]]:

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from fields.tracked_frame import TrackedFrame
 from modp_ti.mapper import Mapper
-from pipelines.mapping import FrameReport
+from pipelines.pipeline import FrameReport
 
 __all__ = ["Observer", "Unobserved"]
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from queue import SimpleQueue
 from threading import Semaphore, Thread
+from typing import TypeVar
 
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 
 __all__ = ["FramesAhead"]
 
+Item = TypeVar("Item", bound=TrackedFrame | PoseCorrection)
 
-class FramesAhead(Iterator[TrackedFrame | PoseCorrection]):
+
+class FramesAhead(Iterator[Item]):
     """The frames of `frames` in their order, up to `ahead` of them read and their pyramids built before they are due.
 
     Corrections of poses come in their places between them; one counts as a frame.
@@ -24,9 +27,9 @@ class FramesAhead(Iterator[TrackedFrame | PoseCorrection]):
     A context manager: leaving it ends the thread, once the frame that it is at is read.
     """
 
-    def __init__(self, frames: Iterable[TrackedFrame | PoseCorrection], ahead: int) -> None:
+    def __init__(self, frames: Iterable[Item], ahead: int) -> None:
         self._frames = iter(frames)
-        self._ready: SimpleQueue[TrackedFrame | PoseCorrection | BaseException] = SimpleQueue()
+        self._ready: SimpleQueue[Item | BaseException] = SimpleQueue()
         self._free = Semaphore(ahead)  # frames that may still be read ahead
         self._end: BaseException | None = None
         self._closed = False
@@ -35,7 +38,7 @@ class FramesAhead(Iterator[TrackedFrame | PoseCorrection]):
         if self._thread is not None:
             self._thread.start()
 
-    def __next__(self) -> TrackedFrame | PoseCorrection:
+    def __next__(self) -> Item:
         if self._thread is None:
             return next(self._frames)
         if self._end is not None:
@@ -47,7 +50,7 @@ class FramesAhead(Iterator[TrackedFrame | PoseCorrection]):
         self._free.release()
         return item
 
-    def __enter__(self) -> FramesAhead:
+    def __enter__(self) -> FramesAhead[Item]:
         return self
 
     def __exit__(self, *error: object) -> None:

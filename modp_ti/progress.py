@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from pipelines.mapping import FrameReport
+    from pipelines.pipeline import FrameReport
 
 __all__ = ["ProgressLine"]
 

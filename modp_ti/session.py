@@ -30,7 +30,7 @@ from modp_ti.results import Results, metrics_of
 from modp_ti.run_clock import RunClock
 from modp_ti.settings import SceneConfig
 from modp_ti.snapshots import Keeper, Snapshot, replay
-from modp_ti.trackers import Tracker, close, events, frame_count, may_read_ahead, open_tracker
+from modp_ti.trackers import Tracker, open_tracker
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
@@ -87,9 +87,9 @@ class _Session:
         """Open the tracker, make the mapper for its first frame, and map what comes; or what comes after `resumed`."""
         tick = time.perf_counter()
         self.tracker = open_tracker(self.config, self.line.prepare)
-        self.held.callback(close, self.tracker)
-        self.ahead = self.config.source.prefetch if may_read_ahead(self.tracker) else 0
-        with FramesAhead(events(self.tracker), self.ahead) as arriving:
+        self.held.callback(self.tracker.close)
+        self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
+        with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             first = next(arriving, None)
             if first is None:
                 raise InputError("the tracker delivered no frame: nothing to map")
@@ -105,7 +105,7 @@ class _Session:
                 self.mapper.pipeline.compile()
             rest: Iterator[TrackedFrame | PoseCorrection] = chain([first], arriving)
             self._open_keeper(resumed, rest)
-            self.observer.begin(self.mapper, frame_count(self.tracker))
+            self.observer.begin(self.mapper, self.tracker.frame_count)
             self.held.enter_context(self.stop)
             self.clock.begin_mapping()
             try:
@@ -133,7 +133,7 @@ class _Session:
     def _map(self, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
         """Take in all frames and corrections, in their order, and finish the map. Raises RunStopped between two."""
         mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
-        line.start_mapping(frame_count(self.tracker), "reading" if offline else "mapping", len(mapper.frames))
+        line.start_mapping(self.tracker.frame_count, "reading" if offline else "mapping", len(mapper.frames))
         size = None
         self.record.begin()
         try:
@@ -176,8 +176,7 @@ class _Session:
 
     def _left_out(self) -> dict[str, int]:
         """How many frames did not touch the map because something is wrong with them, by what."""
-        gate = getattr(self.mapper.pipeline, "gate", None)
-        return {"unreadable": len(getattr(self.tracker, "unreadable", ())), **({} if gate is None else gate.refused)}
+        return {"unreadable": len(self.tracker.unreadable), **self.mapper.pipeline.refused}
 
     # ---- the finished map ------------------------------------------------------------------------------------
 
@@ -262,7 +261,7 @@ class _Session:
     def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
         """Write the scores, the metrics, which are returned, and the report."""
         pipeline, frames, keeper = self.mapper.pipeline, self.mapper.frames, self.keeper
-        truth = getattr(self.tracker, "ground_truth", list)()
+        truth = self.tracker.ground_truth()
         caught = pipeline.caught()
         if warning := caught.warning():
             self._say(warning)

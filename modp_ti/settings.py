@@ -1,4 +1,7 @@
-"""The settings of a scene: one strict model, of which `modp_ti.config` reads and writes the files."""
+"""The settings of a scene: one strict model, of which `modp_ti.config` reads and writes the files.
+
+The `tracker` section is in `modp_ti.tracker_settings`, what happens to the map in `pipelines.settings`.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from modp_ti.errors import InputError
+from modp_ti.tracker_settings import AnyTrackerSettings
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
 __all__ = [
@@ -15,46 +20,40 @@ __all__ = [
     "IntrinsicsSettings",
     "SceneConfig",
     "SourceSettings",
-    "TrackerSettings",
     "ViewSettings",
     "VrsSettings",
 ]
 
-# Trackers that bring images too, those that bring cameras, those whose files hold poses alone, and those that need
-# nothing but images, and so can follow a camera.
-WITHOUT_SOURCE = ("synthetic", "socket")
-WITH_CAMERAS = ("colmap", "transforms", *WITHOUT_SOURCE)
-WITHOUT_POINTS = ("tum", "orbslam3", "replica", "sevenscenes")
-LIVE_TRACKERS = ("klt",)
+NO_PATH = "source.path is missing: give the folder that holds the images"
 
 
 class IntrinsicsSettings(StrictModel):
     """The camera's calibration, for the stored size of the images."""
 
     fx: float | None = Field(
-        None,
+        default=None,
         gt=0,
         description="focal length in pixels of the stored images; this section wins over what the source itself says "
         "of its camera. Empty for no such section",
     )
-    fy: float | None = Field(None, gt=0, description="vertical focal length; empty for fx")
+    fy: float | None = Field(default=None, gt=0, description="vertical focal length; empty for fx")
     cx: float | None = Field(
-        None,
+        default=None,
         description="principal point; pixel centres lie at +0.5, so add 0.5 to what OpenCV or ROS calibrated. "
         "Empty for the middle",
     )
-    cy: float | None = Field(None, description="as cx")
-    k1: float = Field(0.0, description="radial distortion, as in OpenCV")
-    k2: float = Field(0.0, description="as k1")
-    p1: float = Field(0.0, description="tangential distortion, as in OpenCV")
-    p2: float = Field(0.0, description="as p1")
-    k3: float = Field(0.0, description="as k1")
-    k4: float = Field(0.0, description="as k1; with `fisheye` only")
-    fisheye: bool = Field(False, description="k1 to k4 are those of OpenCV's fisheye model")
+    cy: float | None = Field(default=None, description="as cx")
+    k1: float = Field(default=0.0, description="radial distortion, as in OpenCV")
+    k2: float = Field(default=0.0, description="as k1")
+    p1: float = Field(default=0.0, description="tangential distortion, as in OpenCV")
+    p2: float = Field(default=0.0, description="as p1")
+    k3: float = Field(default=0.0, description="as k1")
+    k4: float = Field(default=0.0, description="as k1; with `fisheye` only")
+    fisheye: bool = Field(default=False, description="k1 to k4 are those of OpenCV's fisheye model")
     width: int | None = Field(
-        None, ge=1, description="width that this calibration is for; the images are then checked against it"
+        default=None, ge=1, description="width that this calibration is for; the images are then checked against it"
     )
-    height: int | None = Field(None, ge=1, description="as width")
+    height: int | None = Field(default=None, ge=1, description="as width")
 
     @property
     def given(self) -> bool:
@@ -76,62 +75,76 @@ class IntrinsicsSettings(StrictModel):
 class VrsSettings(StrictModel):
     """The pinhole camera that Aria's fisheye images are undistorted to."""
 
-    width: int = Field(800, ge=8, description="width of the undistorted image (Aria VRS only)")
-    height: int = Field(800, ge=8, description="height of the undistorted image (Aria VRS only)")
-    focal: float = Field(400.0, gt=0, description="its focal length in pixels; 400 at 800x800 sees 90 degrees")
+    width: int = Field(default=800, ge=8, description="width of the undistorted image (Aria VRS only)")
+    height: int = Field(default=800, ge=8, description="height of the undistorted image (Aria VRS only)")
+    focal: float = Field(default=400.0, gt=0, description="its focal length in pixels; 400 at 800x800 sees 90 degrees")
 
 
 class SourceSettings(StrictModel):
     """Where the frames are."""
 
     kind: Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] = Field(
-        "auto",
+        default="auto",
         description="what `path` or `stream` is; `auto` recognises it. `images`: a folder of images; `release`: the "
         "folder of an Aria sequence as the paper's authors publish it; `vrs`: a Project Aria recording",
     )
     path: Path | None = Field(
-        None,
+        default=None,
         description="folder of the images (subfolders are searched too), data set, video file or recording "
         "(not used by `synthetic` and `socket`)",
     )
     stream: int | str | None = Field(
-        None, description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live"
+        default=None,
+        description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live",
     )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
-    scale: float = Field(1.0, gt=0, le=1, description="factor on width and height of every frame")
+    scale: float = Field(default=1.0, gt=0, le=1, description="factor on width and height of every frame")
     holdout: int | None = Field(
-        None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
+        default=None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
     )
     fps: float = Field(
-        30.0,
+        default=30.0,
         gt=0,
         description="frames per second: time stamp = position in the folder / fps, where the source has no times",
     )
-    start: int = Field(0, ge=0, description="first frame, as position in the folder")
-    stop: int | None = Field(None, ge=1, description="position after the last frame; empty for all")
-    step: int = Field(1, ge=1, description="every n-th frame")
+    start: int = Field(default=0, ge=0, description="first frame, as position in the folder")
+    stop: int | None = Field(default=None, ge=1, description="position after the last frame; empty for all")
+    step: int = Field(default=1, ge=1, description="every n-th frame")
     masks: Path | None = Field(
-        None,
+        default=None,
         description="folder with one mask an image, of its name and size: white valid, black ignored; empty for none",
     )
     mask_colour: tuple[int, int, int] | None = Field(
-        None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty for none"
+        default=None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty for none"
     )
     mask_tolerance: int = Field(
-        0, ge=0, le=255, description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG"
+        default=0,
+        ge=0,
+        le=255,
+        description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG",
     )
     prefetch: int = Field(
-        4,
+        default=4,
         ge=0,
         description="frames that a thread decodes, undistorts and halves ahead of the mapper; 0 for no thread. "
         "The map is the same",
     )
     vignette: Path | None = Field(
-        None,
+        default=None,
         description="image of how much light reaches each pixel, brightest where all does; with `vrs` Aria's "
         "vignetting mask, of the recorded image; empty for none, or for the source's own",
     )
+
+    def require_path(self) -> Path:
+        """`path`, for those who cannot do without it.
+
+        Raises:
+            InputError: Where it is not given.
+        """
+        if self.path is None:
+            raise InputError(NO_PATH)
+        return self.path
 
     @field_validator("mask_colour")
     @classmethod
@@ -157,91 +170,11 @@ class SourceSettings(StrictModel):
         return self
 
 
-class TrackerSettings(StrictModel):
-    """Where the camera poses and the sparse points come from."""
-
-    kind: Literal[
-        "colmap",
-        "transforms",
-        "klt",
-        "tum",
-        "orbslam3",
-        "stella_vslam",
-        "aria",
-        "modp",
-        "replica",
-        "sevenscenes",
-        "socket",
-        "synthetic",
-    ] = Field(
-        description="`colmap` (a model), `transforms` (transforms.json), `klt` (the images alone: our own tracker), "
-        "`tum` (any trajectory in TUM's format), `orbslam3`, `stella_vslam` (its map.msg), `aria` (what MPS writes), "
-        "`modp` (the paper's release), `replica`, `sevenscenes`, `socket` (another program sends frames and poses: "
-        "docs/door.md) or `synthetic` (the embedded demo)"
-    )
-    path: Path | None = Field(
-        None,
-        description="model folder or file; empty: the file of the kind's usual name near the images. `socket`: a Unix "
-        "socket to be made there, instead of tracker.address",
-    )
-    points: Path | None = Field(
-        None,
-        description="world points for `tum`, `orbslam3`, `replica` and `sevenscenes`: PLY, or text with `x y z` a "
-        "line; empty to have features tracked and triangulated with the poses",
-    )
-    adjust: bool | None = Field(
-        None,
-        description="for these four without `points`: bundle adjust the poses with the triangulated points before the "
-        "first frame, where they are those of another sensor or not exact to a pixel; empty: for `sevenscenes` alone",
-    )
-    max_points: int = Field(
-        2000, ge=10, description="points of a point file, or of MPS, that one frame is shown at most"
-    )
-    max_difference: float = Field(
-        0.02, gt=0, description="seconds by which a pose's time may differ from its image's time"
-    )
-    time_offset: float = Field(
-        0.0, description="seconds added to the times of the poses, where their clock is not that of the images"
-    )
-    camera: str = Field("camera-rgb", description="`aria` only: label of the camera in online_calibration.jsonl")
-    max_inv_dist_std: float = Field(
-        0.005, gt=0, description="`aria` only: points whose inverse distance is less certain [1/m] are left out"
-    )
-    max_dist_std: float = Field(
-        0.05, gt=0, description="`aria` only: points whose distance is less certain [m] are left out"
-    )
-    address: str | None = Field(
-        None,
-        description="`socket` only: host:port to listen at; empty: 127.0.0.1:7007, which only this machine reaches",
-    )
-    patience: float = Field(
-        120.0, gt=0, description="`socket` only: seconds without a whole message after which the stream counts as ended"
-    )
-    exposure_change: float = Field(
-        0.0, ge=0, description="`synthetic` only: how much its exposure wanders; at 1 by a factor of 1.3 up and down"
-    )
-    drift: float = Field(
-        0.0,
-        ge=0,
-        le=0.5,
-        description="`synthetic` only: the camera walks in a loop, at whose end the world is off by this: shift in "
-        "scene depths, turn in radians, scale by its exponential",
-    )
-    correction: bool = Field(
-        False, description="`synthetic` only: where the loop closes, the tracker corrects all that has drifted"
-    )
-
-    @property
-    def adjusts(self) -> bool:
-        """Whether given poses are adjusted: 7-Scenes' are those of the depth camera, and noisy."""
-        return self.kind == "sevenscenes" if self.adjust is None else self.adjust
-
-
 class EvaluationSettings(StrictModel):
     """How the finished map is scored."""
 
     lpips_weights: Path | None = Field(
-        None,
+        default=None,
         description="folder with `alexnet-owt-7be5be79.pth` (torchvision) and `alex.pth` (the `lpips` package, v0.1); "
         "empty: torch's cache and the installed package; LPIPS is null where they are not",
     )
@@ -251,12 +184,12 @@ class ExportSettings(StrictModel):
     """What a run writes beside its map."""
 
     images: bool = Field(
-        False,
+        default=False,
         description="write the undistorted images, as mapped, into `colmap/images`: to go on with elsewhere, since the "
         "cameras of `colmap/` are theirs",
     )
     report: bool = Field(
-        True, description="write `report.html`: figures, curves, pictures and settings of the run on one page"
+        default=True, description="write `report.html`: figures, curves, pictures and settings of the run on one page"
     )
 
 
@@ -264,21 +197,26 @@ class ViewSettings(StrictModel):
     """The live viewer."""
 
     enabled: bool = Field(
-        False,
+        default=False,
         description="serve a web page that shows the map as it grows (docs/viewer.md). `view: true` is short for it, "
         "and a section that says anything else means it too",
     )
     host: str = Field(
-        "127.0.0.1",
+        default="127.0.0.1",
         description="address to serve at: this machine alone sees 127.0.0.1; 0.0.0.0 is for all that reach it",
     )
-    port: int = Field(8080, ge=0, le=65535, description="port, or the next one that is free; 0 for any")
-    paused: bool = Field(False, description="hold after the first frame until a browser says to go on")
+    port: int = Field(default=8080, ge=0, le=65535, description="port, or the next one that is free; 0 for any")
+    paused: bool = Field(default=False, description="hold after the first frame until a browser says to go on")
     max_cost: float = Field(
-        5.0, gt=0, le=100, description="percent of the mapping time that the viewer may take; it shows less instead"
+        default=5.0,
+        gt=0,
+        le=100,
+        description="percent of the mapping time that the viewer may take; it shows less instead",
     )
     max_splats: int = Field(
-        100_000, ge=100, description="splats that a browser draws; of larger maps a subsample, grown to cover the rest"
+        default=100_000,
+        ge=100,
+        description="splats that a browser draws; of larger maps a subsample, grown to cover the rest",
     )
 
     @model_validator(mode="before")
@@ -295,21 +233,21 @@ class SceneConfig(StrictModel):
     """Everything that a run depends on."""
 
     source: SourceSettings = SourceSettings()
-    tracker: TrackerSettings
+    tracker: AnyTrackerSettings
     output: Path = Field(description="folder of the results, made where it is missing")
-    device: Literal["cpu", "cuda", "auto"] = Field("auto", description="`auto` takes CUDA where there is a GPU")
+    device: Literal["cpu", "cuda", "auto"] = Field(default="auto", description="`auto` takes CUDA where there is a GPU")
     mode: Literal["online", "offline"] = Field(
-        "online",
+        default="online",
         description="`online` maps while frames arrive and then refines; `offline` is 3DGS on all frames at once",
     )
-    seed: int = Field(0, ge=0, description="seed of all randomness")
+    seed: int = Field(default=0, ge=0, description="seed of all randomness")
     snapshot_every: int | None = Field(
-        None,
+        default=None,
         ge=0,
         description="frames after which everything is kept in `snapshot.npz`, for `modp-ti run --resume` after a crash "
         "or a power cut; empty or 0 for none. Ctrl-C keeps it in any case",
     )
-    threads: int | None = Field(None, ge=1, description="CPU threads; empty for one per core")
+    threads: int | None = Field(default=None, ge=1, description="CPU threads; empty for one per core")
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
@@ -318,9 +256,14 @@ class SceneConfig(StrictModel):
     view: ViewSettings = ViewSettings()
 
     @property
+    def is_live(self) -> bool:
+        """Whether the frames are gone when the run is, so that nothing can read them again."""
+        return self.source.stream is not None or self.tracker.is_live
+
+    @property
     def can_be_resumed(self) -> bool:
-        """Whether a snapshot is of use: what arrives live is gone when the process is."""
-        return self.mode == "online" and self.source.stream is None and self.tracker.kind != "socket"
+        """Whether a snapshot is of use: it does not hold the frames, which are read again."""
+        return self.mode == "online" and not self.is_live
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
@@ -333,22 +276,12 @@ class SceneConfig(StrictModel):
         return self
 
     @model_validator(mode="after")
-    def _images_are_named(self) -> SceneConfig:
-        if self.source.path is None and self.source.stream is None and self.tracker.kind not in WITHOUT_SOURCE:
-            raise ValueError("source.path is missing: give the folder that holds the images")
-        if self.source.intrinsics.given and self.tracker.kind in WITH_CAMERAS:
-            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own cameras; take source.intrinsics out")
-        if self.source.stream is not None and self.tracker.kind not in LIVE_TRACKERS:
-            raise ValueError(f"tracker.kind: {self.tracker.kind} cannot follow source.stream: it knows past images")
-        if self.tracker.points is not None and self.tracker.kind not in WITHOUT_POINTS:
-            raise ValueError(f"tracker.kind: {self.tracker.kind} brings its own points; take tracker.points out")
-        if self.tracker.adjust and (self.tracker.kind not in WITHOUT_POINTS or self.tracker.points is not None):
-            raise ValueError(f"tracker.adjust is for {', '.join(WITHOUT_POINTS)} without tracker.points; take it out")
-        if self.tracker.address is not None and self.tracker.kind != "socket":
-            raise ValueError("tracker.address is for tracker.kind: socket alone; take it out")
-        if self.tracker.address is not None and self.tracker.path is not None:
-            raise ValueError("tracker.address and tracker.path both say where to listen: take one out")
-        for key in ("exposure_change", "drift", "correction"):
-            if getattr(self.tracker, key) and self.tracker.kind != "synthetic":
-                raise ValueError(f"tracker.{key} is for tracker.kind: synthetic alone; take it out")
+    def _source_and_tracker_fit(self) -> SceneConfig:
+        source, tracker = self.source, self.tracker
+        if source.path is None and source.stream is None and tracker.needs_source:
+            raise ValueError(NO_PATH)
+        if source.intrinsics.given and tracker.brings_cameras:
+            raise ValueError(f"tracker.kind: {tracker.kind} brings its own cameras; take source.intrinsics out")
+        if source.stream is not None and not tracker.follows_streams:
+            raise ValueError(f"tracker.kind: {tracker.kind} cannot follow source.stream: it knows past images")
         return self

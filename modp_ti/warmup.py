@@ -58,11 +58,12 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: b
     wanted = [picture_size(text) for text in sizes] or [None]
     # Imported here: asking for help must not wait for the compiler and the readers.
     from modp_ti.config import load_scene
-    from modp_ti.settings import SceneConfig, TrackerSettings
+    from modp_ti.settings import SceneConfig
+    from modp_ti.tracker_settings import SyntheticSettings
 
     if scene is None:
         # Any scene of default settings; nothing of it is opened.
-        config = SceneConfig(tracker=TrackerSettings(kind="synthetic"), output=Path())
+        config = SceneConfig(tracker=SyntheticSettings(), output=Path())
     else:
         config = load_scene(scene, overrides)
     from modp_ti.progress import ProgressLine
@@ -93,7 +94,7 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
-    if size is None and config.tracker.kind == "socket":
+    if size is None and config.tracker.is_live:
         raise InputError("no frame is there before a tracker sends one: give the size, --size 640x480")
     if size is None:
         first = next(iter(open_tracker(config)), None)

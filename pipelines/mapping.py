@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,27 +29,18 @@ from pipelines.keyframe_selection import KeyframeSelector
 from pipelines.map_state import MapState
 from pipelines.memory_budget import MemoryBudget
 from pipelines.optimisation import MapOptimiser
+from pipelines.pipeline import FrameReport, Pipeline
+from pipelines.refinement import refine
 from pipelines.rendering import Renderer
-from pipelines.settings import MappingSettings
+from pipelines.settings import MappingSettings, RefineSettings
 from pipelines.spherical_harmonics import sh_rotation
 from pipelines.stopwatch import Stopwatch
 from pipelines.view_selection import LocalGlobalViews, ViewSelection, global_probabilities
 
-__all__ = ["FrameReport", "OnlineMapper"]
+__all__ = ["OnlineMapper"]
 
 # Opacity of the render below which a pixel counts as a hole.
 HOLE = 0.5
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """What a frame did to the map. psnr: mean of the last step's views, None where nothing was optimised."""
-
-    index: int
-    is_keyframe: bool
-    keyframes: int
-    gaussians: int
-    psnr: float | None
 
 
 @dataclass(slots=True)
@@ -60,7 +51,7 @@ class Anchor:
     spacing: float
 
 
-class OnlineMapper:
+class OnlineMapper(Pipeline):
     """Turns a stream of `TrackedFrame`s into a Gaussian map while they arrive.
 
     Images may have any size up to `max_width` x `max_height`. Depth estimation and view selection can be replaced by
@@ -69,6 +60,8 @@ class OnlineMapper:
     Gaussians know the view that placed them (`GaussianField.anchor`, a place in `anchors`), and follow when the tracker
     corrects its pose.
     """
+
+    can_be_refined: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -206,7 +199,7 @@ class OnlineMapper:
                 self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
             return self.optimiser.settle() if steps > 0 else None
 
-    def finish(self) -> float | None:
+    def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
         """After the last frame: more steps on the last keyframe, and a last removal of transparent Gaussians."""
         psnr = self.optimise(self.settings.optimise.last_steps - self.settings.optimise.steps)
         self.prune()
@@ -277,9 +270,26 @@ class OnlineMapper:
             spacing = self.anchors[-1].spacing
             grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, len(self.anchors) - 1)
 
+    def refine(
+        self, settings: RefineSettings, progress: Callable[[int, float], None] | None = None, done: int = 0
+    ) -> None:
+        refine(self, settings, progress, done)
+
+    # ---- what was caught and left out ------------------------------------------------------------------------
+
     def caught(self) -> Guards:
         """What the guards have caught so far. Waits for the device."""
         return self.optimiser.caught()
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self.gate.refused
+
+    def takes_observations(self, count: int) -> bool:
+        return self.budget.takes_observations(count)
+
+    def count_beside(self, nbytes: int) -> None:
+        self.budget.beside = nbytes
 
     # ---- snapshots -------------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from pipelines.corrections import CorrectionReport, revise
 from pipelines.gpu.losses import photometric_loss
 from pipelines.guards import EXPLODED, Guards
 from pipelines.losses import LossValues
-from pipelines.mapping import FrameReport
+from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
 from pipelines.point_initialisation import initialise, union_of_points
 from pipelines.refinement import decay
 from pipelines.rendering import Renderer
@@ -98,11 +98,11 @@ def scene_extent(store: KeyframeStore) -> float:
     return max(1.1 * radius, LEAST_EXTENT * store.scene_depth)
 
 
-class OfflineMapper:
+class OfflineMapper(Pipeline):
     """Collects all frames, then optimises Gaussians from their tracked points on one random view a step.
 
-    `process` takes the frames one by one as `OnlineMapper` does; `initialise` and `optimise` then make the map.
-    `keyframes` are all frames, at their tracked poses.
+    `process` takes the frames one by one as `OnlineMapper` does; `finish`, which is `initialise` and `optimise`, then
+    makes the map. `keyframes` are all frames, at their tracked poses.
     """
 
     def __init__(self, settings: OfflineSettings, max_width: int, max_height: int, seed: int = 0) -> None:
@@ -160,6 +160,14 @@ class OfflineMapper:
                     self.density.reset_opacities()
             if progress is not None:
                 progress(step, len(self.gaussians), psnr)
+
+    def finish(self, progress: Callable[[int, int, float], None] | None = None) -> None:
+        """Make the map. progress: see `optimise`. Raises NothingToMapError where the tracked points are too few."""
+        try:
+            self.initialise()
+        except ValueError as error:
+            raise NothingToMapError(str(error)) from None
+        self.optimise(progress)
 
     def caught(self) -> Guards:
         """What the guards have caught so far. Waits for the device."""

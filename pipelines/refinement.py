@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from pipelines.mapping import OnlineMapper
 from pipelines.settings import RefineSettings
 from pipelines.view_selection import global_probabilities
+
+if TYPE_CHECKING:
+    from pipelines.mapping import OnlineMapper
 
 __all__ = ["decay", "refine"]
 

@@ -44,34 +44,36 @@ class KeyframeSettings(StrictModel):
     """When a frame becomes a keyframe (Section 3.3.1)."""
 
     covisibility: float = Field(
-        0.95, ge=0, le=1, description="a frame that shares less with the last keyframe becomes one"
+        default=0.95, ge=0, le=1, description="a frame that shares less with the last keyframe becomes one"
     )
     baseline: float = Field(
-        0.02,
+        default=0.02,
         gt=0,
         description="movement since the last keyframe that makes one [its median depths]",
     )
-    max_gap: int = Field(5, ge=1, description="frames after which a keyframe is taken in any case (t_k)")
+    max_gap: int = Field(default=5, ge=1, description="frames after which a keyframe is taken in any case (t_k)")
     max_rotation: float = Field(
-        10.0,
+        default=10.0,
         gt=0,
         description="degrees per frame beyond which a frame is a keyframe only if it is not blurred",
     )
     min_sharpness: float = Field(
-        0.75, ge=0, le=1, description="sharpness, as a factor on the last keyframe's, below which it is"
+        default=0.75, ge=0, le=1, description="sharpness, as a factor on the last keyframe's, below which it is"
     )
-    min_points: int = Field(10, ge=0, description="tracked points that a keyframe needs")
+    min_points: int = Field(default=10, ge=0, description="tracked points that a keyframe needs")
 
 
 class EpipolarSettings(StrictModel):
     """Search along epipolar lines in neighbour keyframes."""
 
-    views: int = Field(8, ge=1, description="neighbours that are searched")
-    parallax: float = Field(0.15, gt=0, description="baseline to them that is preferred [the view's median depths]")
-    max_samples: int = Field(128, ge=8, description="samples of inverse depth along a line at most")
-    min_score: float = Field(0.7, ge=-1, le=1, description="correlation (ZNCC) that a match must have")
-    min_lead: float = Field(0.1, ge=0, le=2, description="by how much it must beat all others along the line")
-    pixel_noise: float = Field(0.2, ge=0, description="standard deviation of a sharp match [px]")
+    views: int = Field(default=8, ge=1, description="neighbours that are searched")
+    parallax: float = Field(
+        default=0.15, gt=0, description="baseline to them that is preferred [the view's median depths]"
+    )
+    max_samples: int = Field(default=128, ge=8, description="samples of inverse depth along a line at most")
+    min_score: float = Field(default=0.7, ge=-1, le=1, description="correlation (ZNCC) that a match must have")
+    min_lead: float = Field(default=0.1, ge=0, le=2, description="by how much it must beat all others along the line")
+    pixel_noise: float = Field(default=0.2, ge=0, description="standard deviation of a sharp match [px]")
 
 
 DepthSource = Literal["constant", "image", "depthcov", "epipolar", "map"]
@@ -81,23 +83,28 @@ class DepthSettings(StrictModel):
     """Depth of pixels without a tracked point (Section 3.2.2)."""
 
     sources: tuple[DepthSource, ...] = Field(
-        ("image", "epipolar", "map"),
+        default=("image", "epipolar", "map"),
         min_length=1,
         description="estimators that are fused by inverse variance: Gaussian processes on the tracked points with a "
         "constant kernel (constant), one that follows the image (image) or DepthCov's (depthcov); matches in other "
         "keyframes (epipolar); the render of the map (map)",
     )
-    max_points: int = Field(500, ge=10, description="tracked points that condition the process, drawn at random beyond")
+    max_points: int = Field(
+        default=500, ge=10, description="tracked points that condition the process, drawn at random beyond"
+    )
     max_deviation: float = Field(
-        0.045, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
+        default=0.045, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
     )
     hole_deviation: float = Field(
-        0.15, gt=0, description="the same where the map shows next to nothing: a wrong depth is better than a hole"
+        default=0.15,
+        gt=0,
+        description="the same where the map shows next to nothing: a wrong depth is better than a hole",
     )
     checkpoint: Path | None = Field(
-        None, description="DepthCov's weights (`scannet.ckpt` or `nyu.ckpt`), a file of the user's own; for depthcov"
+        default=None,
+        description="DepthCov's weights (`scannet.ckpt` or `nyu.ckpt`), a file of the user's own; for depthcov",
     )
-    neighbours: int = Field(100, ge=0, description="latest other keyframes among which matches are looked for")
+    neighbours: int = Field(default=100, ge=0, description="latest other keyframes among which matches are looked for")
     epipolar: EpipolarSettings = EpipolarSettings()
 
     @model_validator(mode="after")
@@ -111,77 +118,86 @@ class DensifySettings(StrictModel):
     """Where new Gaussians go and how they begin (Section 3.2.2)."""
 
     error_compensation: bool = Field(
-        True, description="also add Gaussians at pixels of low SSIM, not only at tracked points"
+        default=True, description="also add Gaussians at pixels of low SSIM, not only at tracked points"
     )
     pixels: int = Field(
-        6000,
+        default=6000,
         ge=0,
         description="such pixels per keyframe of 640x480; other sizes by the power 3/4 of their area",
     )
-    dissimilarity: float = Field(0.08, ge=0, le=1, description="1 - SSIM from which a pixel is a candidate")
+    dissimilarity: float = Field(default=0.08, ge=0, le=1, description="1 - SSIM from which a pixel is a candidate")
     warm_up: int = Field(
-        8, ge=0, description="frames at the start that take random pixels instead of those of low SSIM"
+        default=8, ge=0, description="frames at the start that take random pixels instead of those of low SSIM"
     )
     initial_scale: float = Field(
-        0.5, gt=0, description="size of a new Gaussian in pixels of its view, before scale_offset"
+        default=0.5, gt=0, description="size of a new Gaussian in pixels of its view, before scale_offset"
     )
-    scale_offset: float = Field(0.5, description="added to the log of that size (epsilon of Eq. 1)")
-    initial_opacity: float = Field(0.5, gt=0, lt=1, description="opacity of a new Gaussian")
-    prune_every: int = Field(100, ge=1, description="frames between removals of transparent Gaussians")
-    prune_opacity: float = Field(0.01, ge=0, lt=1, description="opacity below which a Gaussian is removed")
+    scale_offset: float = Field(default=0.5, description="added to the log of that size (epsilon of Eq. 1)")
+    initial_opacity: float = Field(default=0.5, gt=0, lt=1, description="opacity of a new Gaussian")
+    prune_every: int = Field(default=100, ge=1, description="frames between removals of transparent Gaussians")
+    prune_opacity: float = Field(default=0.01, ge=0, lt=1, description="opacity below which a Gaussian is removed")
 
 
 class VoxelSettings(StrictModel):
     """Multi-level occupancy voxels (Section 3.2.3)."""
 
-    enabled: bool = Field(True, description="filter new Gaussians by the voxels")
-    levels: int = Field(8, ge=1, le=12, description="number of cell sizes (L)")
-    resolution: int = Field(512, ge=1, description="coarsest cells a side that the finest level covers (n)")
-    coarsest: float = Field(12.5, gt=0, description="coarsest cell (S_init) in view scales of the first keyframe")
-    target: float = Field(0.75, gt=0, description="spacing asked for in a view, in its view scales")
+    enabled: bool = Field(default=True, description="filter new Gaussians by the voxels")
+    levels: int = Field(default=8, ge=1, le=12, description="number of cell sizes (L)")
+    resolution: int = Field(default=512, ge=1, description="coarsest cells a side that the finest level covers (n)")
+    coarsest: float = Field(
+        default=12.5, gt=0, description="coarsest cell (S_init) in view scales of the first keyframe"
+    )
+    target: float = Field(default=0.75, gt=0, description="spacing asked for in a view, in its view scales")
 
 
 class ViewSettings(StrictModel):
     """Which keyframes an optimisation step looks at (Section 3.3.2)."""
 
-    local_views: int = Field(1, ge=0, description="views from the local bank per step")
-    bank: int = Field(10, ge=1, description="keyframes in the local bank")
-    global_views: int = Field(4, ge=0, description="views from all keyframes per step")
-    error_weight: float = Field(50.0, ge=0, description="sigma of the mean absolute error in the draw of global views")
-    recency_weight: float = Field(0.001, ge=0, description="sigma of the age in keyframes in that draw")
+    local_views: int = Field(default=1, ge=0, description="views from the local bank per step")
+    bank: int = Field(default=10, ge=1, description="keyframes in the local bank")
+    global_views: int = Field(default=4, ge=0, description="views from all keyframes per step")
+    error_weight: float = Field(
+        default=50.0, ge=0, description="sigma of the mean absolute error in the draw of global views"
+    )
+    recency_weight: float = Field(default=0.001, ge=0, description="sigma of the age in keyframes in that draw")
 
 
 class PoseSettings(StrictModel):
     """SE(3) refinement of keyframe poses (Section 3.3.3)."""
 
-    enabled: bool = Field(True, description="refine keyframe poses while mapping")
-    steps: int = Field(8, ge=0, description="first steps of a keyframe that also refine poses")
+    enabled: bool = Field(default=True, description="refine keyframe poses while mapping")
+    steps: int = Field(default=8, ge=0, description="first steps of a keyframe that also refine poses")
     learning_rate: float = Field(
-        0.01, ge=0, description="Adam step of a pose, as the movement of its tracked points in the image [px]"
+        default=0.01, ge=0, description="Adam step of a pose, as the movement of its tracked points in the image [px]"
     )
-    align: bool = Field(True, description="first move a new keyframe to where its tracked points project rightly")
+    align: bool = Field(
+        default=True, description="first move a new keyframe to where its tracked points project rightly"
+    )
 
 
 class CorrectionSettings(StrictModel):
     """What a tracker's corrections of former poses (bundle adjustment, closed loops) do to the map."""
 
     enabled: bool = Field(
-        True, description="Gaussians follow the frames that placed them; without, corrections change poses alone"
+        default=True,
+        description="Gaussians follow the frames that placed them; without, corrections change poses alone",
     )
     min_pixels: float = Field(
-        0.5,
+        default=0.5,
         ge=0,
         description="displacement of a keyframe's picture beyond which they do [px]; smaller ones add up until then",
     )
-    steps: int = Field(20, ge=0, description="optimisation steps on keyframes that have moved, after Gaussians have")
-    views: int = Field(4, ge=1, description="such keyframes per step, drawn as the global views are")
+    steps: int = Field(
+        default=20, ge=0, description="optimisation steps on keyframes that have moved, after Gaussians have"
+    )
+    views: int = Field(default=4, ge=1, description="such keyframes per step, drawn as the global views are")
 
 
 class LevelSettings(StrictModel):
     """Image pyramid: the level that a new keyframe is optimised and densified on."""
 
     probabilities: tuple[float, ...] = Field(
-        (0.4, 0.3, 0.2, 0.1),
+        default=(0.4, 0.3, 0.2, 0.1),
         min_length=1,
         max_length=MAX_LEVELS,
         description="of drawing the full size, the half, the quarter, ...; [1] for full size only: slower and finer",
@@ -189,7 +205,7 @@ class LevelSettings(StrictModel):
     # With levels down to 33 pixels the maps of desk and fox lose half a decibel and more. Half of 320x240 is still
     # worth its speed.
     min_side: int = Field(
-        96,
+        default=96,
         ge=1,
         description="no level has a shorter side of fewer pixels; 1 for the published pyramid: faster and coarser",
     )
@@ -198,66 +214,76 @@ class LevelSettings(StrictModel):
 class ExposureSettings(StrictModel):
     """Exposure of every keyframe: image = A colour + b, for cameras that set their exposure by themselves."""
 
-    enabled: bool = Field(False, description="estimate the exposure of keyframes with the map")
-    learning_rate: float = Field(0.005, ge=0, description="Adam step of A (3x3) and b")
-    regularisation: float = Field(0.03, ge=0, description="weight of |A - I|^2 + |b|^2 of a keyframe beside its loss")
+    enabled: bool = Field(default=False, description="estimate the exposure of keyframes with the map")
+    learning_rate: float = Field(default=0.005, ge=0, description="Adam step of A (3x3) and b")
+    regularisation: float = Field(
+        default=0.03, ge=0, description="weight of |A - I|^2 + |b|^2 of a keyframe beside its loss"
+    )
     prior: float = Field(
-        0.001, gt=0, description="weight of the last keyframe's exposure in the fit that a new keyframe begins with"
+        default=0.001,
+        gt=0,
+        description="weight of the last keyframe's exposure in the fit that a new keyframe begins with",
     )
 
 
 class GateSettings(StrictModel):
     """Frames that must not touch the map: blank ones, repeated ones, and those whose pose cannot be right."""
 
-    enabled: bool = Field(True, description="leave such frames out; they keep their place in the outputs")
+    enabled: bool = Field(default=True, description="leave such frames out; they keep their place in the outputs")
     min_contrast: float = Field(
-        2.0, ge=0, description="standard deviation of the colours [of 255] below which an image shows nothing"
+        default=2.0, ge=0, description="standard deviation of the colours [of 255] below which an image shows nothing"
     )
     jump: float = Field(
-        8.0, gt=1, description="motion of the camera, as a factor on the usual one, from which on the map is asked"
+        default=8.0,
+        gt=1,
+        description="motion of the camera, as a factor on the usual one, from which on the map is asked",
     )
-    min_jump: float = Field(0.15, gt=0, description="motion that is never a jump [share of the image's diagonal]")
+    min_jump: float = Field(
+        default=0.15, gt=0, description="motion that is never a jump [share of the image's diagonal]"
+    )
 
 
 class OptimiseSettings(StrictModel):
     """Loss and learning rates."""
 
     batch: int = Field(
-        1, ge=1, description="views whose gradients make one Adam step; the views of a step are shared out"
+        default=1, ge=1, description="views whose gradients make one Adam step; the views of a step are shared out"
     )
 
-    steps: int = Field(25, ge=0, description="steps per keyframe")
-    last_steps: int = Field(40, ge=0, description="steps after the last frame")
-    ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
-    aspect_weight: float = Field(1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
-    position_rate: float = Field(2.4e-5, ge=0, description="Adam step of positions [scene depths]")
-    scale_rate: float = Field(2e-2, ge=0, description="Adam step of log-scales")
-    rotation_rate: float = Field(1e-3, ge=0, description="Adam step of quaternions")
-    opacity_rate: float = Field(0.05, ge=0, description="Adam step of opacity logits")
+    steps: int = Field(default=25, ge=0, description="steps per keyframe")
+    last_steps: int = Field(default=40, ge=0, description="steps after the last frame")
+    ssim_weight: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
+    aspect_weight: float = Field(default=1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
+    position_rate: float = Field(default=2.4e-5, ge=0, description="Adam step of positions [scene depths]")
+    scale_rate: float = Field(default=2e-2, ge=0, description="Adam step of log-scales")
+    rotation_rate: float = Field(default=1e-3, ge=0, description="Adam step of quaternions")
+    opacity_rate: float = Field(default=0.05, ge=0, description="Adam step of opacity logits")
     colour_rate: float = Field(
-        2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
+        default=2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
     )
 
 
 class MappingSettings(StrictModel):
     """The online loop."""
 
-    sh_degree: int = Field(1, ge=0, le=3, description="degree of the spherical harmonics of colour")
+    sh_degree: int = Field(default=1, ge=0, le=3, description="degree of the spherical harmonics of colour")
     max_gaussians: int = Field(
-        1_500_000,
+        default=1_500_000,
         ge=1024,
         le=1_500_000,
         description="size of the pool; further Gaussians are not added. Taichi's allocator sets the limit",
     )
     memory: float | None = Field(
-        None,
+        default=None,
         gt=0,
         description="memory that Gaussians, keyframes, voxels and what frames saw of tracked points may take [GB]; "
         "what has no room is left out and counted. Empty for no limit but max_gaussians",
     )
-    near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
+    near: float = Field(default=0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     image_cache: float = Field(
-        2.0, ge=0, description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed"
+        default=2.0,
+        ge=0,
+        description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed",
     )
     gate: GateSettings = GateSettings()
     keyframes: KeyframeSettings = KeyframeSettings()
@@ -275,13 +301,17 @@ class MappingSettings(StrictModel):
 class RefineSettings(StrictModel):
     """Post refinement of the finished map (Section 4.7)."""
 
-    steps: int = Field(1000, ge=0, description="steps over all keyframes after the last frame; 0 for none")
-    views: int = Field(4, ge=1, description="views per step, drawn as the global views are")
-    poses: bool = Field(False, description="also refine poses, at a rate that decays as that of positions does")
-    position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
-    scale_decay: float = Field(1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay")
+    steps: int = Field(default=1000, ge=0, description="steps over all keyframes after the last frame; 0 for none")
+    views: int = Field(default=4, ge=1, description="views per step, drawn as the global views are")
+    poses: bool = Field(default=False, description="also refine poses, at a rate that decays as that of positions does")
+    position_decay: float = Field(
+        default=0.01, gt=0, le=1, description="factor of the position rate at the end of the decay"
+    )
+    scale_decay: float = Field(
+        default=1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay"
+    )
     min_contribution: float = Field(
-        0.5,
+        default=0.5,
         ge=0,
         description="pixels covered where it shows most, below which a Gaussian is removed beforehand; 0 for none",
     )
@@ -294,45 +324,51 @@ class OfflineSettings(StrictModel):
     30,000" are those of the published run and scale with `steps`.
     """
 
-    steps: int = Field(30_000, ge=1, description="optimisation steps, one view each")
-    sh_degree: int = Field(3, ge=0, le=3, description="degree of the spherical harmonics of colour at the end")
-    sh_every: int = Field(1000, ge=1, description="steps of 30,000 after which the degree rises by one")
+    steps: int = Field(default=30_000, ge=1, description="optimisation steps, one view each")
+    sh_degree: int = Field(default=3, ge=0, le=3, description="degree of the spherical harmonics of colour at the end")
+    sh_every: int = Field(default=1000, ge=1, description="steps of 30,000 after which the degree rises by one")
     max_gaussians: int = Field(
-        1_000_000,
+        default=1_000_000,
         ge=1024,
         le=1_000_000,
         description="size of the pool; beyond it only the largest gradients grow. Taichi's allocator sets the limit",
     )
-    near: float = Field(0.01, gt=0, description="nearest depth that is drawn [scene depths]")
+    near: float = Field(default=0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     image_cache: float = Field(
-        2.0, ge=0, description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed"
+        default=2.0,
+        ge=0,
+        description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed",
     )
-    initial_opacity: float = Field(0.1, gt=0, lt=1, description="opacity of a Gaussian at the start")
-    ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
-    position_rate: float = Field(1.6e-4, ge=0, description="Adam step of positions at the start [extents]")
-    position_decay: float = Field(0.01, gt=0, le=1, description="factor of the position rate at the end of the decay")
-    scale_rate: float = Field(5e-3, ge=0, description="Adam step of log-scales")
-    rotation_rate: float = Field(1e-3, ge=0, description="Adam step of quaternions")
-    opacity_rate: float = Field(0.05, ge=0, description="Adam step of opacity logits")
+    initial_opacity: float = Field(default=0.1, gt=0, lt=1, description="opacity of a Gaussian at the start")
+    ssim_weight: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
+    position_rate: float = Field(default=1.6e-4, ge=0, description="Adam step of positions at the start [extents]")
+    position_decay: float = Field(
+        default=0.01, gt=0, le=1, description="factor of the position rate at the end of the decay"
+    )
+    scale_rate: float = Field(default=5e-3, ge=0, description="Adam step of log-scales")
+    rotation_rate: float = Field(default=1e-3, ge=0, description="Adam step of quaternions")
+    opacity_rate: float = Field(default=0.05, ge=0, description="Adam step of opacity logits")
     colour_rate: float = Field(
-        2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
+        default=2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
     )
     densify_from: int = Field(
-        500, ge=0, description="step after which Gaussians are cloned and split; at most a twelfth of the run"
+        default=500, ge=0, description="step after which Gaussians are cloned and split; at most a twelfth of the run"
     )
-    densify_until: int = Field(15_000, ge=0, description="step of 30,000 at which that ends")
-    densify_every: int = Field(100, ge=1, description="steps between; at most a twelfth of the run")
+    densify_until: int = Field(default=15_000, ge=0, description="step of 30,000 at which that ends")
+    densify_every: int = Field(default=100, ge=1, description="steps between; at most a twelfth of the run")
     gradient_threshold: float = Field(
-        2e-4, gt=0, description="mean gradient by the mean's place in the image [half images] that clones or splits"
+        default=2e-4,
+        gt=0,
+        description="mean gradient by the mean's place in the image [half images] that clones or splits",
     )
     clone_size: float = Field(
-        0.01, gt=0, description="longest axis up to which a Gaussian is cloned, not split [extents]"
+        default=0.01, gt=0, description="longest axis up to which a Gaussian is cloned, not split [extents]"
     )
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="opacity below which a Gaussian is removed")
+    prune_opacity: float = Field(default=0.005, ge=0, lt=1, description="opacity below which a Gaussian is removed")
     prune_size: float = Field(
-        0.1, gt=0, description="longest axis above which it is, after the first reset of opacities [extents]"
+        default=0.1, gt=0, description="longest axis above which it is, after the first reset of opacities [extents]"
     )
     reset_every: int = Field(
-        3000, ge=1, description="steps of 30,000 between resets of all opacities, but 1,500 steps at least"
+        default=3000, ge=1, description="steps of 30,000 between resets of all opacities, but 1,500 steps at least"
     )
-    reset_opacity: float = Field(0.01, gt=0, lt=1, description="largest opacity after a reset")
+    reset_opacity: float = Field(default=0.01, gt=0, lt=1, description="largest opacity after a reset")

@@ -172,7 +172,7 @@ def play(
     from fields.backend import initialise
     from fields.pose_correction import PoseCorrection
     from modp_ti.config import load_scene
-    from modp_ti.trackers import close, events, open_tracker
+    from modp_ti.trackers import open_tracker
 
     config = load_scene(scene, overrides)
     initialise("cpu", config.threads, config.seed)  # the demo's frames are rendered
@@ -181,7 +181,7 @@ def play(
     next_time = time.monotonic()
     sender: Sender | None = None
     try:
-        for event in events(tracker):
+        for event in tracker.events():
             if isinstance(event, PoseCorrection):
                 assert sender is not None, "frames come before their corrections"
                 for each in waiting:  # the frames that it revises need poses first
@@ -210,7 +210,7 @@ def play(
             _send_pose(sender, each)
         return 0 if sender is None else sender.end()
     finally:
-        close(tracker)
+        tracker.close()
 
 
 def _send_pose(sender: Sender, frame) -> None:

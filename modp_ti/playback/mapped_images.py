@@ -16,7 +16,7 @@ from modp_ti.errors import InputError
 from modp_ti.exports.colmap_model import image_names, write_image
 from modp_ti.playback.finished_run import FinishedRun
 from modp_ti.progress import ProgressLine
-from modp_ti.trackers import close, open_tracker
+from modp_ti.trackers import open_tracker
 
 __all__ = ["dataset_names", "grey_images", "write_images"]
 
@@ -37,12 +37,12 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
         _copy(run, names, folder, line)
         return
     config = load_scene(run.folder / "config.yaml")
-    if config.source.stream is not None or config.tracker.kind == "socket":
+    if config.is_live:
         raise InputError(f"{run.folder}: its frames were live and are gone; such a run needs `export.images: true`")
-    if config.tracker.kind == "synthetic":
+    if config.tracker.renders_frames:
         from modp_ti.playback.map_renderer import start_device
 
-        start_device("cpu")  # its frames are rendered
+        start_device("cpu")
     tracker = open_tracker(config, line.prepare)
     other = InputError(
         f"{config.source.path or run.folder}: the source no longer gives the frames that were mapped; run the scene "
@@ -60,7 +60,7 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
         if count < len(run):
             raise other
     finally:
-        close(tracker)
+        tracker.close()
 
 
 def grey_images(run: FinishedRun, positions: Sequence[int], line: ProgressLine) -> list[NDArray[np.uint8]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from modp_ti import __version__
-from modp_ti.config_keys import as_yaml, documented_keys
+from modp_ti.config_keys import as_yaml, documented_values
 from modp_ti.settings import SceneConfig
 
 __all__ = [
@@ -92,10 +92,7 @@ def without_credentials(text: str) -> str:
 def changed_settings(config: SceneConfig) -> list[Change]:
     """Settings that are not their defaults, in the order of the reference."""
     changes = []
-    for entry in documented_keys(SceneConfig):
-        value: Any = config
-        for part in entry.key.split("."):
-            value = getattr(value, part, None)
+    for entry, value in documented_values(config):
         text = "" if value is None else as_yaml(value)
         if text != entry.default:
             changes.append(Change(entry.key, without_credentials(text), entry.default))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipelines.mapping import FrameReport
+    from pipelines.pipeline import FrameReport
 
 __all__ = ["FrameNote", "RunRecord", "StepNote"]
 

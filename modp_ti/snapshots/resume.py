@@ -12,6 +12,7 @@ from modp_ti.config import load_scene, scene_from_data
 from modp_ti.config_keys import as_yaml
 from modp_ti.errors import InputError
 from modp_ti.mapper import Mapper
+from modp_ti.old_settings import without_leftovers
 from modp_ti.settings import SceneConfig
 from modp_ti.snapshots.digest import StreamDigest
 from modp_ti.snapshots.file import FILE
@@ -52,7 +53,7 @@ def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> 
     else:
         config = load_scene(scene, overrides)
     config = config.model_copy(update={"output": output.resolve()})
-    before, now = _leaves(snapshot.settings), _leaves(config.model_dump(mode="json"))
+    before, now = _leaves(without_leftovers(snapshot.settings)), _leaves(config.model_dump(mode="json"))
     for key in [*now, *(key for key in before if key not in now)]:
         if before.get(key) != now.get(key) and not any(key == free or key.startswith(f"{free}.") for free in FREE):
             raise InputError(

@@ -19,6 +19,7 @@ from modp_ti.sources.undistortion import Undistorter
 from modp_ti.sources.video_file import VideoFile
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from modp_ti.settings import SourceSettings
@@ -52,45 +53,45 @@ def open_source(source: SourceSettings) -> ImageSource:
         except InputError:
             live.close()
             raise
-    assert source.path is not None, "the configuration asks for it"
-    kind = recognised_kind(source.path) if source.kind == "auto" else source.kind
-    images = _opened(kind, source.path, source)
+    path = source.require_path()
+    kind = recognised_kind(path) if source.kind == "auto" else source.kind
+    images = _OPENERS[kind](path, source)
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
-        images.notes.insert(0, f"{source.path} is read as what `source.kind: {kind}` says")
+        images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
     return _with_camera(images, source)
 
 
-def _opened(kind: str, path: Path, source: SourceSettings) -> ImageSource:
-    if kind == "video":
-        return VideoFile(path, source.fps, source.stop)
-    if kind == "vrs":
-        from modp_ti.sources.aria_vrs import AriaRecording
+def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:
+    # Imported here: projectaria-tools is an extra.
+    from modp_ti.sources.aria_vrs import AriaRecording
 
-        return AriaRecording(path, source.vrs, source.vignette)
-    if kind == "tum_rgbd":
-        return open_tum_rgbd(path)
-    if kind == "replica":
-        return open_replica(path, source.fps)
-    if kind == "sevenscenes":
-        return open_sevenscenes(path, source.fps)
-    if kind == "release":
-        return open_release(path, source.fps, own_vignette=source.vignette is None)
-    return ImageFolder(path, source.fps)
+    return AriaRecording(path, source.vrs, source.vignette)
+
+
+_OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
+    "images": lambda path, source: ImageFolder(path, source.fps),
+    "video": lambda path, source: VideoFile(path, source.fps, source.stop),
+    "tum_rgbd": lambda path, _: open_tum_rgbd(path),
+    "replica": lambda path, source: open_replica(path, source.fps),
+    "sevenscenes": lambda path, source: open_sevenscenes(path, source.fps),
+    "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
+    "vrs": _open_vrs,
+}
+"""What opens a path, by `source.kind`."""
 
 
 def _with_camera(images: ImageSource, source: SourceSettings) -> ImageSource:
     """The source with the user's intrinsics, or its own where they are of the images' size."""
-    if images.intrinsics is None and not source.intrinsics.given:
-        return images
-    # A live source has delivered nothing yet, and knows its size all the same.
-    width, height = images.frame_size if hasattr(images, "frame_size") else images.size(images.names[0])
     if source.intrinsics.given:
-        images.intrinsics = given_intrinsics(source.intrinsics, width, height)
+        images.intrinsics = given_intrinsics(source.intrinsics, *images.frame_size)
+        return images
+    if images.intrinsics is None:
         return images
     camera = images.intrinsics.camera
+    width, height = images.frame_size
     if (camera.width, camera.height) != (width, height):
         images.intrinsics = None
-        images.notes.append(
+        images.add_note(
             f"{images.path}: the images are {width}x{height}, the data set's camera {camera.width}x{camera.height}: "
             "give source.intrinsics where the tracker brings no camera"
         )

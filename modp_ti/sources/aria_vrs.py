@@ -72,11 +72,12 @@ class AriaRecording(KnownFrames):
         fisheye = None if device is None else device.get_camera_calib(RGB)
         if fisheye is None:
             raise InputError(f"{path}: holds no calibration of {RGB}, without which its images cannot be undistorted")
-        self.T_device_camera: NDArray[np.float64] = np.asarray(fisheye.get_transform_device_camera().to_matrix())
+        T_device_camera = np.asarray(fisheye.get_transform_device_camera().to_matrix())
 
         nanoseconds = provider.get_timestamps_ns(self._stream, sensor_data.TimeDomain.DEVICE_TIME)
         times = np.array(nanoseconds, dtype=np.float64) * 1e-9
         super().__init__(path, [f"{path.stem}_{i:06d}" for i in range(len(times))], times)
+        self.T_device_camera = T_device_camera
 
         raw = self._recorded(0)
         width, height = (int(value) for value in fisheye.get_image_size())
@@ -88,16 +89,14 @@ class AriaRecording(KnownFrames):
         self._rectification = _Rectification(calibration.distort_by_calibration, camera, fisheye)
         fx, fy = (float(value) for value in camera.get_focal_lengths())
         cx, cy = (float(value) for value in camera.get_principal_point())  # of pixel centres at whole numbers
-        self.intrinsics: Intrinsics | None = Intrinsics(
-            PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, pinhole.width, pinhole.height)
-        )
+        self.intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, pinhole.width, pinhole.height))
         self.vignette = self._light(mask, width, height)
-        self.notes = [
+        self.add_note(
             f"{path.name} is undistorted to {pinhole.width}x{pinhole.height}, f = {pinhole.focal:g} px, and lies on "
             "its side as it was recorded: the scene's up is the image's left"
-        ]
+        )
         if mask is None:
-            self.notes.append(
+            self.add_note(
                 "Aria's lens darkens toward the edge: give its vignetting mask as source.vignette "
                 "(rgb_vignetting_half_reso_mask.png or rgb_vignetting_full_reso_mask.png of Project Aria)"
             )

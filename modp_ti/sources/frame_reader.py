@@ -44,7 +44,7 @@ class FrameReader:
         self.images = images
         self._source = source
         self._masks = None if source.masks is None else MaskFolder(source.masks)
-        self._vignette: NDArray[np.float32] | None = getattr(images, "vignette", None)
+        self._vignette = images.vignette
         if self._vignette is None and source.vignette is not None:
             self._vignette = read_vignette(source.vignette)
         self._of_camera: dict[Undistorter, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
@@ -76,22 +76,25 @@ class FrameReader:
         image, mask = undistorter.image(raw, self.valid(name, raw))
         if self._vignette is None:
             return Picture(image, mask, None)
-        vignette, lit = self._light(undistorter)
+        vignette, lit = self._light(undistorter, self._vignette)
         return Picture(image, _both(mask, lit), vignette)
 
     def valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         """Which pixels of the stored image count; None where all do."""
-        valid = None if self._masks is None else self._masks.read(name)
-        if hasattr(self.images, "valid"):
-            valid = _both(valid, self.images.valid(name))
+        valid = _both(None if self._masks is None else self._masks.read(name), self.images.valid(name))
         if self._source.mask_colour is not None:
             valid = _both(valid, differs_from_colour(raw, self._source.mask_colour, self._source.mask_tolerance))
         return None if valid is None or valid.all() else valid
 
-    def _light(self, undistorter: Undistorter) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """The vignette of the camera's delivered images, and where it leaves enough light. One for all its frames."""
+    def _light(
+        self, undistorter: Undistorter, stored: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """The vignette of the camera's delivered images, and where it leaves enough light. One for all its frames.
+
+        stored: the vignette (H, W, 3) of the stored images.
+        """
         if undistorter not in self._of_camera:
-            vignette = undistorter.smooth(self._vignette)
+            vignette = undistorter.smooth(stored)
             lit = vignette.min(axis=2) >= LEAST_LIGHT
             vignette = np.clip(vignette, LEAST_LIGHT, 1.0)
             vignette.flags.writeable = False

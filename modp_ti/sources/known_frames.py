@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+from numpy.typing import NDArray
+
 from modp_ti.errors import InputError
+from modp_ti.sources.protocol import ImageSource
 
 __all__ = ["IMAGE_SUFFIXES", "KnownFrames", "find_frame"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 
-class KnownFrames:
-    """What every `ImageSource` does alike that is no live one. path: of the source. times [s]: of each name."""
+class KnownFrames(ImageSource):
+    """What every source does alike that is no live one. path: of the source. times [s]: of each name."""
 
-    def __init__(self, path: Path, names: Sequence[str], times: Sequence[float]) -> None:
-        self.path = path
-        self.names: tuple[str, ...] = tuple(names)
+    def __init__(self, path: Path, names: Sequence[str], times: Sequence[float] | NDArray[np.float64]) -> None:
+        super().__init__(path)
+        self._names = tuple(names)
         self._times = times
-        self._position = {name: i for i, name in enumerate(self.names)}
+        self._position = {name: i for i, name in enumerate(self._names)}
 
-    def __len__(self) -> int:
-        return len(self.names)
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self._names
 
     def position(self, name: str) -> int:
         """Place of a frame in the order, from 0."""
@@ -45,10 +50,6 @@ class KnownFrames:
                 f"in the {'folder' if self.path.is_dir() else 'file'}"
             )
         return names
-
-    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        """The same names, one by one."""
-        return iter(self.selected(start, stop, step))
 
 
 def find_frame(name: str, frames: Container[str]) -> str | None:

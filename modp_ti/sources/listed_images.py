@@ -31,14 +31,14 @@ class ListedImages(KnownFrames):
         self,
         path: Path,
         names: Sequence[str],
-        times: Sequence[float],
+        times: Sequence[float] | NDArray[np.float64],
         intrinsics: Intrinsics | None = None,
         notes: Iterable[str] = (),
         vignette: NDArray[np.float32] | None = None,
     ) -> None:
         super().__init__(path, names, times)
         self.intrinsics = intrinsics
-        self.notes = list(notes)
+        self._notes += notes
         self.vignette = vignette
         self._by_stem: dict[str, str] = {}
         for name in self.names:
@@ -97,9 +97,6 @@ class ListedImages(KnownFrames):
         if image is None:
             raise self._unreadable(name, reason or "it is damaged or no image")
         return image
-
-    def close(self) -> None:
-        """Nothing stays open."""
 
     def _unreadable(self, name: str, reason: str) -> UnreadableImageError:
         return UnreadableImageError(

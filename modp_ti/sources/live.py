@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
-from modp_ti.sources.intrinsics import Intrinsics
 from modp_ti.sources.known_frames import find_frame
 from modp_ti.sources.listed_images import decoded
+from modp_ti.sources.protocol import ImageSource
 from modp_ti.sources.video_file import quiet_decoder
 
 __all__ = ["LiveSource"]
@@ -29,8 +29,8 @@ WAITING = 8
 PATIENCE = 10.0
 
 
-class LiveSource:
-    """An `ImageSource` that is still being taken. Frame n that was delivered is called `live_<n with six digits>`.
+class LiveSource(ImageSource):
+    """A source that is still being taken. Frame n that was delivered is called `live_<n with six digits>`.
 
     stream: number of a camera, or URL. A thread takes frames from it all the time; up to `WAITING` wait to be asked
     for by `arriving`, and of more the oldest are dropped and counted. A frame that is delivered is written, without
@@ -40,14 +40,13 @@ class LiveSource:
     It ends when the stream does, when `arriving` comes to its `stop`, with `finish`, and with the first Ctrl-C (where
     it was opened in the main thread): the frames until then are all there are. After the end Ctrl-C interrupts.
 
-    frame_size: (width, height). Raises InputError where the stream cannot be opened or sends no frame.
+    Raises InputError where the stream cannot be opened or sends no frame.
     """
 
     def __init__(self, stream: int | str) -> None:
         if isinstance(stream, str) and stream.isdigit():
             stream = int(stream)
-        self.path = Path(_shown(stream))
-        self.intrinsics: Intrinsics | None = None
+        super().__init__(Path(_shown(stream)))
         self.dropped = 0
         self._names: list[str] = []
         self._position: dict[str, int] = {}
@@ -63,7 +62,7 @@ class LiveSource:
         if first is None:
             self._capture.release()
             raise InputError(f"{self.path}: sends no frame (source.stream); is it in use by another program?")
-        self.frame_size = (first[1].shape[1], first[1].shape[0])
+        self._frame_size = (first[1].shape[1], first[1].shape[0])
         self._waiting.append(first)
         self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
         # A daemon, so that a stalled stream does not hold the process; and an end before Python's own, which would
@@ -77,7 +76,10 @@ class LiveSource:
 
     @property
     def notes(self) -> list[str]:
-        notes = [f"{self.path} is mapped live: Ctrl-C ends the recording, and the map is finished with what came"]
+        notes = [
+            f"{self.path} is mapped live: Ctrl-C ends the recording, and the map is finished with what came",
+            *self._notes,
+        ]
         if self.dropped:
             notes.append(
                 f"{self.dropped} frames of {self.path} came faster than they were taken and were dropped; "
@@ -89,9 +91,6 @@ class LiveSource:
     def names(self) -> Sequence[str]:
         """Of the frames that were delivered so far."""
         return self._names
-
-    def __len__(self) -> int:
-        return len(self._names)
 
     def position(self, name: str) -> int:
         """Number of the frame among those delivered, from 0."""
@@ -125,10 +124,14 @@ class LiveSource:
             position += step
         self.finish()
 
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        return self._frame_size
+
     def size(self, name: str) -> tuple[int, int]:
         """(width, height) of the stream's frames."""
         assert name in self._position, name
-        return self.frame_size
+        return self._frame_size
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """The frame (H, W, 3) uint8 RGB, exactly as it came. Raises InputError where it cannot be read again."""

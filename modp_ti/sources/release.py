@@ -31,5 +31,5 @@ def open_release(path: Path, fps: float, own_vignette: bool) -> ImageFolder:
     vignette = path / "vignette.png"
     if own_vignette and vignette.is_file():
         images.vignette = read_vignette(vignette)
-        images.notes.append(f"{vignette} is the lens's vignette")
+        images.add_note(f"{vignette} is the lens's vignette")
     return images

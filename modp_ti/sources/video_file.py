@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
 from modp_ti.sources.image_bounds import MAX_IMAGE_PIXELS
-from modp_ti.sources.intrinsics import Intrinsics
 from modp_ti.sources.known_frames import KnownFrames
 from modp_ti.sources.video_container import missing_bytes
 
@@ -52,8 +51,6 @@ class VideoFile(KnownFrames):
 
     def __init__(self, path: str | os.PathLike[str], fps: float = 30.0, stop: int | None = None) -> None:
         self.path = Path(path)
-        self.intrinsics: Intrinsics | None = None
-        self.notes: list[str] = []
         if not self.path.exists():
             raise InputError(f"{self.path}: no such video file (source.path)")
         if not self.path.is_file():
@@ -90,12 +87,12 @@ class VideoFile(KnownFrames):
         height, width = first.shape[:2]
         self._size = (width, height)
         if self._front.turned:
-            self.notes.append(
+            self.add_note(
                 f"{self.path} asks to be turned clockwise by {self._front.turned} degrees, and is: its frames are "
                 f"{width}x{height}, and intrinsics are for that"
             )
         if not timed:
-            self.notes.append(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
+            self.add_note(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
         self._front.close()
         self._front = self._decoder(missing)
 

@@ -11,8 +11,9 @@ from modp_ti.synthetic.loop import Loop
 from modp_ti.synthetic.simulated_tracker import FRAMES, LOOP_FRAMES, SMALLEST, SyntheticTracker, TrackerNoise
 
 if TYPE_CHECKING:
-    from modp_ti.settings import SourceSettings, TrackerSettings
+    from modp_ti.settings import SourceSettings
     from modp_ti.synthetic.renderer import RoomRenderer
+    from modp_ti.tracker_settings import SyntheticSettings
 
 __all__ = ["LightChange", "Loop", "SyntheticTracker", "TrackerNoise", "open_synthetic"]
 
@@ -20,7 +21,7 @@ WIDTH, HEIGHT = 320, 240  # [px] at scale 1
 
 
 def open_synthetic(
-    source: SourceSettings, tracker: TrackerSettings, room: RoomRenderer | None = None
+    source: SourceSettings, tracker: SyntheticSettings, room: RoomRenderer | None = None
 ) -> SyntheticTracker:
     """The demo sequence; with drift or correction the camera walks in a loop.
 

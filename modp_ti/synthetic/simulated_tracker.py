@@ -18,6 +18,7 @@ from modp_ti.synthetic.light import LightChange
 from modp_ti.synthetic.loop import Loop
 from modp_ti.synthetic.renderer import RoomRenderer
 from modp_ti.synthetic.walks import smooth_walks
+from modp_ti.trackers.protocol import Tracker
 
 __all__ = ["FRAMES", "LOOP_FRAMES", "SMALLEST", "SyntheticTracker", "TrackerNoise"]
 
@@ -53,7 +54,7 @@ class TrackerNoise:
         return TrackerNoise(pixel=0.0, depth=0.0, translation=0.0, rotation=0.0)
 
 
-class SyntheticTracker:
+class SyntheticTracker(Tracker):
     """Frames of the demo room with tracked poses and points, rendered as they are asked for.
 
     Iterating yields `fields.tracked_frame.TrackedFrame` in order, the same ones each time. Taichi must be
@@ -114,6 +115,10 @@ class SyntheticTracker:
 
     def __len__(self) -> int:
         return len(self._truth)
+
+    @property
+    def frame_count(self) -> int:
+        return len(self)
 
     @property
     def notes(self) -> list[str]:

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import ImageSource, open_source
 from modp_ti.sources.protocol import require_intrinsics
+from modp_ti.tracker_settings import AriaSettings
 from modp_ti.trackers.aria_mps import (
     CameraMounts,
     DeviceTrajectory,
@@ -37,7 +38,7 @@ OBSERVATIONS = ("semidense_observations.csv.gz", "semidense_observations.csv")
 SEEN_WITHIN = 0.11
 
 
-def open_aria(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> ReplayedTracker:
+def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress | None = None) -> ReplayedTracker:
     """The images that have a device pose within `tracker.max_difference` of their time, in the source's order.
 
     tracker.path: MPS's folder, or its `slam` or `trajectory` folder, or one of the two trajectories. The closed loop is
@@ -47,8 +48,8 @@ def open_aria(source: SourceSettings, tracker: TrackerSettings, progress: Progre
     not theirs, features are tracked and triangulated. Raises InputError for what is missing and cannot be done
     without, for malformed files, and for images that do not fit the camera or the times.
     """
-    assert source.path is not None, "the configuration asks for it"
-    folder, file = _trajectory_file(tracker.path, source.path)
+    place = source.require_path()
+    folder, file = _trajectory_file(tracker.path, place)
     device = read_open_loop(file) if file.name == OPEN_LOOP else read_closed_loop(file)
     calibration = folder / CALIBRATION
     mounts = read_calibration(calibration, tracker.camera) if calibration.is_file() else None
@@ -106,7 +107,7 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
 
 def _recorded_mount(images: ImageSource, file: Path, label: str) -> tuple[CameraMounts, list[str]]:
     """Where a VRS recording says that its camera sits, in place of the calibration over time, and a remark on that."""
-    mount = getattr(images, "T_device_camera", None)
+    mount = images.T_device_camera
     lost = f"{file} is missing: it would have brought where the camera {label} sits on the device (T_device_camera)"
     if mount is None:
         raise InputError(f"{lost}, without which device poses are no camera poses")

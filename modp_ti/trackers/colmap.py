@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.sources.distortion import colmap_intrinsics
 from modp_ti.sources.intrinsics import require_plausible
+from modp_ti.tracker_settings import ColmapSettings
 from modp_ti.trackers.colmap_files import read_colmap_model
 from modp_ti.trackers.replay import (
     PosedImage,
@@ -31,16 +32,16 @@ if TYPE_CHECKING:
 __all__ = ["open_colmap"]
 
 
-def open_colmap(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTracker:
+def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTracker:
     """The images that the model has poses for, in natural order, with the points that each observes.
 
     Raises InputError for a folder or model that is missing, damaged or of a camera model that is not
     supported, where no image of the model is in the folder, and for images that do not fit their cameras.
     """
-    assert source.path is not None, "the configuration asks for it"
+    place = source.require_path()
     images = open_source(source)
     selected = set(images.selected(source.start, source.stop, source.step))
-    folder = _model_folder(source.path, tracker.path)
+    folder = _model_folder(place, tracker.path)
     model = read_colmap_model(folder)
     if not model.images:
         raise InputError(f"{folder}: the COLMAP model holds no image")

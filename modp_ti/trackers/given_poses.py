@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.sources.protocol import require_intrinsics
+from modp_ti.tracker_settings import GivenPosesSettings
 from modp_ti.trackers.point_cloud import visible_points
 from modp_ti.trackers.point_file import read_point_file
 from modp_ti.trackers.protocol import Progress
@@ -82,7 +83,7 @@ def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], or
 def replay_poses(
     images: ImageSource,
     source: SourceSettings,
-    tracker: TrackerSettings,
+    tracker: GivenPosesSettings,
     poses: Mapping[str, NDArray[np.float64]],
     notes: Sequence[str],
     progress: Progress | None,

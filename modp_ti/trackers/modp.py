@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
 from modp_ti.reading import LARGEST, open_file, read_json
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import Undistorter, open_source
 from modp_ti.sources.protocol import require_intrinsics
+from modp_ti.tracker_settings import ModpSettings
 from modp_ti.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
 from modp_ti.trackers.number_rows import read_number_rows
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
@@ -36,15 +37,15 @@ NPY_HEADER = re.compile(
 )
 
 
-def open_modp(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTracker:
+def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
     """The images that the JSON has poses for, in the source's order, each with the points of its own file.
 
     Points are told apart by their coordinates: one place is one point, in whichever frames' files it stands; pixels are
     projections. Raises InputError for files that are missing or malformed, poses that are no rigid motion, a point file
     with the wrong columns or NaN, no points at all, and images that do not fit `source.intrinsics`.
     """
-    assert source.path is not None, "the configuration asks for it"
-    folders = (source.path, source.path.parent)
+    place = source.require_path()
+    folders = (place, place.parent)
     guesses = [folder / name for name in (POSES, POSES_ORB) for folder in folders]
     file = found_file(tracker.path, guesses, f"the release's {POSES} or {POSES_ORB}")
     cameras = _cameras(file)

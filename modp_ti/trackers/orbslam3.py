@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
+from modp_ti.tracker_settings import OrbSlam3Settings
 from modp_ti.trackers.given_poses import found_file
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import ReplayedTracker
@@ -18,15 +19,15 @@ FRAMES, KEYFRAMES = "CameraTrajectory.txt", "KeyFrameTrajectory.txt"
 
 
 def open_orbslam3(
-    source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None
+    source: SourceSettings, tracker: OrbSlam3Settings, progress: Progress | None = None
 ) -> ReplayedTracker:
     """The images with a pose in CameraTrajectory.txt or, where that is missing, KeyFrameTrajectory.txt.
 
     Both flavours are read: TUM's in seconds and EuRoC's in nanoseconds. Frames between keyframes that have no pose are
     skipped with a count. Raises InputError as `open_tum` does.
     """
-    assert source.path is not None, "the configuration asks for it"
-    file = _trajectory_file(tracker.path, source.path)
+    place = source.require_path()
+    file = _trajectory_file(tracker.path, place)
     opened = replay_trajectory(file, source, tracker, progress)
     if file.name == KEYFRAMES or file.name.startswith("kf_"):
         opened.notes.append(

@@ -2,54 +2,78 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
+from modp_ti.errors import UnreadableImageError
 
-__all__ = ["Progress", "Tracker", "close", "events", "frame_count", "may_read_ahead"]
+if TYPE_CHECKING:
+    from modp_ti.sources import Undistorter
+
+__all__ = ["Progress", "Tracker"]
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(what, done, total) while a tracker prepares."""
 
 
-@runtime_checkable
-class Tracker(Protocol):
+class Tracker(ABC):
     """Delivers frames in order, each decoded when it is asked for.
 
-    notes: one-line remarks for the user, known when the tracker is opened, such as frames that were skipped; one that
-    is live may have more of them once its frames have ended.
-    A tracker that knows how many frames it will deliver has `__len__`. One whose frames may be read in a thread
-    beside the mapper has `reads_ahead = True`; it must not start Taichi's kernels then, which one thread alone may do.
-    A tracker that revises poses has `events()`, an iterator over its frames and, between them, `PoseCorrection`s of
-    frames before. It may be live; the frames are there again, with the poses that they had last, when the tracker is
-    iterated over afterwards. One that holds a camera or a socket open has `close()`.
-    Iterating raises InputError where an input turns out bad.
+    Every tracker has `notes` and can be iterated over. What only some can do has a default here: a tracker that
+    revises poses overrides `events`, one that holds a camera or a socket open overrides `close`, and so on. Whoever
+    uses a tracker asks for nothing beyond this class.
     """
 
+    reads_ahead: ClassVar[bool] = False
+    """Whether a thread may iterate over the tracker beside the mapper. It must not start Taichi's kernels then, which
+    one thread alone may do."""
+
     @property
-    def notes(self) -> list[str]: ...
+    @abstractmethod
+    def notes(self) -> list[str]:
+        """One-line remarks for the user, known when the tracker is opened, such as frames that were skipped.
 
-    def __iter__(self) -> Iterator[TrackedFrame]: ...
+        A live tracker may have more of them once its frames have ended.
+        """
 
+    @abstractmethod
+    def __iter__(self) -> Iterator[TrackedFrame]:
+        """The frames in their order.
 
-def events(tracker: Tracker) -> Iterator[TrackedFrame | PoseCorrection]:
-    """What the tracker delivers: its frames, and corrections where it makes any."""
-    return tracker.events() if hasattr(tracker, "events") else iter(tracker)
+        Where poses were revised, these are the poses that the frames had last.
 
+        Raises:
+            InputError: Where an input turns out bad.
+        """
 
-def close(tracker: Tracker) -> None:
-    """Let go of what the tracker holds open: a camera, a file, a socket."""
-    if hasattr(tracker, "close"):
-        tracker.close()
+    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+        """The frames and, between them, corrections of frames before; a live tracker delivers them once."""
+        return iter(self)
 
+    @property
+    def frame_count(self) -> int | None:
+        """How many frames the tracker delivers; None where it does not know, as with a live camera."""
+        return None
 
-def frame_count(tracker: Tracker) -> int | None:
-    """How many frames the tracker delivers; None where it does not know, as with a live camera."""
-    return len(tracker) if hasattr(tracker, "__len__") else None
+    @property
+    def unreadable(self) -> Mapping[str, UnreadableImageError]:
+        """Images that were left out because they are damaged, with what is wrong, as far as they have been come to."""
+        return {}
 
+    @property
+    def undistorter(self) -> Undistorter | None:
+        """What frees the first frame's image from the distortion of its lens; None where the tracker does not say."""
+        return None
 
-def may_read_ahead(tracker: Tracker) -> bool:
-    """Whether a thread may iterate over the tracker while the mapper works; not unless it says so."""
-    return getattr(tracker, "reads_ahead", False)
+    def ground_truth(self) -> list[NDArray[np.float64]]:
+        """True T_camera_world (4, 4) of every frame, in metres; empty where it is not known."""
+        return []
+
+    def close(self) -> None:  # noqa: B027 - most trackers hold nothing open
+        """Let go of what the tracker holds open: a camera, a file, a socket."""

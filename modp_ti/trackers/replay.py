@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.errors import FEW, InputError, UnreadableImageError
 from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.trackers.protocol import Tracker
 
 __all__ = [
     "FARTHEST",
@@ -46,14 +48,14 @@ class PosedImage:
         return replace(self, points=points)
 
 
-class ReplayedTracker:
+class ReplayedTracker(Tracker):
     """A `Tracker` over posed images, in the order given. Points on masked pixels are left out.
 
-    So are images that turn out damaged, if they are few. unreadable: their names with what is wrong, as far as they
-    have been come to. Which frames are held out goes by their place among all that were given.
+    So are images that turn out damaged, if they are few. Which frames are held out goes by their place among all that
+    were given.
     """
 
-    reads_ahead = True
+    reads_ahead: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -63,14 +65,30 @@ class ReplayedTracker:
         notes: Iterable[str] = (),
     ) -> None:
         self.frames = tuple(frames)
-        self.notes = [*notes, *reader.images.notes]
-        self.unreadable: dict[str, UnreadableImageError] = {}
+        self._notes = [*notes, *reader.images.notes]
+        self._unreadable: dict[str, UnreadableImageError] = {}
         self._noted = False
         self._reader = reader
         self._source = source
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def notes(self) -> list[str]:
+        return self._notes
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.frames)
+
+    @property
+    def unreadable(self) -> Mapping[str, UnreadableImageError]:
+        return self._unreadable
+
+    @property
+    def undistorter(self) -> Undistorter | None:
+        return self.frames[0].undistorter if self.frames else None
 
     def close(self) -> None:
         """Let go of what the source of the images has open."""
@@ -82,8 +100,8 @@ class ReplayedTracker:
             try:
                 picture = self._reader.read(frame.name, frame.undistorter)
             except UnreadableImageError as error:
-                self.unreadable[frame.name] = error
-                require_few(list(self.unreadable.values()), len(self.frames))
+                self._unreadable[frame.name] = error
+                require_few(list(self._unreadable.values()), len(self.frames))
                 continue
             index += 1
             yield TrackedFrame(
@@ -98,9 +116,9 @@ class ReplayedTracker:
                 vignette=picture.vignette,
                 held_out=is_held_out(place, self._source),
             )
-        if self.unreadable and not self._noted:
+        if self._unreadable and not self._noted:
             self._noted = True
-            self.notes.append(unreadable_note(list(self.unreadable.values()), len(self.frames)))
+            self._notes.append(unreadable_note(list(self._unreadable.values()), len(self.frames)))
 
 
 def require_few(unreadable: Sequence[UnreadableImageError], count: int) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import ImageSource, open_source
+from modp_ti.tracker_settings import ReplicaSettings
 from modp_ti.trackers.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
 from modp_ti.trackers.number_rows import NumberRows, read_number_rows
 from modp_ti.trackers.protocol import Progress
@@ -21,14 +22,14 @@ from modp_ti.trackers.trajectory import inverse_poses
 __all__ = ["open_replica"]
 
 
-def open_replica(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> ReplayedTracker:
+def open_replica(source: SourceSettings, tracker: ReplicaSettings, progress: Progress | None = None) -> ReplayedTracker:
     """The images with a line in traj.txt, which holds 4x4 matrices, camera to world, row by row.
 
     Image `frame000123` has the line 123, counted from 0. Raises InputError, with the line, for a file that is missing
     or malformed, a matrix that is no rigid motion, and as `replay_poses` does.
     """
-    assert source.path is not None, "the configuration asks for it"
-    folders = (source.path, source.path.parent)
+    place = source.require_path()
+    folders = (place, place.parent)
     file = found_file(tracker.path, [folder / "traj.txt" for folder in folders], "Replica's traj.txt")
     rows = read_number_rows(file, 16, "a 4x4 matrix, camera to world, row by row")
     T_world_camera = np.stack([checked_pose(row.reshape(4, 4), rows.where(i)) for i, row in enumerate(rows.values)])

@@ -8,8 +8,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import ImageSource, open_source
+from modp_ti.tracker_settings import SevenScenesSettings
 from modp_ti.trackers.given_poses import missing_frames_note, replay_poses, selected_frames
 from modp_ti.trackers.number_rows import read_number_rows
 from modp_ti.trackers.protocol import Progress
@@ -22,7 +23,7 @@ SUFFIX = ".pose.txt"
 
 
 def open_sevenscenes(
-    source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None
+    source: SourceSettings, tracker: SevenScenesSettings, progress: Progress | None = None
 ) -> ReplayedTracker:
     """The images `NAME.color.*` that have a `NAME.pose.txt` with a 4x4 matrix, camera to world.
 
@@ -30,10 +31,10 @@ def open_sevenscenes(
     with the line, for a file that is malformed, a matrix that is no rigid motion, where there is no pose at all, and as
     `replay_poses` does.
     """
-    assert source.path is not None, "the configuration asks for it"
+    place = source.require_path()
     images = open_source(source)
     selected = selected_frames(images, source)
-    folder = _pose_folder(tracker.path, source.path, images, selected)
+    folder = _pose_folder(tracker.path, place, images, selected)
     files = {name: _pose_file(folder, name) for name in selected}
     found = {name: file for name, file in files.items() if file.is_file()}
     matrices = []

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import ImageSource, Intrinsics, Undistorter, open_source
+from modp_ti.tracker_settings import StellaVslamSettings
 from modp_ti.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
 from modp_ti.trackers.point_cloud import visible_points
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker, points_inside
@@ -26,7 +27,7 @@ NEIGHBOURS = 2
 SAME_TIME = 1e-4
 
 
-def open_stella_vslam(source: SourceSettings, tracker: TrackerSettings) -> ReplayedTracker:
+def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> ReplayedTracker:
     """The images that stella_vslam has poses for, in the source's order, with the landmarks that each sees.
 
     A keyframe sees what it observed, where it observed it. A frame between keyframes sees the landmarks that two
@@ -34,10 +35,8 @@ def open_stella_vslam(source: SourceSettings, tracker: TrackerSettings) -> Repla
     frame_trajectory.txt beside the map there are keyframes alone. Raises InputError for a map or trajectory that is
     missing or malformed, and images that do not fit the map's camera or times.
     """
-    assert source.path is not None, "the configuration asks for it"
-    file = found_file(
-        tracker.path, [source.path.parent / "map.msg", source.path / "map.msg"], "a map of stella_vslam (map.msg)"
-    )
+    place = source.require_path()
+    file = found_file(tracker.path, [place.parent / "map.msg", place / "map.msg"], "a map of stella_vslam (map.msg)")
     world = read_stella_map(file)
     beside = file.with_name(TRAJECTORY)
     trajectory = read_trajectory_file(beside) if beside.is_file() else None

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import FEW, InputError
-from modp_ti.settings import TrackerSettings
 from modp_ti.sources import ImageSource
 from modp_ti.sources.association import associate
+from modp_ti.tracker_settings import TimedPosesSettings
 from modp_ti.trackers.number_rows import read_number_rows
 from modp_ti.trackers.replay import FARTHEST
 
@@ -134,7 +134,7 @@ def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> N
 
 
 def rows_at_frames(
-    images: ImageSource, names: Sequence[str], path: Path, times: NDArray[np.float64], tracker: TrackerSettings
+    images: ImageSource, names: Sequence[str], path: Path, times: NDArray[np.float64], tracker: TimedPosesSettings
 ) -> dict[str, int]:
     """The pose of each image that has one within `tracker.max_difference` of its time, as its row.
 

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
 from modp_ti.reading import is_file, read_json
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import Distortion, FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.sources.intrinsics import require_plausible
+from modp_ti.tracker_settings import TransformsSettings
 from modp_ti.trackers.point_cloud import read_ply_points, visible_points
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import (
@@ -38,7 +39,7 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 
 
 def open_transforms(
-    source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None
+    source: SourceSettings, tracker: TransformsSettings, progress: Progress | None = None
 ) -> ReplayedTracker:
     """The frames of the file whose images are in the folder, in natural order of the images.
 
@@ -46,10 +47,10 @@ def open_transforms(
     poses, before the first frame is delivered. Raises InputError for a file that is missing or malformed,
     poses that are none, no image at all, and images that do not fit the intrinsics.
     """
-    assert source.path is not None, "the configuration asks for it"
+    place = source.require_path()
     images = open_source(source)
     selected = set(images.selected(source.start, source.stop, source.step))
-    file = _transforms_file(source.path, tracker.path)
+    file = _transforms_file(place, tracker.path)
     data = _read_json(file)
 
     entries: dict[str, Mapping[str, Any]] = {}

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import open_source
+from modp_ti.tracker_settings import OrbSlam3Settings, TumSettings
 from modp_ti.trackers.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
 from modp_ti.trackers.protocol import Progress
 from modp_ti.trackers.replay import ReplayedTracker
@@ -16,14 +17,14 @@ __all__ = ["open_tum", "replay_trajectory"]
 NAMES = ("groundtruth.txt", "trajectory.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt")
 
 
-def open_tum(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> ReplayedTracker:
+def open_tum(source: SourceSettings, tracker: TumSettings, progress: Progress | None = None) -> ReplayedTracker:
     """The images that have a pose within `tracker.max_difference` of their time, in the source's order.
 
     Raises InputError for a trajectory that is missing or malformed or of other times than the images, and as
     `replay_poses` does.
     """
-    assert source.path is not None, "the configuration asks for it"
-    folders = (source.path, source.path.parent)
+    place = source.require_path()
+    folders = (place, place.parent)
     file = found_file(
         tracker.path, [folder / name for folder in folders for name in NAMES], "a trajectory in TUM's format"
     )
@@ -31,7 +32,7 @@ def open_tum(source: SourceSettings, tracker: TrackerSettings, progress: Progres
 
 
 def replay_trajectory(
-    file: Path, source: SourceSettings, tracker: TrackerSettings, progress: Progress | None
+    file: Path, source: SourceSettings, tracker: TumSettings | OrbSlam3Settings, progress: Progress | None
 ) -> ReplayedTracker:
     """The same for a given file."""
     trajectory = read_trajectory_file(file)  # before the images are listed: a wrong file is named at once

@@ -28,7 +28,7 @@ from modp_ti.viewer.modes import (
 )
 from modp_ti.viewer.page import Page, ShownFrame
 from modp_ti.viewer.splats import splats_of
-from pipelines.mapping import FrameReport
+from pipelines.pipeline import FrameReport
 
 __all__ = ["LiveViewer"]
 

@@ -51,12 +51,12 @@ class Reader:
 def _open(file: Path) -> None:
     """The tracker of the scene beside the file, opened and asked for what it holds."""
     from modp_ti.config import load_scene
-    from modp_ti.trackers import close, open_tracker
+    from modp_ti.trackers import open_tracker
 
     folder = file.parent
     while not (folder / "scene.yaml").exists():
         folder = folder.parent
-    close(open_tracker(load_scene(folder / "scene.yaml")))
+    open_tracker(load_scene(folder / "scene.yaml")).close()
 
 
 def _scene(file: Path) -> None:

@@ -327,6 +327,7 @@ HEAVY_TO_COMPLETE = "('taichi', 'torch', 'open3d', 'pycolmap', 'matplotlib')"
         ("modp-ti export out --format sp", ["splat", "spz"]),
         ("modp-ti render out --path ", ["recorded", "smoothed", "orbit"]),
         ("modp-ti run scene.yaml --set source.sc", ["source.scale=1.0"]),
+        ("modp-ti run scene.yaml --set tracker.kind=t", ["tracker.kind=transforms", "tracker.kind=tum"]),
     ],
 )
 def test_the_shell_is_offered_commands_options_and_values_without_waiting(line, offered):
@@ -340,10 +341,12 @@ def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):
     from modp_ti.settings import SceneConfig
 
     offered = [value for value, _ in matching_settings("")]
-    assert [value.partition("=")[0] for value in offered] == [entry.key for entry in documented_keys(SceneConfig)]
+    keys = [value.partition("=")[0] for value in offered]
+    assert list(dict.fromkeys(keys)) == list(dict.fromkeys(entry.key for entry in documented_keys(SceneConfig)))
+    assert len(set(offered)) == len(offered) and "tracker.kind=colmap" in offered
     defaults = [value for value in offered if not value.endswith("=")]
     assert len(defaults) > 100
-    usable = [value for value in defaults if not value.startswith(("source.vrs", "tracker.camera"))]
+    usable = [value for value in defaults if not value.startswith(("source.vrs", "tracker.kind"))]
     loaded = load_scene(scene, usable)
     assert loaded == load_scene(scene, [])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,12 @@ import yaml
 from pydantic import ValidationError
 
 from modp_ti.config import dump_scene, load_scene
-from modp_ti.config_keys import documented_keys, markdown_of_keys
+from modp_ti.config_keys import documented_keys, documented_values, markdown_of_keys, variants_of
 from modp_ti.errors import InputError
 from modp_ti.settings import SceneConfig
+from modp_ti.tracker_settings import KltSettings, TumSettings
 
+KINDS = list(variants_of(SceneConfig.model_fields["tracker"]))
 MINIMAL = "source: {path: images}\ntracker: {kind: colmap}\noutput: out/here\n"
 
 
@@ -125,6 +128,7 @@ def test_wrong_override_is_named_as_it_was_typed(scene, override, parts):
         ("tracker.drift", "0.05"),
         ("tracker.correction", "true"),
         ("tracker.adjust", "true"),
+        ("tracker.max_points", "3000"),
         ("mapping.corrections.min_pixels", "-1"),
         ("tracker.kind", "orb"),
         ("tracker.path", "3"),
@@ -150,7 +154,8 @@ def test_wrong_value_in_the_file_is_named_with_its_line(scene):
     [
         ("tracker: {kind: colmap}\noutput: o\n", ["source.path is missing"]),
         ("source: {path: x}\noutput: o\n", ["tracker is missing", "tracker.kind"]),
-        ("source: {path: x}\ntracker: {}\noutput: o\n", ["tracker.kind is missing"]),
+        ("source: {path: x}\ntracker: {}\noutput: o\n", ["tracker.kind is missing", "`klt` (the images alone"]),
+        ("source: {path: x}\ntracker: {path: m}\noutput: o\n", ["tracker.kind is missing"]),
         ("source: {path: x}\ntracker: {kind: colmap}\n", ["output is missing", "folder of the results"]),
     ],
 )
@@ -158,6 +163,44 @@ def test_missing_key_is_named_with_its_meaning(scene, text, parts):
     message = failure(scene(text))
     for part in parts:
         assert part in message
+
+
+@pytest.mark.parametrize(
+    ("tracker", "parts"),
+    [
+        ("{kind: colmap, pth: x}", ["unknown key `tracker.pth`; did you mean `tracker.path`?"]),
+        (
+            "{kind: colmap, points: x}",
+            ["unknown key `tracker.points`", "tum, orbslam3, replica and sevenscenes, not colmap", "`tracker.path`"],
+        ),
+        ("{kind: klt, path: x}", ["unknown key `tracker.path`", "not klt, which has no other key; take it out"]),
+        ("{kind: tum, camera: x}", ["`tracker.camera`: it is for tracker.kind: aria, not tum"]),
+        ("{kind: replica, time_offset: 1}", ["`tracker.time_offset`"]),
+        ("{kind: colmap, adress: x}", ["did you mean `tracker.address`, which is for tracker.kind: socket?"]),
+        ("{points: x, pth: y}", ["unknown key `tracker.pth`; did you mean `tracker.path`?"]),
+        ("{kind: orbslam, path: x}", ["tracker.kind: must be 'colmap', 'transforms'", "did you mean `orbslam3`?"]),
+        ("{kind: [colmap]}", ["tracker.kind: must be", 'not ["colmap"]']),
+        ("{kind: }", ["tracker.kind: must be", "not null"]),
+        ("7", ["tracker: must be an object, not 7"]),
+        ("{kind: tum, max_difference: -1}", ["tracker.max_difference: must be greater than 0, not -1"]),
+        ("{kind: tum, points: x, adjust: true}", ["tracker.adjust is for poses without tracker.points"]),
+        ("{kind: socket, address: x, path: y}", ["both say where to listen"]),
+    ],
+)
+def test_what_a_kind_of_tracker_does_not_take_is_named_with_its_line(scene, tracker, parts):
+    message = failure(scene(f"source: {{path: x}}\noutput: o\ntracker: {tracker}\n"))
+    assert "scene.yaml:3: " in message
+    for part in parts:
+        assert part in message
+
+
+def test_the_kind_that_counts_is_the_one_after_all_overrides(scene):
+    file = scene(MINIMAL)
+    tracker = load_scene(file, ["tracker.points=p.ply", "tracker.kind=tum"]).tracker
+    assert isinstance(tracker, TumSettings) and tracker.points == file.parent / "p.ply"
+    assert isinstance(load_scene(file, ["tracker.path=m", "tracker={kind: klt}"]).tracker, KltSettings)
+    message = failure(file, "tracker.path=m", "tracker.kind=klt")
+    assert message.startswith("--set tracker.path=m: unknown key `tracker.path`")
 
 
 def test_empty_range_of_frames_is_refused(scene):
@@ -220,17 +263,19 @@ def test_written_configuration_gives_the_same_run_from_wherever_it_lies(scene, t
     assert [file.name for file in elsewhere.iterdir()] == ["config.yaml"]
 
 
+def test_a_scene_is_written_with_the_keys_of_its_own_tracker_alone(scene, tmp_path):
+    for kind in KINDS:
+        dump_scene(load_scene(scene(MINIMAL), [f"tracker={{kind: {kind}}}"]), tmp_path / "config.yaml")
+        written = leaves(yaml.safe_load((tmp_path / "config.yaml").read_text()))
+        assert written == [entry.key for entry in documented_keys(SceneConfig) if entry.variant in ("", kind)]
+        assert load_scene(tmp_path / "config.yaml").tracker.kind == kind
+
+
 def leaves(data: dict, prefix: str = "") -> list[str]:
     keys = []
     for key, value in data.items():
         keys += leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [prefix + key]
     return keys
-
-
-def test_written_configuration_names_every_documented_key(scene, tmp_path):
-    dump_scene(load_scene(scene(MINIMAL)), tmp_path / "config.yaml")
-    written = leaves(yaml.safe_load((tmp_path / "config.yaml").read_text()))
-    assert written == [entry.key for entry in documented_keys(SceneConfig)]
 
 
 def test_every_key_is_documented_with_its_meaning_and_default():
@@ -240,6 +285,24 @@ def test_every_key_is_documented_with_its_meaning_and_default():
         assert f"| `{entry.key}` |" in text
     defaults = {entry.key: entry.default for entry in documented_keys(SceneConfig)}
     assert (defaults["source.scale"], defaults["source.holdout"], defaults["output"]) == ("1.0", "", None)
+    assert (defaults["tracker.kind"], defaults["tracker.patience"]) == (None, "120.0")
+
+
+def test_every_kind_of_tracker_has_its_section_in_the_reference():
+    text = markdown_of_keys(SceneConfig)
+    for kind in KINDS:
+        section = text.split(f"### `tracker` of kind `{kind}`\n")[1].split("\n#")[0]
+        keys = [entry.key for entry in documented_keys(SceneConfig) if entry.variant == kind]
+        assert re.findall(r"^\| `([\w.]+)` \|", section, re.MULTILINE) == keys
+        assert f"| [`{kind}`](#tracker-of-kind-{kind}) |" in text
+
+
+def test_every_setting_is_told_with_its_value(scene):
+    config = load_scene(scene(MINIMAL), ["tracker={kind: aria, camera: left}", "seed=4"])
+    values = {entry.key: value for entry, value in documented_values(config)}
+    assert (values["tracker.kind"], values["tracker.camera"], values["seed"]) == ("aria", "left", 4)
+    entries = [entry for entry in documented_keys(SceneConfig) if entry.variant in ("", "aria")]
+    assert [entry for entry, _ in documented_values(config)] == entries
 
 
 def test_reference_of_the_keys_is_up_to_date():

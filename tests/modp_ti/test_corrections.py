@@ -19,7 +19,7 @@ from modp_ti.evaluation import absolute_trajectory_error
 from modp_ti.exports.trajectory import read_trajectory
 from modp_ti.synthetic import Loop, SyntheticTracker
 from modp_ti.synthetic.renderer import RoomRenderer
-from modp_ti.trackers import events, open_tracker
+from modp_ti.trackers import open_tracker
 from pipelines.mapping import OnlineMapper
 from pipelines.settings import MappingSettings
 from tests.modp_ti.runs import finished_run
@@ -46,7 +46,7 @@ class RememberedRoom(RoomRenderer):
 def sequence(drift: float, room: RoomRenderer) -> list[TrackedFrame | PoseCorrection]:
     loop = Loop(drift, corrected=True)
     tracker = SyntheticTracker(width=SIZE[0], height=SIZE[1], frames=48, points=200, holdout=4, loop=loop, room=room)
-    return list(events(tracker))
+    return list(tracker.events())
 
 
 def held_out_psnr(mapper: OnlineMapper, frames: list[TrackedFrame], trajectory: list[NDArray]) -> float:

@@ -21,7 +21,8 @@ from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory, write_trajectory
 from modp_ti.playback.finished_run import open_run
 from modp_ti.playback.map_renderer import MapRenderer
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
+from modp_ti.tracker_settings import TransformsSettings
 from modp_ti.trackers.transforms import open_transforms
 from tests.modp_ti.exports.splat_readers import READERS
 from tests.room import HIGH, LOW
@@ -268,7 +269,7 @@ def test_a_nerfstudio_data_set_is_read_by_our_own_reader_and_has_its_split(out: 
     assert data["val_filenames"] == data["test_filenames"]  # nerfstudio refuses a set that lists two splits of three
     assert not set(data["train_filenames"]) & set(data["test_filenames"])
     assert PlyData.read(folder / data["ply_file_path"])["vertex"].count > 100
-    source, tracker = SourceSettings(path=folder / "images"), TrackerSettings(kind="transforms", path=folder)
+    source, tracker = SourceSettings(path=folder / "images"), TransformsSettings(path=folder)
     frames = list(open_transforms(source, tracker))
     run = open_run(out)
     for frame, T, camera in zip(frames, run.poses, run.cameras, strict=True):

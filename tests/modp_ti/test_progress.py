@@ -7,7 +7,7 @@ from rich.console import Console
 
 from modp_ti import progress
 from modp_ti.progress import ProgressLine
-from pipelines.mapping import FrameReport
+from pipelines.pipeline import FrameReport
 
 
 def written(terminal: bool) -> str:

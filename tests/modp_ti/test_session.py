@@ -24,7 +24,7 @@ from modp_ti.exports.scores_csv import read_scores
 from modp_ti.exports.splats_ply import read_splats
 from modp_ti.exports.trajectory import read_trajectory
 from modp_ti.lpips import open_lpips
-from modp_ti.trackers import open_tracker
+from modp_ti.trackers import Tracker, open_tracker
 from pipelines.stopwatch import Stopwatch
 from tests.modp_ti.report.made_up_run import Page
 from tests.modp_ti.runs import FILES, SHORT_RUN, run
@@ -230,18 +230,22 @@ def test_estimated_exposures_are_written_and_the_scores_are_those_of_the_develop
     assert metrics["refined"]["held_out"]["psnr"] == pytest.approx(expected, abs=0.01)
 
 
-class LiveTracker:
+class LiveTracker(Tracker):
     """Two black frames, a note that only their end brings, and something to let go of."""
 
     def __init__(self):
-        self.notes = ["said first"]
+        self.said = ["said first"]
         self.closed = False
+
+    @property
+    def notes(self):
+        return self.said
 
     def __iter__(self):
         camera = PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)
         for i in range(2):
             yield TrackedFrame(i, i / 30, str(i), np.zeros((48, 64, 3), np.float32), camera, np.eye(4))
-        self.notes.append("said last")
+        self.said.append("said last")
 
     def close(self):
         self.closed = True
@@ -252,6 +256,9 @@ class DeafPipeline:
 
     keyframes = ()
     stopwatch = Stopwatch()
+
+    def __init__(self) -> None:
+        self.refused = {}
 
     def compile(self) -> None: ...
 

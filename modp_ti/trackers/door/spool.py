@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fields.tracked_frame import SparsePoints
 from modp_ti.errors import InputError
 from modp_ti.sources.image_header import read_image_header
-from modp_ti.sources.intrinsics import Intrinsics
+from modp_ti.sources.protocol import ImageSource
 from modp_ti.trackers.door.messages import POINT, Encoding, Frame, Hello, UnfitError, parse_points
 
 __all__ = ["Spool", "SpoolFullError"]
@@ -27,18 +27,17 @@ class SpoolFullError(Exception):
     """The disk has no room for another frame. The text says so in a line."""
 
 
-class Spool:
-    """An `ImageSource` of the images that have arrived, in a temporary folder of its own until `close`.
+class Spool(ImageSource):
+    """The images that have arrived, in a temporary folder of its own until `close`.
 
     A frame is named by its number at the sender.
     """
 
     def __init__(self, hello: Hello) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-door-")
-        self.path = Path(self._folder.name)
-        self.intrinsics: Intrinsics | None = hello.intrinsics
-        self.notes: list[str] = []
-        self.names: list[str] = []
+        super().__init__(Path(self._folder.name))
+        self.intrinsics = hello.intrinsics
+        self._names: list[str] = []
         self._encoding = hello.encoding
         self._position: dict[str, int] = {}
         self._timestamps: list[float] = []
@@ -57,8 +56,8 @@ class Spool:
         except InputError as error:
             (self.path / name).unlink(missing_ok=True)
             raise UnfitError(f"FRAME {frame.number}: {error}", frame.number) from None
-        self._position[name] = len(self.names)
-        self.names.append(name)
+        self._position[name] = len(self._names)
+        self._names.append(name)
         self._timestamps.append(frame.timestamp)
         return name
 
@@ -88,8 +87,9 @@ class Spool:
                 frame.number,
             )
 
-    def __len__(self) -> int:
-        return len(self.names)
+    @property
+    def names(self) -> Sequence[str]:
+        return self._names
 
     def position(self, name: str) -> int:
         return self._position[name]
@@ -101,10 +101,7 @@ class Spool:
         return name if name in self._position else None
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        return self.names[start:stop:step]
-
-    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        return iter(self.selected(start, stop, step))
+        return self._names[start:stop:step]
 
     def size(self, name: str) -> tuple[int, int]:
         assert self.intrinsics is not None

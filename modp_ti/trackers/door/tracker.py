@@ -12,8 +12,9 @@ import numpy as np
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, Undistorter
+from modp_ti.tracker_settings import SocketSettings
 from modp_ti.trackers.door.connection import GLANCE, Connection, SenderGoneError
 from modp_ti.trackers.door.history import Delivered, History
 from modp_ti.trackers.door.listening import listen, open_to_others
@@ -31,7 +32,7 @@ from modp_ti.trackers.door.messages import (
 )
 from modp_ti.trackers.door.ordering import Ordering
 from modp_ti.trackers.door.spool import Spool, SpoolFullError
-from modp_ti.trackers.protocol import Progress
+from modp_ti.trackers.protocol import Progress, Tracker
 from modp_ti.trackers.replay import is_held_out, points_inside, unmasked
 
 __all__ = ["DoorTracker", "open_door"]
@@ -43,7 +44,7 @@ BREATH, LONGEST_BREATH = 0.01, 0.5
 FEW_UNFIT, UNFIT_SHARE = 3, 0.1
 
 
-def open_door(source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> DoorTracker:
+def open_door(source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> DoorTracker:
     """Listen where the configuration says; frames come once a sender is there.
 
     Raises InputError for an address where this cannot be, and for settings that choose among files.
@@ -55,7 +56,7 @@ def open_door(source: SourceSettings, tracker: TrackerSettings, progress: Progre
     return DoorTracker(source, tracker, progress)
 
 
-class DoorTracker:
+class DoorTracker(Tracker):
     """A live `Tracker` that listens from the start, in a thread that reads, checks and decodes what is sent.
 
     Up to `source.prefetch` frames (one at least) wait decoded for the mapper; then nothing more is read, and the
@@ -65,14 +66,14 @@ class DoorTracker:
     was sent is kept in a temporary folder until `close`.
     """
 
-    def __init__(self, source: SourceSettings, tracker: TrackerSettings, progress: Progress | None = None) -> None:
+    def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
         self._source = source
         self._patience = tracker.patience
         self._path = tracker.path
         self._listener, self.address = listen(tracker.address, tracker.path)
-        self.notes = [f"frames come from {self.address}"]
+        self._notes = [f"frames come from {self.address}"]
         if open_to_others(self._listener):
-            self.notes.append(f"{self.address} is open to the network: whoever reaches it can send frames")
+            self._notes.append(f"{self.address} is open to the network: whoever reaches it can send frames")
         self._progress = progress
         self._spool: Spool | None = None
         self._reader: FrameReader | None = None
@@ -91,6 +92,10 @@ class DoorTracker:
         self._thread.start()
 
     # ---- what the mapper takes, in its thread ----------------------------------------------------------------
+
+    @property
+    def notes(self) -> list[str]:
+        return self._notes
 
     def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
         """Frames and corrections as they arrive, once. Raises InputError where the run's own settings do not fit."""
@@ -210,17 +215,17 @@ class DoorTracker:
             self._closed.wait(min(BREATH * self._dropped, LONGEST_BREATH))
             return False
         if problem is not None:
-            self.notes.append(f"the stream ended early: {problem}; the run went on with the frames before")
+            self._notes.append(f"the stream ended early: {problem}; the run went on with the frames before")
         ordering.close()
         try:
             self._deliver(ordering)
         except SpoolFullError as error:
-            self.notes.append(f"the last frames are missing: {error}")
+            self._notes.append(f"the last frames are missing: {error}")
         if self._unfit:
             messages = "1 message was" if len(self._unfit) == 1 else f"{len(self._unfit)} messages were"
-            self.notes.append(f"{messages} left out: {'' if len(self._unfit) == 1 else 'the last: '}{self._unfit[-1]}")
+            self._notes.append(f"{messages} left out: {'' if len(self._unfit) == 1 else 'the last: '}{self._unfit[-1]}")
         if ordering.lost:
-            self.notes.append(f"{ordering.lost} of {len(self._spool or ())} frames came without a pose: skipped")
+            self._notes.append(f"{ordering.lost} of {len(self._spool or ())} frames came without a pose: skipped")
         if problem is None:
             connection.say(Kind.DONE, struct.pack("<I", len(self._indices)))
             connection.close()
@@ -242,7 +247,7 @@ class DoorTracker:
         were = "was" if self._dropped == 1 else "were"
         last = "" if self._dropped == 1 else "the last: "
         note = f"{many} to {self.address} {were} dropped before the first frame: {last}{problem}"
-        self.notes = [*(other for other in self.notes if other != self._dropped_note), note]
+        self._notes = [*(other for other in self._notes if other != self._dropped_note), note]
         self._dropped_note = note
 
     def _prepare(self, hello: Hello) -> None:
@@ -272,7 +277,7 @@ class DoorTracker:
         self._reader.require_fitting([(name, self._undistorter)])
         ordering.add_frame(frame)
         if len(self._spool) == 1 and self._name:
-            self.notes.append(f"the tracker there is {self._name}")
+            self._notes.append(f"the tracker there is {self._name}")
 
     def _deliver(self, ordering: Ordering) -> None:
         """Hand on what is ready, waiting for the mapper where it has enough."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +15,17 @@ from fields.pose_correction import PoseCorrection
 from fields.se3 import inverse_se3
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.errors import InputError, UnreadableImageError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
 from modp_ti.sources.exif import focal_length_35mm
 from modp_ti.trackers.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
 from modp_ti.trackers.klt.lens import Lens
 from modp_ti.trackers.klt.odometry import Odometry, View
 from modp_ti.trackers.klt.pose import ray_errors
-from modp_ti.trackers.protocol import Progress
+from modp_ti.trackers.protocol import Progress, Tracker
 from modp_ti.trackers.replay import is_held_out, points_inside, require_few, unmasked, unreadable_note
 
-__all__ = ["KltTracker", "open_klt"]
+__all__ = ["ArrivingNames", "KltTracker", "open_klt"]
 
 FOLLOWED_SIDE = 640  # px: features are followed in images of this longer side at most
 MAX_ERROR = 2.5  # px of those: a point farther from where it is seen is not delivered
@@ -36,20 +37,14 @@ MOVED = 0.2
 DIAGONAL_35MM = 43.27  # mm
 
 
-def open_klt(
-    source: SourceSettings, tracker: TrackerSettings, seed: int = 0, progress: Progress | None = None
-) -> KltTracker:
+def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = None) -> KltTracker:
     """The tracker over the source's images, its camera known: the source's own, of EXIF, or estimated now.
 
     Raises InputError for images that are missing, unreadable or of more than one size.
     """
-    if tracker.path is not None:
-        raise InputError(
-            f"tracker.path ({tracker.path}) is not for tracker.kind: klt, which tracks the images; take it out"
-        )
     images = open_source(source)
     reader = FrameReader(images, source)
-    arrived = _Arrived(images, source)
+    arrived = ArrivingNames(images, source)
     first = next(iter(arrived), None)
     if first is None:
         raise InputError(f"{images.path}: brought no image")
@@ -71,7 +66,7 @@ def open_klt(
     return KltTracker(reader, arrived, intrinsics, source, seed, notes)
 
 
-class _Arrived:
+class ArrivingNames:
     """Names of a source's images, each once it is there; may be iterated over again, and goes on where it was."""
 
     def __init__(self, images: ImageSource, source: SourceSettings) -> None:
@@ -116,7 +111,7 @@ def _require_one_size(images: ImageSource, names: Sequence[str], width: int, hei
 
 
 def _estimated(
-    reader: FrameReader, arrived: _Arrived, blank: Intrinsics, seed: int, progress: Progress | None
+    reader: FrameReader, arrived: ArrivingNames, blank: Intrinsics, seed: int, progress: Progress | None
 ) -> tuple[Intrinsics, str]:
     """The camera by EXIF and by the images, and what to tell the user."""
     width, height = blank.camera.width, blank.camera.height
@@ -172,7 +167,7 @@ class _Told:
     T_camera_world: NDArray[np.float64]
 
 
-class KltTracker:
+class KltTracker(Tracker):
     """A `Tracker` that finds poses and points in the images of `reader`'s source, as they arrive.
 
     `events` may be iterated over once; it delivers frames and, where bundle adjustment has moved earlier ones, their
@@ -181,12 +176,12 @@ class KltTracker:
     which grow until the last frame. All of it depends on the images and the seed alone.
     """
 
-    reads_ahead = True
+    reads_ahead: ClassVar[bool] = True
 
     def __init__(
         self,
         reader: FrameReader,
-        names: _Arrived | Sequence[str],
+        names: ArrivingNames,
         intrinsics: Intrinsics,
         source: SourceSettings,
         seed: int = 0,
@@ -202,7 +197,7 @@ class KltTracker:
         self._delivered = intrinsics.undistorter(source.scale)
         self._odometry = Odometry([Lens.pinhole(self._followed.camera)], seed)
         self._told: list[_Told] = []
-        self.unreadable: dict[str, UnreadableImageError] = {}  # images that were left out
+        self._unreadable: dict[str, UnreadableImageError] = {}
         self._told_keyframes: dict[int, NDArray[np.float64]] = {}
         self._told_xyz = np.zeros((0, 3))
         self._progress = self._tracked()
@@ -227,6 +222,10 @@ class KltTracker:
         """What the source has to say, and what the tracker has found so far."""
         return [*self._reader.images.notes, *self._notes]
 
+    @property
+    def unreadable(self) -> Mapping[str, UnreadableImageError]:
+        return self._unreadable
+
     def close(self) -> None:
         self._reader.images.close()
 
@@ -238,8 +237,8 @@ class KltTracker:
             try:
                 raw = _read(self._reader.images, name, raw_camera.width, raw_camera.height)
             except UnreadableImageError as error:
-                self.unreadable[name] = error
-                require_few(list(self.unreadable.values()), max(len(names), len(self._known())))
+                self._unreadable[name] = error
+                require_few(list(self._unreadable.values()), max(len(names), len(self._names.there)))
                 continue
             grey, valid = self._followed.grey(raw, self._reader.valid(name, raw))
             keyframes = self._keyframe_count()
@@ -253,24 +252,21 @@ class KltTracker:
             yield from self._corrections(MOVED)
         self._sum_up(names)
 
-    def _known(self) -> Sequence[str]:
-        return self._names.there if isinstance(self._names, _Arrived) else self._names
-
     def _keyframe_count(self) -> int:
         return 0 if self._odometry.map is None else len(self._odometry.map.keyframes)
 
     def _sum_up(self, names: Sequence[str]) -> None:
         counts = self._odometry.counts
-        without = len(names) - len(self._told) - len(self.unreadable)
+        without = len(names) - len(self._told) - len(self._unreadable)
         if not self._told:
             raise InputError(
                 f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
                 "and a camera that moves sideways and does not only turn"
             )
-        if self.unreadable:
-            self._notes.append(unreadable_note(list(self.unreadable.values()), len(names)))
+        if self._unreadable:
+            self._notes.append(unreadable_note(list(self._unreadable.values()), len(names)))
         if without:
-            placed = {told.name for told in self._told} | set(self.unreadable)
+            placed = {told.name for told in self._told} | set(self._unreadable)
             first = next(name for name in names if name not in placed)
             self._notes.append(
                 f"{without} of {len(names)} images could not be placed (the first is {first}): skipped; the camera was "

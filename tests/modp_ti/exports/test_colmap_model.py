@@ -12,8 +12,9 @@ import pytest
 from fields.camera import PinholeCamera
 from fields.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.exports.colmap_model import image_names, write_colmap, write_image
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.tracked_points import TrackedPoints
+from modp_ti.tracker_settings import ColmapSettings
 from modp_ti.trackers.colmap import open_colmap
 
 CAMERAS = [PinholeCamera(50.0, 51.0, 20.5, 14.0, 40, 30), PinholeCamera(55.0, 55.0, 20.0, 15.0, 40, 30)]
@@ -114,7 +115,7 @@ def test_our_own_reader_gives_the_same_frames_back(tracked: TrackedPoints, tmp_p
     for name, frame in zip(names, frames(), strict=True):
         write_image(folder, name, frame)
     source = SourceSettings(path=folder / "images", masks=None)
-    again = list(open_colmap(source, TrackerSettings(kind="colmap", path=folder)))
+    again = list(open_colmap(source, ColmapSettings(path=folder)))
     assert [f.name for f in again] == ["left/frame2.png", "left/frame10.png", "right/a.png"]
     for ours, theirs in zip(again, frames(), strict=True):
         assert ours.camera == theirs.camera

@@ -21,8 +21,9 @@ from modp_ti.report.page import ReportedRun
 from modp_ti.report.pictures import Album
 from modp_ti.report.record import RunRecord
 from modp_ti.results import metrics_of
-from modp_ti.settings import ExportSettings, SceneConfig, SourceSettings, TrackerSettings
-from pipelines.mapping import FrameReport
+from modp_ti.settings import ExportSettings, SceneConfig, SourceSettings
+from modp_ti.tracker_settings import SyntheticSettings
+from pipelines.pipeline import FrameReport
 
 
 def cameras(count: int, radius: float = 1.0, height: float = 1.5) -> list[NDArray[np.float64]]:
@@ -160,7 +161,7 @@ def made_up_run(
             cv2.imwrite(str(folder / "renders" / f"{i:06d}.png"), pair)
         album.keep(i, image, render)
     config = SceneConfig(
-        tracker=TrackerSettings(kind="synthetic"),
+        tracker=SyntheticSettings(),
         source=SourceSettings(scale=0.5, holdout=holdout or None),
         export=ExportSettings(),
         output=folder / "out",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from modp_ti.report.record import FrameNote, RunRecord, StepNote
-from pipelines.mapping import FrameReport
+from pipelines.pipeline import FrameReport
 
 
 def test_frames_are_noted_with_the_time_since_the_first_began() -> None:

@@ -230,6 +230,14 @@ def test_settings_that_this_version_does_not_have_are_refused(stopped: Path) -> 
         load_resumed(stopped, None, [])
 
 
+def test_a_snapshot_with_the_keys_of_all_trackers_as_0_1_0_wrote_it_is_taken(stopped: Path) -> None:
+    arrays, about = read_arrays(stopped / FILE)
+    del about["version"]
+    about["settings"]["tracker"] |= {"path": None, "camera": "camera-rgb", "patience": 120.0}
+    write_arrays(stopped / FILE, arrays, about)
+    assert load_resumed(stopped, None, [])[0] == load_resumed(stopped, stopped.parent / "scene.yaml", [])[0]
+
+
 def test_a_folder_without_a_snapshot_says_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         load_resumed(tmp_path / "gone", None, [])

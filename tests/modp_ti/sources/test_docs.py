@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from modp_ti.config import load_scene
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import open_source
 from modp_ti.sources.recognition import recognised_kind
 
@@ -66,14 +66,6 @@ def settings(example: str, folder: Path) -> SourceSettings:
     file.write_text(EXAMPLES[example])
     block = yaml.safe_load(EXAMPLES[example])
     assert set(block) == {"source", "tracker", "output"}
-    if block["tracker"]["kind"] not in get_args(TrackerSettings.model_fields["kind"].annotation):
-        block["tracker"] = {"kind": "synthetic"}  # that tracker is not part of this version
-        if "intrinsics" in block["source"]:
-            paths = {"path": folder / block["source"]["path"]}
-            return SourceSettings.model_validate(block["source"] | paths)
-        if "stream" in block["source"]:
-            return SourceSettings.model_validate(block["source"])
-        file.write_text(yaml.safe_dump(block))
     return load_scene(file).source
 
 

@@ -132,6 +132,8 @@ def test_frames_arrive_in_order_with_their_times_and_can_be_read_again(camera, o
     assert source.size("live_000004") == (64, 48)
     assert source.find("x/live_000002.png") == "live_000002" and source.find("2") is None
     assert len(source.notes) == 1, "nothing was dropped"
+    source.add_note("the camera is guessed")
+    assert source.notes[1:] == ["the camera is guessed"]
 
 
 def test_what_is_read_again_is_what_the_decoder_gave(camera, opened):

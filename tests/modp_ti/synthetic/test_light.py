@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.synthetic import LightChange, SyntheticTracker, open_synthetic
 from modp_ti.synthetic.renderer import RoomRenderer
+from modp_ti.tracker_settings import SyntheticSettings
 
 SHAPE = {"width": 64, "height": 48, "select": slice(3), "points": 60, "seed": 3}
 
@@ -47,8 +48,8 @@ def test_the_exposure_wanders_by_the_deviations_that_it_is_given() -> None:
 
 def test_a_scene_file_sets_how_much_it_wanders() -> None:
     source = SourceSettings(scale=0.25, stop=6)
-    still = open_synthetic(source, TrackerSettings(kind="synthetic"))
-    wandering = open_synthetic(source, TrackerSettings(kind="synthetic", exposure_change=1.0))
+    still = open_synthetic(source, SyntheticSettings())
+    wandering = open_synthetic(source, SyntheticSettings(exposure_change=1.0))
     np.testing.assert_array_equal(still.exposure(4), np.eye(3, 4))
     assert np.abs(wandering.exposure(4) - np.eye(3, 4)).max() > 0.02
 
@@ -56,4 +57,4 @@ def test_a_scene_file_sets_how_much_it_wanders() -> None:
 @pytest.mark.parametrize("setting", [{"masks": "m"}, {"mask_colour": (0, 0, 0)}, {"vignette": "v.png"}])
 def test_the_demo_refuses_masks_and_vignettes(setting: dict) -> None:
     with pytest.raises(InputError, match="the demo room has neither masks nor a vignette"):
-        open_synthetic(SourceSettings.model_validate(setting), TrackerSettings(kind="synthetic"))
+        open_synthetic(SourceSettings.model_validate(setting), SyntheticSettings())

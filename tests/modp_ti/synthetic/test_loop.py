@@ -14,7 +14,6 @@ from modp_ti.evaluation import umeyama
 from modp_ti.synthetic import Loop, SyntheticTracker, TrackerNoise
 from modp_ti.synthetic.camera_path import camera_path
 from modp_ti.synthetic.renderer import RoomRenderer
-from modp_ti.trackers import events
 
 Make = Callable[..., SyntheticTracker]
 
@@ -51,7 +50,7 @@ def test_the_camera_comes_back_to_where_it_began() -> None:
 def test_poses_and_points_of_a_frame_drift_together(make: Make) -> None:
     tracker = make(loop=Loop(0.05))
     truth = tracker.ground_truth()
-    drifted = list(events(tracker))
+    drifted = list(tracker.events())
     for frame in drifted:
         T = frame.T_camera_world
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
@@ -76,7 +75,7 @@ def test_the_correction_comes_where_the_loop_closes_or_at_the_end_and_is_right(
 ) -> None:
     options = {"select": slice(0, stop), "metres_per_unit": 0.4}
     tracker = make(loop=Loop(0.05, corrected=True), **options)
-    items = list(events(tracker))
+    items = list(tracker.events())
     (at,) = [i for i, item in enumerate(items) if isinstance(item, PoseCorrection)]
     assert at == place and len(items) == stop + 1
     correction, frames = items[at], frames_of(items)
@@ -107,7 +106,7 @@ def test_iterating_afterwards_gives_the_poses_of_the_end(make: Make) -> None:
 
 
 def test_without_drift_the_correction_says_what_the_frames_said(make: Make) -> None:
-    items = list(events(make(loop=Loop(0.0, corrected=True))))
+    items = list(make(loop=Loop(0.0, corrected=True)).events())
     (correction,) = [item for item in items if isinstance(item, PoseCorrection)]
     for i, frame in enumerate(frames_of(items)[: len(correction.index)]):
         np.testing.assert_array_equal(correction.T_camera_world[i], frame.T_camera_world)

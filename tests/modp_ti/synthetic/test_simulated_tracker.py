@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from fields.tracked_frame import TrackedFrame
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.synthetic import SyntheticTracker, TrackerNoise, open_synthetic, simulated_tracker
 from modp_ti.synthetic.renderer import RoomRenderer
-from modp_ti.trackers.protocol import Tracker, frame_count
+from modp_ti.tracker_settings import SyntheticSettings
+from modp_ti.trackers.protocol import Tracker
 
 pytestmark = pytest.mark.slow
 
@@ -181,9 +182,9 @@ def test_the_camera_moves_smoothly_with_parallax(make: Make) -> None:
 
 def test_open_synthetic_follows_the_scene(room: RoomRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulated_tracker, "RoomRenderer", lambda: room)
-    tracker = TrackerSettings(kind="synthetic")
+    tracker = SyntheticSettings()
     opened = open_synthetic(SourceSettings(scale=0.25, holdout=3, fps=5, start=4, stop=12, step=2), tracker)
-    assert isinstance(opened, Tracker) and frame_count(opened) == 4
+    assert isinstance(opened, Tracker) and opened.frame_count == 4
     assert "demo room" in opened.notes[0]
     got = list(opened)
     assert [frame.index for frame in got] == [0, 1, 2, 3]
@@ -202,4 +203,4 @@ def test_open_synthetic_follows_the_scene(room: RoomRenderer, monkeypatch: pytes
 def test_settings_that_leave_nothing_are_refused(settings: dict[str, float], part: str) -> None:
     source = SimpleNamespace(**{**SourceSettings().model_dump(), **settings})
     with pytest.raises(InputError, match=part):
-        open_synthetic(source, TrackerSettings(kind="synthetic"))
+        open_synthetic(source, SyntheticSettings())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SceneConfig, SourceSettings, TrackerSettings
+from modp_ti.settings import SceneConfig
 from modp_ti.trackers import open_tracker
 from modp_ti.trackers.replay import ReplayedTracker
 
@@ -56,8 +56,8 @@ class Recording:
         intrinsics = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
         settings = {"path": self.root / "images", "intrinsics": intrinsics, **(source or {})}
         return open_tracker(
-            SceneConfig(
-                source=SourceSettings(**settings), tracker=TrackerSettings(kind=kind, **tracker), output=Path("out")
+            SceneConfig.model_validate(
+                {"source": settings, "tracker": {"kind": kind, **tracker}, "output": Path("out")}
             )
         )
 

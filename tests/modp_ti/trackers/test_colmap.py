@@ -11,8 +11,9 @@ import pycolmap
 import pytest
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
-from modp_ti.trackers import Tracker, frame_count
+from modp_ti.settings import SourceSettings
+from modp_ti.tracker_settings import ColmapSettings
+from modp_ti.trackers import Tracker
 from modp_ti.trackers.colmap import open_colmap
 
 
@@ -22,7 +23,7 @@ def plane_points(count: int = 60) -> np.ndarray:
 
 
 def opened(scene, model=None, **source):
-    return open_colmap(SourceSettings(path=scene.folder, **source), TrackerSettings(kind="colmap", path=model))
+    return open_colmap(SourceSettings(path=scene.folder, **source), ColmapSettings(path=model))
 
 
 def failure(scene, model=None, **source) -> str:
@@ -39,7 +40,7 @@ def test_frames_come_with_poses_and_points_that_project_onto_their_pixels(plane_
     plane_scene.write_colmap(xyz, text)
     tracker = opened(plane_scene, scale=scale)
     assert isinstance(tracker, Tracker)
-    assert frame_count(tracker) == 7
+    assert tracker.frame_count == 7
     assert tracker.notes == []
     frames = list(tracker)
     assert [frame.name for frame in frames] == [f"view{i}.png" for i in range(8, 15)]
@@ -251,7 +252,7 @@ def test_pose_that_is_none_is_named(plane_scene):
 def test_model_of_a_videos_frames_gives_the_frames_that_it_gives_for_images(plane_scene):
     points = plane_points()
     plane_scene.write_colmap(points)
-    expected = list(open_colmap(SourceSettings(path=plane_scene.folder), TrackerSettings(kind="colmap")))
+    expected = list(open_colmap(SourceSettings(path=plane_scene.folder), ColmapSettings()))
 
     video = plane_scene.folder.parent / "room.mkv"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"FFV1"), 30.0, plane_scene.size)
@@ -260,7 +261,7 @@ def test_model_of_a_videos_frames_gives_the_frames_that_it_gives_for_images(plan
     writer.release()
     renamed = replace(plane_scene, names=[f"room_{i:06d}.png" for i in range(len(plane_scene.names))])
     renamed.write_colmap(points)
-    tracker = open_colmap(SourceSettings(path=video), TrackerSettings(kind="colmap"))
+    tracker = open_colmap(SourceSettings(path=video), ColmapSettings())
     assert tracker.notes == []
     for frame, other in zip(tracker, expected, strict=True):
         assert np.array_equal(frame.image, other.image)

@@ -15,7 +15,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from modp_ti.settings import IntrinsicsSettings, SourceSettings, TrackerSettings
+from modp_ti.settings import IntrinsicsSettings, SourceSettings
+from modp_ti.tracker_settings import AriaSettings, SevenScenesSettings, StellaVslamSettings, TumSettings
 from modp_ti.trackers.aria import open_aria
 from modp_ti.trackers.replay import PosedImage, ReplayedTracker
 from modp_ti.trackers.sevenscenes import open_sevenscenes
@@ -56,7 +57,7 @@ def test_tum_poses_carry_one_frame_s_depth_into_the_last(shared_data, tmp_path):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(row[4:]).as_matrix(), row[1:4]
     points = cloud_file(tmp_path / "points.txt", depth_image(depths[0], 5000), (517.3, 516.5, 319.1, 255.8), T)
-    settings = TrackerSettings(kind="tum", points=points, max_points=3000)
+    settings = TumSettings(points=points, max_points=3000)
     tracker = open_tum(SourceSettings(path=data), settings)
     assert [frame.name for frame in tracker.frames] == [f"rgb/{name.name}" for name in names]
     assert any("images that" in note and "are not there" in note for note in tracker.notes)
@@ -76,7 +77,7 @@ def test_sevenscenes_poses_carry_one_frame_s_depth_into_a_later(shared_data, tmp
     points = cloud_file(tmp_path / "points.txt", depths[0], K, T)
     camera = IntrinsicsSettings(fx=585.0)  # of the depth camera: it is what the poses are of
     source = SourceSettings(path=data, start=100, stop=141, step=40, intrinsics=camera)
-    tracker = open_sevenscenes(source, TrackerSettings(kind="sevenscenes", points=points, max_points=3000))
+    tracker = open_sevenscenes(source, SevenScenesSettings(points=points, max_points=3000))
     assert any("those of the depth camera" in note for note in tracker.notes)
     ratio = depth_ratio(tracker.frames[1], depths[1])
     assert len(ratio) > 500
@@ -89,7 +90,7 @@ def stella() -> ReplayedTracker:
     if not data.is_dir():
         pytest.skip("no ../shared/data/redkitchen")
     source = SourceSettings(path=data, scale=0.5)
-    return open_stella_vslam(source, TrackerSettings(kind="stella_vslam", path=data / "stella"))
+    return open_stella_vslam(source, StellaVslamSettings(path=data / "stella"))
 
 
 def test_stella_s_trajectory_is_as_near_to_the_other_one_as_is_known_of_it(shared_data, stella):
@@ -128,7 +129,7 @@ def test_aria_s_files_are_read_and_the_missing_one_is_named(shared_data, tmp_pat
     for i in range(2):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((80, 80, 3), 90, np.uint8))
     source = SourceSettings(path=tmp_path, intrinsics=IntrinsicsSettings(fx=40.0))
-    settings = TrackerSettings(kind="aria", path=folder, time_offset=-float(row[1]) * 1e-6)
+    settings = AriaSettings(path=folder, time_offset=-float(row[1]) * 1e-6)
     tracker = open_aria(source, settings)
 
     lines = map(json.loads, (folder / "online_calibration.jsonl").read_text().splitlines())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from fields.camera import PinholeCamera
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import Undistorter
+from modp_ti.tracker_settings import ColmapSettings, TransformsSettings
 from modp_ti.trackers.colmap import open_colmap
 from modp_ti.trackers.replay import checked_pose, points_inside
 from modp_ti.trackers.transforms import open_transforms
@@ -54,17 +57,16 @@ def test_masks_of_the_source_reach_the_frames_and_take_their_points_away(plane_s
     source = {"path": plane_scene.folder, "scale": 0.5}
     if kind == "colmap":
         plane_scene.write_colmap(xyz)
-        opened = open_colmap
+        opened = partial(open_colmap, tracker=ColmapSettings())
     else:
         rows = "\n".join(" ".join(map(repr, row)) for row in xyz.tolist())
         properties = "".join(f"property double {axis}\n" for axis in "xyz")
         header = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n{properties}end_header\n"
         (plane_scene.folder.parent / "points.ply").write_text(f"{header}{rows}\n")
         plane_scene.write_transforms(ply_file_path="points.ply", k1=-0.15)
-        opened = open_transforms
-    tracker = TrackerSettings(kind=kind)
-    plain = list(opened(SourceSettings(**source), tracker))
-    masked = list(opened(SourceSettings(**source, masks=masks, mask_colour=(255, 0, 0)), tracker))
+        opened = partial(open_transforms, tracker=TransformsSettings())
+    plain = list(opened(SourceSettings(**source)))
+    masked = list(opened(SourceSettings(**source, masks=masks, mask_colour=(255, 0, 0))))
     lost = 0
     for before, after in zip(plain, masked, strict=True):
         camera = after.camera
@@ -95,6 +97,6 @@ def test_a_missing_mask_ends_the_run_before_the_points_are_triangulated(plane_sc
     with pytest.raises(InputError, match=r"has no mask for view9\.png"):
         open_transforms(
             SourceSettings(path=plane_scene.folder, masks=masks),
-            TrackerSettings(kind="transforms"),
+            TransformsSettings(),
             lambda *_: pytest.fail("it began"),
         )

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
+from modp_ti.tracker_settings import TransformsSettings
 from modp_ti.trackers import Tracker
 from modp_ti.trackers.transforms import open_transforms
 
 
 def opened(scene, file=None, progress=None, **source):
-    return open_transforms(
-        SourceSettings(path=scene.folder, **source), TrackerSettings(kind="transforms", path=file), progress
-    )
+    return open_transforms(SourceSettings(path=scene.folder, **source), TransformsSettings(path=file), progress)
 
 
 def failure(scene, file=None, **source) -> str:

@@ -10,7 +10,8 @@ import pytest
 
 from fields.keyframes import Keyframe, KeyframeStore
 from fields.tracked_frame import SparsePoints
-from modp_ti.settings import SceneConfig, SourceSettings, TrackerSettings
+from modp_ti.settings import SceneConfig, SourceSettings
+from modp_ti.tracker_settings import ColmapSettings
 from modp_ti.trackers import open_tracker
 from pipelines.depth import DepthEstimator, EpipolarDepth, FusedDepth, GaussianProcessDepth, ImageGuidedDepth
 from pipelines.depth.estimate import point_depths
@@ -25,7 +26,7 @@ VIEWS = (15, 25, 35, 45, 58)
 def views() -> list[Keyframe]:
     config = SceneConfig(
         source=SourceSettings(path=DATA / "images", scale=0.5, stop=310),
-        tracker=TrackerSettings(kind="colmap", path=DATA / "sparse/0"),
+        tracker=ColmapSettings(path=DATA / "sparse/0"),
         output=Path("unused"),
     )
     store = KeyframeStore()

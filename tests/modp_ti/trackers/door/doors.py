@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fields.tracked_frame import TrackedFrame
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
+from modp_ti.tracker_settings import SocketSettings
 from modp_ti.trackers.door import DoorTracker, open_door
 
 HELLO, FRAME, POSE, CORRECTION, END = 1, 2, 3, 4, 5
@@ -21,7 +22,7 @@ SIZE = (8, 6)
 
 @contextmanager
 def opened(path: Path, patience: float = 20.0, **source: object) -> Iterator[DoorTracker]:
-    tracker = open_door(SourceSettings(**source), TrackerSettings(kind="socket", path=path, patience=patience))
+    tracker = open_door(SourceSettings(**source), SocketSettings(path=path, patience=patience))
     try:
         yield tracker
     finally:

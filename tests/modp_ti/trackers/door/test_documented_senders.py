@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
+from modp_ti.tracker_settings import SocketSettings
 from modp_ti.trackers.door import open_door
 
 PAGE = (Path(__file__).parents[4] / "docs" / "door.md").read_text()
 
 
 def received(command: list[str]) -> list:
-    tracker = open_door(SourceSettings(prefetch=16), TrackerSettings(kind="socket", address="127.0.0.1:0"))
+    tracker = open_door(SourceSettings(prefetch=16), SocketSettings(address="127.0.0.1:0"))
     try:
         port = tracker.address.rpartition(":")[2]
         sender = subprocess.run([*command, port], capture_output=True, text=True, timeout=60, check=False)

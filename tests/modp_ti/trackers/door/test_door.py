@@ -17,8 +17,9 @@ import pytest
 from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 from modp_ti.errors import InputError
-from modp_ti.settings import SourceSettings, TrackerSettings
-from modp_ti.trackers import Tracker, events
+from modp_ti.settings import SourceSettings
+from modp_ti.tracker_settings import ColmapSettings, SocketSettings
+from modp_ti.trackers import Tracker
 from modp_ti.trackers.colmap import open_colmap
 from modp_ti.trackers.door import open_door
 from tests.modp_ti.trackers.door.doors import (
@@ -79,7 +80,7 @@ def test_a_lens_and_a_scale_are_treated_as_the_colmap_reader_does(plane_scene, t
     model.cameras[1].model, model.cameras[1].params = lens.model, lens.params
     model.write_binary(str(folder))
     source = SourceSettings(path=plane_scene.folder, scale=0.5)
-    expected = list(open_colmap(source, TrackerSettings(kind="colmap")))
+    expected = list(open_colmap(source, ColmapSettings()))
     with opened(tmp_path / "s", scale=0.5, prefetch=8) as tracker, connect(tmp_path / "s") as connection:
         start = struct.pack("<IIII12d", 320, 240, 2, 1, *intrinsics, *k, *[0.0] * 4)
         connection.sendall(message(HELLO, start + b"a tracker"))
@@ -130,7 +131,7 @@ def test_a_correction_names_delivered_frames_and_they_are_there_again_with_it(tm
         moved = {10: pose(2.0), 14: pose(3.4)}
         connection.sendall(message(CORRECTION, correction(moved, {5: (1.0, 0, 3), 99: (0, 0, 1)})))
         connection.sendall(message(FRAME, frame(16)) + message(END))
-        arrived = list(events(tracker))
+        arrived = list(tracker.events())
         again = list(tracker)
     assert [type(e) for e in arrived] == [TrackedFrame] * 4 + [PoseCorrection] + [TrackedFrame]
     revised = arrived[4]
@@ -202,19 +203,19 @@ def test_a_closed_door_leaves_nothing_behind(tmp_path: Path) -> None:
 
 def test_an_address_is_of_this_machine_unless_another_is_asked_for() -> None:
     def notes(address: str) -> tuple[str, list[str]]:
-        tracker = open_door(SourceSettings(), TrackerSettings(kind="socket", address=address))
+        tracker = open_door(SourceSettings(), SocketSettings(address=address))
         tracker.close()
         return tracker.address, tracker.notes
 
     assert notes("127.0.0.1:0")[1][1:] == []
     assert "is open to the network" in notes("0.0.0.0:0")[1][1]
-    assert TrackerSettings(kind="socket").address is None
+    assert SocketSettings().address is None
 
 
 def test_an_address_that_cannot_be_is_refused(tmp_path: Path) -> None:
     def failure(**tracker: object) -> str:
         with pytest.raises(InputError) as caught:
-            open_door(SourceSettings(), TrackerSettings(kind="socket", **tracker))
+            open_door(SourceSettings(), SocketSettings(**tracker))
         assert "\n" not in str(caught.value)
         return str(caught.value)
 

@@ -10,20 +10,17 @@ from fields.pose_correction import PoseCorrection
 from fields.tracked_frame import TrackedFrame
 from modp_ti.errors import InputError
 from modp_ti.evaluation import absolute_trajectory_error
-from modp_ti.settings import SourceSettings, TrackerSettings
+from modp_ti.settings import SourceSettings
 from modp_ti.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.sources.distortion import Distortion
 from modp_ti.trackers.klt import KltTracker, open_klt
-
-KLT = TrackerSettings(kind="klt")
+from modp_ti.trackers.klt.tracker import ArrivingNames
 
 
 def known_camera(source: SourceSettings, box_room, distortion: Distortion | None = None) -> KltTracker:
     images = ImageFolder(source.path)
     intrinsics = Intrinsics(box_room.camera, distortion or Distortion())
-    return KltTracker(
-        FrameReader(images, source), images.selected(source.start, source.stop, source.step), intrinsics, source
-    )
+    return KltTracker(FrameReader(images, source), ArrivingNames(images, source), intrinsics, source)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +97,7 @@ def test_no_point_is_delivered_where_the_mask_is_black(box_room, box_walk, tmp_p
 
 
 def test_a_camera_that_nobody_described_is_estimated_and_said(box_room, box_walk, tmp_path):
-    tracker = open_klt(SourceSettings(path=box_walk.written(tmp_path / "images")), KLT)
+    tracker = open_klt(SourceSettings(path=box_walk.written(tmp_path / "images")))
     assert "estimated" in tracker.notes[0]
     assert tracker.intrinsics.camera.fx == pytest.approx(box_room.camera.fx, rel=0.05)
 
@@ -110,7 +107,7 @@ def test_images_that_do_not_tell_the_camera_give_a_guess_and_a_map_of_nothing_is
     folder.mkdir()
     for i in range(4):
         cv2.imwrite(str(folder / f"{i}.png"), np.zeros((120, 160, 3), np.uint8))
-    tracker = open_klt(SourceSettings(path=folder), KLT)
+    tracker = open_klt(SourceSettings(path=folder))
     assert "is a guess" in tracker.notes[0]
     with pytest.raises(InputError, match="could place none of the 4 images"):
         list(tracker.events())
@@ -120,12 +117,7 @@ def test_images_of_two_sizes_are_refused_before_tracking(tmp_path):
     for i, width in enumerate((160, 160, 100)):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((120, width, 3), np.uint8))
     with pytest.raises(InputError, match=r"2\.png is 100x120, the first image 160x120"):
-        open_klt(SourceSettings(path=tmp_path), KLT)
-
-
-def test_a_path_for_the_tracker_is_refused(tmp_path):
-    with pytest.raises(InputError, match="take it out"):
-        open_klt(SourceSettings(path=tmp_path), TrackerSettings(kind="klt", path=tmp_path / "model"))
+        open_klt(SourceSettings(path=tmp_path))
 
 
 def test_desk_is_tracked_from_its_images_alone(shared_data):
@@ -133,7 +125,7 @@ def test_desk_is_tracked_from_its_images_alone(shared_data):
     import pycolmap
 
     data = shared_data("desk")
-    frames = list(open_klt(SourceSettings(path=data / "images", scale=0.25), KLT))
+    frames = list(open_klt(SourceSettings(path=data / "images", scale=0.25)))
     model = pycolmap.Reconstruction(str(data / "sparse" / "0"))
     truth = {image.name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in model.images.values()}
     assert len(frames) >= 27

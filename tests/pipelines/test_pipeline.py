@@ -1,0 +1,57 @@
+"""What drives a map sees one class: the offline baseline takes the defaults of what only the online loop can do."""
+
+from __future__ import annotations
+
+import pytest
+
+from modp_ti.errors import InputError
+from modp_ti.mapper import Mapper
+from pipelines.map_state import MapState
+from pipelines.mapping import OnlineMapper
+from pipelines.offline import OfflineMapper
+from pipelines.pipeline import NothingToMapError, Pipeline
+from pipelines.settings import OfflineSettings, RefineSettings
+from tests.pipelines.wall import frame
+
+
+@pytest.fixture(scope="module")
+def mapper(taichi_on_the_cpu: None) -> Mapper:
+    return Mapper(64, 48, OfflineSettings(steps=3))
+
+
+def test_both_are_pipelines(mapper: Mapper) -> None:
+    assert issubclass(OnlineMapper, Pipeline) and isinstance(mapper.pipeline, OfflineMapper)
+    assert OnlineMapper.can_be_refined and not OfflineMapper.can_be_refined
+
+
+def test_an_offline_map_refuses_nothing_and_has_no_budget(mapper: Mapper) -> None:
+    assert mapper.pipeline.refused == {}
+    assert mapper.pipeline.takes_observations(10**9)
+    mapper.pipeline.count_beside(10**12)
+
+
+def test_an_offline_map_is_neither_refined_nor_resumed(mapper: Mapper) -> None:
+    with pytest.raises(ValueError, match="an offline map is not refined: give its settings more steps"):
+        mapper.refine(5)
+    with pytest.raises(ValueError, match="cannot be refined"):
+        mapper.pipeline.refine(RefineSettings())
+    with pytest.raises(ValueError, match="no state between two frames"):
+        mapper.pipeline.state()
+    with pytest.raises(ValueError, match="cannot be resumed"):
+        mapper.pipeline.restore(MapState.of({}, {}), [])
+
+
+def test_a_map_of_nothing_is_said_to_be_one(mapper: Mapper) -> None:
+    with pytest.raises(NothingToMapError):
+        mapper.pipeline.finish()
+    mapper.add(frame(0, held_out=True))
+    with pytest.raises(InputError, match="`mode: offline` starts from tracked points"):
+        mapper.finish()
+
+
+def test_finishing_makes_the_map(taichi_on_the_cpu: None, mapper: Mapper) -> None:
+    steps: list[int] = []
+    for i in range(1, 4):
+        mapper.add(frame(i))
+    mapper.finish(lambda step, gaussians, psnr: steps.append(step))
+    assert steps == [1, 2, 3] and len(mapper.pipeline.gaussians) > 0
