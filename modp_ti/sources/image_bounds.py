@@ -9,8 +9,11 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from PIL import BmpImagePlugin, PpmImagePlugin
+from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
+
 from modp_ti.reading.memory import available_memory
-from modp_ti.sources.image_header import read_image_header
+from modp_ti.sources.image_header import HEADER_ERRORS, HeaderReader, JpegHeader, read_tiff_directory
 
 __all__ = ["MAX_IMAGE_PIXELS", "why_undecodable"]
 
@@ -25,6 +28,8 @@ MOST_INFLATED = 1032
 INFLATED_AT_A_TIME = 1 << 18
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's kind of colour
 MOST_JPEG_PIXELS = 2048  # a byte
+# Least bits per pixel of the PNM formats: text has a digit and a separator per value, except in bitmaps.
+PNM_BITS = {b"1": 8, b"2": 16, b"3": 48, b"4": 1, b"5": 8, b"6": 24}
 
 
 @dataclass(frozen=True)
@@ -34,10 +39,6 @@ class _Claim:
     width: int
     height: int
     least: int = 0
-
-
-class _UnknownError(Exception):
-    """The header is damaged."""
 
 
 def why_undecodable(data: bytes) -> str | None:
@@ -50,7 +51,7 @@ def why_undecodable(data: bytes) -> str | None:
         return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM or PGM)"
     try:
         claim = read(data)
-    except (_UnknownError, struct.error, IndexError, ValueError):
+    except HEADER_ERRORS:
         return "its header is damaged"
     if claim.width < 1 or claim.height < 1:
         return f"its header says {claim.width}x{claim.height} pixels"
@@ -67,11 +68,11 @@ def why_undecodable(data: bytes) -> str | None:
 
 def _png(data: bytes) -> _Claim:
     if data[12:16] != b"IHDR":
-        raise _UnknownError
-    width, height, depth, kind = struct.unpack_from(">IIBB", data, 16)
+        raise ValueError
+    width, height, depth, kind, *_ = struct.unpack_from(">IIBBBBB", data, 16)
     channels = PNG_CHANNELS.get(kind, 0)
     if channels == 0 or depth not in (1, 2, 4, 8, 16):
-        raise _UnknownError
+        raise ValueError
     return _Claim(width, height, height * (1 + width * channels * depth // 8) // MOST_INFLATED)
 
 
@@ -95,37 +96,24 @@ def _inflates(data: bytes) -> bool:
 
 
 def _jpeg(data: bytes) -> _Claim:
-    header = read_image_header(io.BytesIO(data))
-    if header is None:
-        raise _UnknownError
-    return _Claim(header.width, header.height, header.width * header.height // MOST_JPEG_PIXELS)
+    width, height = JpegHeader(HeaderReader(io.BytesIO(data))).size
+    return _Claim(width, height, width * height // MOST_JPEG_PIXELS)
 
 
 def _bmp(data: bytes) -> _Claim:
-    (size,) = struct.unpack_from("<I", data, 14)
-    if size == 12:
-        width, height = struct.unpack_from("<HH", data, 18)
-        return _Claim(width, height)
-    width, height = struct.unpack_from("<ii", data, 18)
-    bits, compression = struct.unpack_from("<HI", data, 28)
-    plain = compression in (0, 3)
-    return _Claim(width, abs(height), abs(height) * max(width, 0) * bits // 8 if plain else 0)
+    image = BmpImagePlugin.BmpImageFile(HeaderReader(io.BytesIO(data)))
+    codec, _, _, parameters = image.tile[0]
+    # The last row may lack its padding.
+    return _Claim(*image.size, (image.height - 1) * parameters[1] if codec == "raw" else 0)
 
 
 def _pnm(data: bytes) -> _Claim:
-    words = re.sub(rb"#[^\n]*\n", b" ", data[:4096]).split(maxsplit=4)
-    if len(words) < 4 or max(map(len, words[1:3])) > 9:
-        raise _UnknownError
-    width, height = int(words[1]), int(words[2])
-    kind = int(words[0][1:])
-    # A bit or a byte a value, or a digit; text parts its values, but those of bitmaps.
-    least = {1: width * height, 2: 2 * width * height, 3: 6 * width * height}.get(
-        kind, {4: (width + 7) // 8 * height, 5: width * height, 6: 3 * width * height}.get(kind, 0)
-    )
-    return _Claim(width, height, least)
+    width, height = PpmImagePlugin.PpmImageFile(HeaderReader(io.BytesIO(data))).size
+    return _Claim(width, height, width * height * PNM_BITS[data[1:2]] // 8)
 
 
 def _webp(data: bytes) -> _Claim:
+    """Without Pillow, whose reader allocates two canvases of the declared size."""
     kind = data[12:16]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 26)
@@ -136,35 +124,16 @@ def _webp(data: bytes) -> _Claim:
     if kind == b"VP8X":
         width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
         return _Claim(width, height)
-    raise _UnknownError
-
-
-TIFF_NUMBERS = {1: "B", 3: "H", 4: "I", 16: "Q"}
-TIFF_WIDTH, TIFF_HEIGHT, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 322, 323
+    raise ValueError
 
 
 def _tiff(data: bytes) -> _Claim:
     """Of the first image in the file. A tile may be larger than the image, and is decoded as a whole."""
-    order = "<" if data[:2] == b"II" else ">"
-    if struct.unpack_from(order + "H", data, 2)[0] == 42:
-        (at,) = struct.unpack_from(order + "I", data, 4)
-        (entries,) = struct.unpack_from(order + "H", data, at)
-        first, entry, value = at + 2, 12, 8
-    else:  # BigTIFF
-        (at,) = struct.unpack_from(order + "Q", data, 8)
-        if at > len(data):  # beyond 2^63 an offset is none to Python
-            raise _UnknownError
-        (entries,) = struct.unpack_from(order + "Q", data, at)
-        first, entry, value = at + 8, 20, 12
-    found: dict[int, int] = {}
-    for number in range(min(entries, 4096)):
-        tag, kind = struct.unpack_from(order + "HH", data, first + entry * number)
-        if TIFF_WIDTH <= tag <= TIFF_TILE_HEIGHT and kind in TIFF_NUMBERS:
-            found[tag] = struct.unpack_from(order + TIFF_NUMBERS[kind], data, first + entry * number + value)[0]
-    if TIFF_WIDTH not in found or TIFF_HEIGHT not in found:
-        raise _UnknownError
-    tile = found.get(TIFF_TILE_WIDTH, 1), found.get(TIFF_TILE_HEIGHT, 1)
-    return _Claim(*(max(found[side], of) for side, of in zip((TIFF_WIDTH, TIFF_HEIGHT), tile, strict=True)))
+    found = read_tiff_directory(data)
+    sizes = found[IMAGEWIDTH], found[IMAGELENGTH], found.get(TILEWIDTH, 1), found.get(TILELENGTH, 1)
+    if not all(isinstance(size, int) for size in sizes):
+        raise ValueError
+    return _Claim(max(sizes[::2]), max(sizes[1::2]))
 
 
 FORMATS: tuple[tuple[bytes, Callable[[bytes], _Claim]], ...] = (

@@ -76,6 +76,8 @@ class ListedImages(KnownFrames):
             return width, height
         if not header.complete:
             raise self._unreadable(name, "the file is cut off")
+        if header.width < 1 or header.height < 1:
+            raise self._unreadable(name, "its header is damaged")
         return header.width, header.height
 
     def read(self, name: str) -> NDArray[np.uint8]:

@@ -1,8 +1,12 @@
-"""Source `live`: a camera or a network stream, through OpenCV, frame by frame as they come."""
+"""Source `live`: a camera or a network stream, through OpenCV, frame by frame as they come.
+
+Not through PyAV, as `video_file`: OpenCV finds cameras by number with the drivers of each operating system.
+"""
 
 from __future__ import annotations
 
 import atexit
+import os
 import re
 import signal
 import tempfile
@@ -10,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +24,6 @@ from modp_ti.errors import InputError
 from modp_ti.sources.known_frames import find_frame
 from modp_ti.sources.listed_images import decoded
 from modp_ti.sources.protocol import ImageSource
-from modp_ti.sources.video_file import quiet_decoder
 
 __all__ = ["LiveSource"]
 
@@ -246,7 +250,7 @@ def _open(stream: int | str):
 
     if isinstance(stream, str) and Path(stream).is_file():
         raise InputError(f"{stream}: is a file (source.stream): give it as source.path")
-    with quiet_decoder():
+    with _quiet_decoder():
         try:
             if isinstance(stream, int) or "://" not in stream:  # a camera, by its number or its path
                 capture = cv2.VideoCapture(stream)
@@ -260,3 +264,16 @@ def _open(stream: int | str):
         what = "no such camera, or it is in use" if isinstance(stream, int) else "no stream that can be opened"
         raise InputError(f"{_shown(stream)}: {what} (source.stream)")
     return capture
+
+
+@contextmanager
+def _quiet_decoder() -> Iterator[None]:
+    """Keeps OpenCV and its FFmpeg from writing to the terminal: the user gets one line, from us."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first stream is opened
+    log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(log_level)

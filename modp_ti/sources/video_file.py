@@ -1,11 +1,9 @@
-"""Source `video`: the frames of a video file, through OpenCV."""
+"""Source `video`: the frames of a video file, in any order."""
 
 from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -14,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.errors import InputError
-from modp_ti.sources.image_bounds import MAX_IMAGE_PIXELS
 from modp_ti.sources.known_frames import KnownFrames
 from modp_ti.sources.video_container import missing_bytes
 
 if TYPE_CHECKING:
-    import cv2
+    from modp_ti.sources.video_decoder import VideoDecoder
 
-__all__ = ["VIDEO_SUFFIXES", "VideoFile", "quiet_decoder"]
+__all__ = ["VIDEO_SUFFIXES", "VideoFile"]
 
 VIDEO_SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
@@ -31,8 +28,8 @@ VIDEO_SUFFIXES = (
 # Up to this many frames ahead are decoded and passed over; further ones are sought, which decodes from the last
 # keyframe of the stream, some 250 frames away at most.
 PASSED_OVER = 60
-# Before this time [ms] the decoder is asked to go, for a frame to come after the place where it lands.
-SEEK_MARGIN = 100.0
+# How long before the wanted frame [s] to seek; the next one is tried if a seek lands behind the frame.
+SEEK_MARGINS = (0.0, 1.0, 10.0, 100.0)
 
 
 class VideoFile(KnownFrames):
@@ -62,18 +59,20 @@ class VideoFile(KnownFrames):
         self._lock = Lock()
         self._checksums: dict[int, int] = {}
         self._seeks = True
+        self._form: tuple[int, int, int] | None = None
         self._front = self._decoder(missing, in_threads=True)
-        self._back: _Decoder | None = None
+        self._back: VideoDecoder | None = None
 
         shown: list[float] = []
+        first = None
         while (stop is None or len(shown) < stop) and self._front.advance():
             shown.append(self._front.shown)
             if len(shown) == 1:
-                first = self._front.image()
+                first, self._form = self._front.image(), self._front.form
         cut_off = bool(missing) and (stop is None or len(shown) < stop)
-        if not shown or first is None or cut_off:
+        if first is None or cut_off:
             self.close()
-        if not shown or first is None:
+        if first is None or self._form is None:
             raise self._useless(missing)
         if cut_off:
             raise InputError(
@@ -86,9 +85,9 @@ class VideoFile(KnownFrames):
 
         height, width = first.shape[:2]
         self._size = (width, height)
-        if self._front.turned:
+        if turned := self._form[2]:
             self.add_note(
-                f"{self.path} asks to be turned clockwise by {self._front.turned} degrees, and is: its frames are "
+                f"{self.path} asks to be turned clockwise by {turned} degrees, and is: its frames are "
                 f"{width}x{height}, and intrinsics are for that"
             )
         if not timed:
@@ -103,14 +102,12 @@ class VideoFile(KnownFrames):
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Decoded frame (H, W, 3) uint8 RGB. Raises InputError where it cannot be decoded."""
-        import cv2
-
         with self._lock:
             index = self._position[name]
             image = self._new(index) if index > self._front.index else self._old(index)
         if image is None:
             raise InputError(f"{self.path}: frame {index} cannot be decoded (any more); was the file changed?")
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return image
 
     def close(self) -> None:
         """Close the file."""
@@ -156,23 +153,20 @@ class VideoFile(KnownFrames):
     def _seek(self, index: int) -> bool:
         """Whether the second decoder stands at the frame after a search by its time."""
         assert self._back is not None
-        margin = SEEK_MARGIN
-        while margin < 1e5:
-            target = max(float(self._shown[index]) - margin, 0.0)
-            landed = self._back.seek(target)
-            found = None if landed is None else np.flatnonzero(self._shown == landed)
-            if found is not None and len(found) == 1 and found[0] <= index:
+        for margin in SEEK_MARGINS:
+            landed = self._back.seek(float(self._shown[index]) - 1000.0 * margin)
+            found = [] if landed is None else np.flatnonzero(self._shown == landed)
+            if len(found) == 1 and found[0] <= index:
                 self._back.index = int(found[0])
-                return self._back.index == index or self._back.advance_to(index)
-            if target == 0.0:
-                break
-            margin *= 4
+                return self._back.advance_to(index)
         self._back.index = len(self.names)  # somewhere: what comes next begins anew
         return False
 
-    def _decoder(self, missing: int | None = None, in_threads: bool = False) -> _Decoder:
+    def _decoder(self, missing: int | None = None, in_threads: bool = False) -> VideoDecoder:
+        from modp_ti.sources.video_decoder import VideoDecoder
+
         try:
-            return _Decoder(self.path, in_threads)
+            return VideoDecoder(self.path, in_threads, self._form)
         except OSError:
             raise self._useless(missing) from None
 
@@ -182,82 +176,9 @@ class VideoFile(KnownFrames):
         if missing:
             return InputError(f"{self.path}: the video is cut off, {missing} bytes are missing: copy it again")
         return InputError(
-            f"{self.path}: no video that OpenCV can read, or without a frame: convert it, for example with "
+            f"{self.path}: no video that FFmpeg can read, or without a frame: convert it, for example with "
             "`ffmpeg -i in -c:v libx264 out.mp4`"
         )
-
-
-class _Decoder:
-    """A capture that counts. index: of the frame that was decoded last, -1 before the first.
-
-    in_threads: faster, but damaged parts of a stream then look different each time.
-    """
-
-    def __init__(self, path: Path, in_threads: bool) -> None:
-        import cv2
-
-        with quiet_decoder():
-            threads = [] if in_threads else [cv2.CAP_PROP_N_THREADS, 1]
-            self._capture: cv2.VideoCapture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, threads)
-            # Where OpenCV was built without FFmpeg; its other readers write to the terminal.
-            if not self._capture.isOpened() and cv2.CAP_FFMPEG not in cv2.videoio_registry.getBackends():
-                self._capture = cv2.VideoCapture(str(path))
-        if not self._capture.isOpened():
-            raise OSError(str(path))
-        sides = [self._capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
-        if sides[0] * sides[1] > MAX_IMAGE_PIXELS:
-            self._capture.release()
-            raise OSError(str(path))
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-        self.turned = int(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
-        self.index = -1
-
-    @property
-    def shown(self) -> float:
-        """When the frame is shown [ms], as the container says."""
-        import cv2
-
-        return float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
-
-    def advance(self) -> bool:
-        """Decode the next frame; False at the end."""
-        more = bool(self._capture.grab())
-        self.index += more
-        return more
-
-    def advance_to(self, index: int) -> bool:
-        while self.index < index:
-            if not self.advance():
-                return False
-        return self.index == index
-
-    def seek(self, milliseconds: float) -> float | None:
-        """Go to about this time and decode a frame: its time, None where there is none. `index` is unknown then."""
-        import cv2
-
-        self._capture.set(cv2.CAP_PROP_POS_MSEC, milliseconds)
-        return self.shown if self.advance() else None
-
-    def image(self) -> NDArray[np.uint8] | None:
-        """The frame that was decoded last (H, W, 3), BGR; None where it is unusable."""
-        more, image = self._capture.retrieve()
-        return image if more else None
-
-    def close(self) -> None:
-        self._capture.release()
-
-
-@contextmanager
-def quiet_decoder() -> Iterator[None]:
-    """Keeps OpenCV and its FFmpeg from writing to the terminal: the one line that the user gets is ours."""
-    import cv2
-
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first video is opened
-    log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(log_level)
 
 
 def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.float64], bool]:

@@ -256,7 +256,7 @@ def import_readers() -> None:
     kinds = ("aria", "colmap", "door", "modp", "replica", "stella_vslam", "transforms", "tum")
     for name in (
         *("config", "exports.exposure", "exports.scores_csv", "exports.splats_ply", "exports.trajectory"),
-        *("playback.finished_run", "sources.exif", "sources.tum_rgbd", "sources.video_file", "sources.vignette"),
+        *("playback.finished_run", "sources.exif", "sources.tum_rgbd", "sources.video_decoder", "sources.vignette"),
         *(f"trackers.{kind}" for kind in kinds),
     ):
         import_module(f"modp_ti.{name}")

@@ -72,6 +72,8 @@ VIDEO: dict[str, Spoil] = {
     "no data": changed(lambda data: data[: data.index(b"mdat") + 4] + b"\0" * 64),
     "a box of 2^63": changed(lambda data: data + b"\0\0\0\1mdat\x7f" + b"\xff" * 7),
     "a Matroska start alone": whole(b"\x1aE\xdf\xa3\x9f"),
+    "a playlist": whole("#EXTM3U\n#EXTINF:3,\nother.mp4\n"),
+    "a list of files": whole("ffconcat version 1.0\nfile other.mp4\n"),
     "an AVI of nothing": whole(b"RIFF\x24\0\0\0AVI " + bytes(32)),
 }
 

@@ -68,7 +68,10 @@ def test_what_is_no_such_image_is_refused(data: bytes) -> None:
 @pytest.mark.parametrize(
     "data",
     [
+        b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR\0\0\0\x30\0\0\0\x24\x08\x02",
         *(b"\x89PNG\r\n\x1a\n", b"BM", b"II*\0\xff\xff\xff\xff", b"RIFF1234WEBPVP8 ", b"P6 x y 255\n"),
+        # A TIFF whose width is a ratio, and so no limit's to compare.
+        b"II*\0\x08\0\0\0" + struct.pack("<HHHIIHHII", 2, 256, 5, 1, 8, 257, 4, 1, 9) + bytes(4),
         b"II+\0\x08\0\0\0" + b"\xff" * 8,  # a BigTIFF whose directory lies beyond what Python can address
     ],
 )

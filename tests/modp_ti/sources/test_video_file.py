@@ -1,16 +1,18 @@
 """A video's frames are those of the file in any order, with the container's times; bad files get one line.
 
-Oracles: what was written (a lossless codec), OpenCV's own reading from the first frame to the last, and MP4 files whose
-bytes are changed by hand.
+Oracles: what was written (a lossless codec), OpenCV's reading from the first frame to the last, to the bit, and MP4
+files whose bytes are changed by hand.
 """
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 from threading import Thread
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -23,6 +25,15 @@ RNG = np.random.default_rng(5)
 IMAGES = [cv2.GaussianBlur(RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8), (0, 0), 2) for _ in range(FRAMES)]
 # Inter-coded with a keyframe every twelve frames, each frame on its own, and lossless.
 CODECS = {"room.mp4": "mp4v", "room.avi": "MJPG", "room.mkv": "FFV1"}
+# Written by FFmpeg: codec and pixels; with frames out of order, ten bits, grey, other colours, and a late first frame.
+FORMS = {
+    "film/room.mp4": ("libx264", {"pix_fmt": "yuv420p", "colorspace": 1, "color_range": 1}),
+    "full/room.mp4": ("libx264", {"pix_fmt": "yuvj420p", "colorspace": 1, "color_range": 2}),
+    "deep/room.mkv": ("libx264", {"pix_fmt": "yuv420p10le"}),
+    "grey/room.mkv": ("ffv1", {"pix_fmt": "gray"}),
+    "room.webm": ("libvpx-vp9", {"pix_fmt": "yuv420p"}),
+    "room.ts": ("mpeg4", {"pix_fmt": "yuv420p"}),
+}
 
 
 def write(file: Path, codec: str, images=IMAGES) -> Path:
@@ -34,9 +45,26 @@ def write(file: Path, codec: str, images=IMAGES) -> Path:
     return file
 
 
-@pytest.fixture(params=CODECS)
+def by_ffmpeg(file: Path, codec: str, metadata: str = "", **properties) -> Path:
+    """Properties: of the codec's context."""
+    file.parent.mkdir(exist_ok=True)
+    with av.open(str(file), "w") as output:
+        output.metadata["title"] = metadata
+        stream = output.add_stream(codec, rate=Fraction(FPS))
+        for name, value in {"width": 64, "height": 48, "pix_fmt": "yuv420p", **properties}.items():
+            setattr(stream.codec_context, name, value)
+        for image in (*IMAGES, None):
+            frame = None if image is None else av.VideoFrame.from_ndarray(image, format="rgb24")
+            output.mux(stream.encode(frame))
+    return file
+
+
+@pytest.fixture(params=[*CODECS, *FORMS.items()], ids=[*CODECS, *("ffmpeg's " + name for name in FORMS)])
 def video(tmp_path, request) -> Path:
-    return write(tmp_path / request.param, CODECS[request.param])
+    if isinstance(request.param, str):
+        return write(tmp_path / request.param, CODECS[request.param])
+    name, (codec, properties) = request.param
+    return by_ffmpeg(tmp_path / name, codec, **properties)
 
 
 @pytest.fixture
@@ -73,6 +101,24 @@ def test_every_order_of_reading_gives_the_frames_of_the_file(video):
                 assert np.array_equal(made.read(made.names[i]), expected[i]), (list(order), i)
 
 
+def test_times_are_those_of_opencv_to_the_bit(video):
+    made, capture = VideoFile(video), cv2.VideoCapture(str(video))
+    for name in made.names:
+        assert capture.grab()
+        assert made.timestamp(name) == capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+
+
+def test_frames_out_of_order_are_timed_where_the_container_knows_only_their_order(tmp_path):
+    """AVI states no times and FFmpeg guesses them; OpenCV gave those of decoding, and 0 for the last two frames."""
+    file = by_ffmpeg(tmp_path / "room.avi", "libx264")
+    made, expected = VideoFile(file), by_opencv(file)
+    assert made.notes == []
+    times = np.array([made.timestamp(name) for name in made.names])
+    assert (np.diff(times) > 0).all() and np.abs(times - np.arange(FRAMES) / FPS).max() < 2.5 / FPS
+    for i in (*range(FRAMES), 3, 38, 20):
+        assert np.array_equal(made.read(made.names[i]), expected[i]), i
+
+
 def test_lossless_video_gives_the_very_pixels_that_were_written(tmp_path):
     made = VideoFile(write(tmp_path / "a.mkv", "FFV1"))
     difference = [np.abs(made.read(n).astype(int) - image).max() for n, image in zip(made.names, IMAGES, strict=True)]
@@ -81,19 +127,19 @@ def test_lossless_video_gives_the_very_pixels_that_were_written(tmp_path):
 
 def test_frames_behind_a_place_that_seeking_gets_wrong_are_right_all_the_same(mp4, monkeypatch):
     """A container whose search lands elsewhere than it says is found out, and read from its beginning."""
-    from modp_ti.sources import video_file
+    from modp_ti.sources.video_decoder import VideoDecoder
 
     made, expected = VideoFile(mp4), by_opencv(mp4)
     for name in made.names:
         made.read(name)
-    lands_at = video_file._Decoder.seek
+    lands_at = VideoDecoder.seek
 
     def two_frames_late(decoder, milliseconds):
         shown = lands_at(decoder, milliseconds)
         decoder.advance(), decoder.advance()
         return shown
 
-    monkeypatch.setattr(video_file._Decoder, "seek", two_frames_late)
+    monkeypatch.setattr(VideoDecoder, "seek", two_frames_late)
     for i in (30, 5, 17, 2):
         assert np.array_equal(made.read(made.names[i]), expected[i])
 
@@ -111,6 +157,30 @@ def test_damaged_video_looks_the_same_whenever_it_is_read(mp4, seed):
     assert all(np.array_equal(made.read(made.names[i]), first[i]) for i in order)
     assert all(np.array_equal(again.read(again.names[i]), first[i]) for i in order)
     assert len(made) > 20
+
+
+def test_a_frame_that_cannot_be_decoded_does_not_end_the_video(tmp_path):
+    file = write(tmp_path / "room.avi", "MJPG")
+    expected = by_opencv(file)
+
+    def spoil(data: bytearray) -> None:
+        place = [at for at in range(data.index(b"movi"), len(data)) if data.startswith(b"00dc", at)][20]
+        length = int.from_bytes(data[place + 4 : place + 8], "little")
+        data[place + 8 : place + 8 + length] = bytes(length)
+
+    made = VideoFile(patch(file, spoil))
+    assert len(made) == FRAMES - 1
+    for order in (range(FRAMES - 1), range(FRAMES - 2, -1, -1)):
+        for i in order:
+            assert np.array_equal(made.read(made.names[i]), expected[i + (i >= 20)]), i
+
+
+def test_frames_of_another_size_are_brought_to_that_of_the_first(tmp_path):
+    parts = [by_ffmpeg(tmp_path / f"{width}.ts", "mpeg4", width=width) for width in (64, 96)]
+    (tmp_path / "room.ts").write_bytes(b"".join(part.read_bytes() for part in parts))
+    made = VideoFile(tmp_path / "room.ts")
+    shapes = {made.read(made.names[i]).shape for i in (len(made) - 1, 2, FRAMES + 9, 30)}
+    assert (len(made), shapes, made.size(made.names[-1])) == (2 * FRAMES, {(48, 64, 3)}, (64, 48))
 
 
 def test_two_threads_may_read(mp4):
@@ -169,13 +239,8 @@ def test_portrait_that_was_recorded_lying_is_turned_and_said(mp4):
     ]
 
 
-def test_stream_without_times_is_timed_by_the_setting(tmp_path, monkeypatch):
-    from modp_ti.sources import video_file
-
-    file = write(tmp_path / "room.avi", "MJPG")
-    # What OpenCV says of raw H.264, which none of its encoders writes.
-    monkeypatch.setattr(video_file._Decoder, "shown", 0.0)
-    made = VideoFile(file, fps=20.0)
+def test_stream_without_times_is_timed_by_the_setting(tmp_path):
+    made = VideoFile(by_ffmpeg(tmp_path / "room.h264", "libx264"), fps=20.0)
     assert made.timestamp("room_000010") == 0.5
     assert "holds no frame times: frame n is taken to be of second n / 20" in made.notes[0]
 
@@ -220,7 +285,7 @@ def test_mp4_without_its_table_is_named(mp4):
 
 def test_files_that_are_no_videos_are_named(tmp_path):
     file = tmp_path / "a.mp4"
-    for content, message in ((b"", "the video file is empty"), (b"no video", "no video that OpenCV can read")):
+    for content, message in ((b"", "the video file is empty"), (b"no video", "no video that FFmpeg can read")):
         file.write_bytes(content)
         with pytest.raises(InputError, match=rf"a\.mp4: {message}"):
             VideoFile(file)
@@ -230,13 +295,41 @@ def test_files_that_are_no_videos_are_named(tmp_path):
         VideoFile(tmp_path)
 
 
+@pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile room.mp4\n", "#EXTM3U\n#EXTINF:3,\nroom.mp4\n"])
+def test_lists_that_name_other_files_are_no_videos(mp4, text):
+    for name in ("list.mp4", "list.m3u8"):
+        (mp4.parent / name).write_text(text)
+        with pytest.raises(InputError, match="no video that FFmpeg can read"):
+            VideoFile(mp4.parent / name)
+
+
+def test_frames_beyond_the_largest_image_are_refused(tmp_path, monkeypatch):
+    from modp_ti.sources import video_decoder
+
+    files = [by_ffmpeg(tmp_path / name, "mpeg4") for name in ("room.mp4", "room.ts")]
+    for limit, refused in ((64 * 48 - 1, True), (1 << 20, False)):  # codecs count what they put around an image
+        monkeypatch.setattr(video_decoder, "LIMITS", {"max_pixels": str(limit)})
+        for file in files:
+            if refused:
+                with pytest.raises(InputError, match="no video that FFmpeg can read"):
+                    VideoFile(file)
+            else:
+                assert len(VideoFile(file)) == FRAMES
+
+
+def test_words_in_another_encoding_do_no_harm(tmp_path):
+    file = by_ffmpeg(tmp_path / "room.mp4", "mpeg4", metadata="kitchen")
+    file.write_bytes(file.read_bytes().replace(b"kitchen", "k\xfcche..".encode("latin-1")))
+    assert len(VideoFile(file)) == FRAMES
+
+
 def test_video_without_a_frame_is_named(mp4):
     def no_frames(data: bytearray) -> None:
         for table, entry in ((b"stts", 4), (b"stsz", 8), (b"stsc", 4), (b"stco", 4)):  # the number of entries
             place = data.index(table) + 4 + entry
             data[place : place + 4] = bytes(4)
 
-    with pytest.raises(InputError, match="no video that OpenCV can read, or without a frame"):
+    with pytest.raises(InputError, match="no video that FFmpeg can read, or without a frame"):
         VideoFile(patch(mp4, no_frames))
 
 
