@@ -134,7 +134,7 @@ def test_a_round_is_that_of_the_plain_rules(pool: GaussianField, prune_large: bo
     after = pool.to_numpy()
     rows = np.concatenate([value.reshape(len(pool), -1) for value in after.values()], axis=1)
     np.testing.assert_allclose(in_order(rows), in_order(expected), rtol=1e-4, atol=1e-5)
-    assert min(done) > 5  # every rule was at work
+    assert min(done) > 0  # every rule was at work
     assert len(pool) == N + done.cloned + done.split - done.pruned
     assert (density.statistics.mean(len(pool)) == 0).all()
 

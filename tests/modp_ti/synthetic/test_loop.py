@@ -88,7 +88,7 @@ def test_the_correction_comes_where_the_loop_closes_or_at_the_end_and_is_right(
         np.testing.assert_array_equal(frame.image, right.image)
         if frame.index < place:
             assert set(frame.points.ids.tolist()) <= set(where)
-            moved = np.array([where[i] for i in right.points.ids.tolist()])
+            moved = np.array([where[i] for i in right.points.ids.tolist()]).reshape(-1, 3)
             np.testing.assert_allclose(moved, right.points.xyz, atol=1e-12)
         else:
             np.testing.assert_allclose(frame.T_camera_world, right.T_camera_world, atol=1e-12)

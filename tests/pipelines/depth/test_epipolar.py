@@ -85,8 +85,9 @@ def test_scores_are_the_correlation_of_patches_carried_over_at_that_depth(store:
             b = (there[y, x] * (1 - u) + there[y, x + 1] * u) * (1 - v) + (
                 there[y + 1, x] * (1 - u) + there[y + 1, x + 1] * u
             ) * v
-            # White noise in a wide image shows most that the patch is turned and scaled to first order only.
-            assert scores[n, s] == pytest.approx(np.corrcoef(a, b)[0, 1], abs=3e-3)
+            # White noise in a wide image shows most that the patch is turned and scaled to first order only: off by
+            # 1.3e-3 to 3.9e-3 over twenty seeds.
+            assert scores[n, s] == pytest.approx(np.corrcoef(a, b)[0, 1], abs=7e-3)
 
 
 def test_patches_that_leave_the_image_have_no_score(store: KeyframeStore) -> None:
