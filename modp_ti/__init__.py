@@ -15,52 +15,52 @@ from typing import TYPE_CHECKING
 
 # For type checkers and editors alone: at run time `__getattr__` does it.
 if TYPE_CHECKING:
-    from fields.backend import initialise
-    from fields.camera import PinholeCamera
-    from fields.gaussians import GaussianField
-    from fields.occupancy import OccupancyVoxels
-    from fields.pose_correction import PoseCorrection
-    from fields.se3 import torch_exp_se3
-    from fields.tracked_frame import SparsePoints, TrackedFrame
-    from modp_ti.config import load_scene
-    from modp_ti.errors import InputError
-    from modp_ti.exports.splats_ply import read_splats, write_splats
-    from modp_ti.mapper import Mapper
-    from modp_ti.session import run_scene
-    from modp_ti.settings import SceneConfig
-    from modp_ti.trackers import open_tracker
-    from pipelines.mapping import OnlineMapper
-    from pipelines.rasterization import RasterizedView, rasterize
+    from fields.frames.pose_correction import PoseCorrection
+    from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+    from fields.geometry.camera import PinholeCamera
+    from fields.geometry.se3 import torch_exp_se3
+    from fields.map.gaussians import GaussianField
+    from fields.map.occupancy import OccupancyVoxels
+    from fields.runtime.backend import initialise
+    from modp_ti.config.scene_file import load_scene
+    from modp_ti.config.settings import SceneConfig
+    from modp_ti.engine.mapper import Mapper
+    from modp_ti.engine.session import run_scene
+    from modp_ti.files.errors import InputError
+    from modp_ti.inputs.trackers import open_tracker
+    from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
+    from pipelines.online import OnlineMapper
     from pipelines.refinement import refine
-    from pipelines.rendering import Renderer
+    from pipelines.render.rasterize import RasterizedView, rasterize
+    from pipelines.render.renderer import Renderer
     from pipelines.settings import MappingSettings, RefineSettings
 
 __version__ = "0.2.0"
 
 _HOMES = {
-    "GaussianField": "fields.gaussians",
-    "InputError": "modp_ti.errors",
-    "Mapper": "modp_ti.mapper",
+    "GaussianField": "fields.map.gaussians",
+    "InputError": "modp_ti.files.errors",
+    "Mapper": "modp_ti.engine.mapper",
     "MappingSettings": "pipelines.settings",
-    "OccupancyVoxels": "fields.occupancy",
-    "OnlineMapper": "pipelines.mapping",
-    "PinholeCamera": "fields.camera",
-    "PoseCorrection": "fields.pose_correction",
-    "RasterizedView": "pipelines.rasterization",
+    "OccupancyVoxels": "fields.map.occupancy",
+    "OnlineMapper": "pipelines.online",
+    "PinholeCamera": "fields.geometry.camera",
+    "PoseCorrection": "fields.frames.pose_correction",
+    "RasterizedView": "pipelines.render.rasterize",
     "RefineSettings": "pipelines.settings",
-    "Renderer": "pipelines.rendering",
-    "SceneConfig": "modp_ti.settings",
-    "SparsePoints": "fields.tracked_frame",
-    "TrackedFrame": "fields.tracked_frame",
-    "initialise": "fields.backend",
-    "load_scene": "modp_ti.config",
-    "open_tracker": "modp_ti.trackers",
-    "rasterize": "pipelines.rasterization",
-    "read_splats": "modp_ti.exports.splats_ply",
+    "Renderer": "pipelines.render.renderer",
+    "SceneConfig": "modp_ti.config.settings",
+    "SparsePoints": "fields.frames.tracked_frame",
+    "TrackedFrame": "fields.frames.tracked_frame",
+    "initialise": "fields.runtime.backend",
+    "load_scene": "modp_ti.config.scene_file",
+    "open_tracker": "modp_ti.inputs.trackers",
+    "rasterize": "pipelines.render.rasterize",
+    "read_splats": "modp_ti.outputs.formats.splats_ply",
     "refine": "pipelines.refinement",
-    "run_scene": "modp_ti.session",
-    "torch_exp_se3": "fields.se3",
-    "write_splats": "modp_ti.exports.splats_ply",
+    "run_scene": "modp_ti.engine.session",
+    "torch_exp_se3": "fields.geometry.se3",
+    "write_splats": "modp_ti.outputs.formats.splats_ply",
 }
 __all__ = [
     "GaussianField",

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.keyframes import Keyframe, KeyframeStore
-from fields.pose_correction import PoseCorrection
-from fields.se3 import interpolate_se3, inverse_se3, orthonormalised
-from fields.similarity import motion_around, moved_points, moved_pose, scale_of
-from fields.tracked_frame import SparsePoints
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import SparsePoints
+from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
+from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
+from fields.map.keyframes import Keyframe, KeyframeStore
 
-__all__ = ["CorrectionReport", "WorldMotion", "lag_in_pixels", "revise"]
+__all__ = ["CorrectionReport", "WorldMotion", "pending_motion_in_pixels", "revise"]
 
 # Moved points that tell a keyframe's change of scale.
 MIN_POINTS = 10
@@ -66,7 +66,8 @@ def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], cor
     """Bring the keyframes of `store` up to date: poses, points, depths; return how the world moves.
 
     tracked: T_camera_world (4, 4) of the frames so far by index, as the tracker had them. Named frames that are not
-    among them tell nothing. The Gaussians stay where they are: each keyframe's `lag` says how they are to follow.
+    among them tell nothing. The Gaussians stay where they are: each keyframe's `pending_motion` says how they are to
+    follow.
     """
     known = np.array([int(i) in tracked for i in correction.index])
     index, T_after = correction.index[known], correction.T_camera_world[known]
@@ -88,18 +89,20 @@ def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], cor
     return motion
 
 
-def lag_in_pixels(view: Keyframe) -> float:
+def pending_motion_in_pixels(view: Keyframe) -> float:
     """By how much the picture of a keyframe would be off if Gaussians stayed behind [px].
 
     The mean over a grid of pixels at its median depth; infinite where they would not be before the camera at all.
     """
-    if np.array_equal(view.lag, np.eye(4)):
+    if np.array_equal(view.pending_motion, np.eye(4)):
         return 0.0
     camera = view.camera
     across, down = (np.arange(0.1, 1.0, 0.2) * side for side in (camera.width, camera.height))
     grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
     here = camera.unproject(grid, np.full(len(grid), view.median_depth))
-    there = moved_points(view.T_camera_world @ np.linalg.inv(view.lag) @ inverse_se3(view.T_camera_world), here)
+    there = moved_points(
+        view.T_camera_world @ np.linalg.inv(view.pending_motion) @ inverse_se3(view.T_camera_world), here
+    )
     if (there[:, 2] < 1e-3 * view.median_depth).any():
         return float("inf")
     return float(np.linalg.norm(camera.project(there) - grid, axis=1).mean())

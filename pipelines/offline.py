@@ -7,22 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fields.camera import PinholeCamera
-from fields.gaussians import GaussianField
-from fields.keyframes import Keyframe, KeyframeStore
-from fields.pose_correction import PoseCorrection
-from fields.se3 import inverse_se3
-from fields.tracked_frame import SparsePoints, TrackedFrame
-from pipelines.adam import Adam, LearningRates
-from pipelines.adaptive_density import AdaptiveDensity
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import Keyframe, KeyframeStore
 from pipelines.corrections import CorrectionReport, revise
-from pipelines.gpu.losses import photometric_loss
-from pipelines.guards import EXPLODED, Guards
-from pipelines.losses import LossValues
+from pipelines.densify.adaptive_density import AdaptiveDensity
+from pipelines.densify.point_initialisation import initialise, union_of_points
+from pipelines.optimise.adam import Adam, LearningRates
+from pipelines.optimise.gpu_losses import photometric_loss
+from pipelines.optimise.losses import LossValues
+from pipelines.optimise.safeguards import EXPLODED, Safeguards
 from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
-from pipelines.point_initialisation import initialise, union_of_points
 from pipelines.refinement import decay
-from pipelines.rendering import Renderer
+from pipelines.render.renderer import Renderer
 from pipelines.settings import OfflineSettings
 from pipelines.stopwatch import Stopwatch
 
@@ -114,7 +114,7 @@ class OfflineMapper(Pipeline):
         self.loss = photometric_loss(self.renderer.images)
         self._last: LossValues | None = None
         self.adam = Adam(self.gaussians)
-        self.guards = Guards()
+        self.safeguards = Safeguards()
         self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
         self.keyframes = KeyframeStore()
 
@@ -169,12 +169,12 @@ class OfflineMapper(Pipeline):
             raise NothingToMapError(str(error)) from None
         self.optimise(progress)
 
-    def caught(self) -> Guards:
-        """What the guards have caught so far. Waits for the device."""
+    def caught(self) -> Safeguards:
+        """What the safeguards have caught so far. Waits for the device."""
         steps, exploded = self.gaussians.take_caught()
-        self.guards.gaussian_steps += steps
-        self.guards.exploded_gaussians += exploded
-        return self.guards
+        self.safeguards.gaussian_steps += steps
+        self.safeguards.exploded_gaussians += exploded
+        return self.safeguards
 
     def _rates(self, position_unit: float) -> LearningRates:
         s = self.settings

@@ -7,16 +7,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from fields.gaussians import GaussianField
-from fields.keyframes import KeyframeStore
-from fields.pose_correction import PoseCorrection
-from fields.tracked_frame import TrackedFrame
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import KeyframeStore
 from pipelines.corrections import CorrectionReport
-from pipelines.guards import Guards
-from pipelines.losses import PhotometricLoss
-from pipelines.map_state import MapState
-from pipelines.rendering import Renderer
+from pipelines.optimise.losses import PhotometricLoss
+from pipelines.optimise.safeguards import Safeguards
+from pipelines.render.renderer import Renderer
 from pipelines.settings import RefineSettings
+from pipelines.state import MapState
 from pipelines.stopwatch import Stopwatch
 
 __all__ = ["FrameReport", "NothingToMapError", "Pipeline"]
@@ -82,8 +82,8 @@ class Pipeline(ABC):
         """
 
     @abstractmethod
-    def caught(self) -> Guards:
-        """What the guards have caught so far. Waits for the device."""
+    def caught(self) -> Safeguards:
+        """What the safeguards have caught so far. Waits for the device."""
 
     @property
     def refused(self) -> Mapping[str, int]:

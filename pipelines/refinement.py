@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from pipelines.select.views import global_probabilities
 from pipelines.settings import RefineSettings
-from pipelines.view_selection import global_probabilities
 
 if TYPE_CHECKING:
-    from pipelines.mapping import OnlineMapper
+    from pipelines.online import OnlineMapper
 
 __all__ = ["decay", "refine"]
 

@@ -1,8 +1,8 @@
 """Settings of everything that happens to the map: one section a concept, each field with its default and meaning.
 
-The sections are part of the one configuration model (`modp_ti.config.SceneConfig`). Lengths are relative to the scene:
-a `view scale` is the median of depth / focal length over a view's tracked points (Section 3.2.1), the width of a pixel
-out there; the `scene depth` is the median depth of the tracked points over all keyframes.
+The sections are part of the one configuration model (`modp_ti.config.settings.SceneConfig`). Lengths are relative to
+the scene: a `view scale` is the median of depth / focal length over a view's tracked points (Section 3.2.1), the width
+of a pixel out there; the `scene depth` is the median depth of the tracked points over all keyframes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from fields.pyramid import MAX_LEVELS
+from fields.frames.pyramid import MAX_LEVELS
 
 __all__ = [
     "CorrectionSettings",

@@ -24,7 +24,7 @@ from experiments import (
     write_report,
 )
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 FULL = "full"
 OTHER_TRACKER = "other tracker"

@@ -20,7 +20,7 @@ from benchmarks.whole_runs import measure_runs, planned_runs
 from ending import documented_ending
 from experiments import command_line, write_report
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 # width, height, Gaussians in view: a phone's frame, a webcam's, and full detail.
 SIZES = [(270, 480, 12_500), (640, 480, 100_000), (1280, 720, 500_000)]

@@ -25,7 +25,7 @@ from experiments import (
     write_report,
 )
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 ONLINE, OFFLINE = "online", "offline 3DGS"
 COLUMNS = {

@@ -18,13 +18,13 @@ import numpy as np
 from ending import documented_ending
 from numpy.typing import NDArray
 
-from fields.backend import initialise
-from fields.camera import PinholeCamera
-from fields.tracked_frame import TrackedFrame
-from modp_ti.config import load_scene
-from modp_ti.trackers import open_tracker
-from pipelines.depth import DepthEstimate, DepthEstimator, FusedDepth, GaussianProcessDepth
-from pipelines.mapping import OnlineMapper
+from fields.frames.tracked_frame import TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.runtime.backend import initialise
+from modp_ti.config.scene_file import load_scene
+from modp_ti.inputs.trackers import open_tracker
+from pipelines.densify.depth import DepthEstimate, DepthEstimator, FusedDepth, GaussianProcessDepth
+from pipelines.online import OnlineMapper
 
 # The deviation below which version 0.1.0, which had the constant process alone, accepted a depth.
 FIRST_LIMIT = 0.06

@@ -7,8 +7,8 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from modp_ti.command_line import BAD_INPUT, FAULT, INTERRUPTED
-from modp_ti.errors import InputError
+from modp_ti.commands.shared import BAD_INPUT, FAULT, INTERRUPTED
+from modp_ti.files.errors import InputError
 
 __all__ = ["documented_ending"]
 

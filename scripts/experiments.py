@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from modp_ti.config import load_scene
-from modp_ti.errors import InputError
+from modp_ti.config.scene_file import load_scene
+from modp_ti.files.errors import InputError
 
 __all__ = [
     "Figures",

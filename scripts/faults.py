@@ -1,9 +1,9 @@
 """Faults, made on purpose, and what became of the run: tables for docs/reliability.md.
 
 kills      a small run is killed at random moments and resumed; its map must be that of a run in peace, byte for byte
-stream     a recording with a tenth of its frames spoilt, beside the same one in order
+stream     a recording with a tenth of its frames corrupted, beside the same one in order
 soak       a long recording, and the memory that the process holds meanwhile
-malformed  inputs of every reader, spoilt in hundreds of ways: one clear line each
+malformed  inputs of every reader, corrupted in hundreds of ways: one clear line each
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from experiments import write_report
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 Say = Callable[[str], None]
 Part = Callable[[argparse.Namespace, Say], str]

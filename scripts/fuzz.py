@@ -40,7 +40,10 @@ def main() -> None:
     options = parser.parse_args()
     import atheris
 
-    for kernels in ("mapping", "weights"):  # compiled by Taichi and PyTorch: nothing to be instrumented, much to import
+    for kernels in (
+        "online",
+        "torch_checkpoint",
+    ):  # compiled by Taichi and PyTorch: nothing to be instrumented, much to import
         import_module(f"pipelines.{kernels}")
     with atheris.instrument_imports(include=["modp_ti"]):
         from fault_injection.readers import READERS, import_readers

@@ -19,16 +19,16 @@ import numpy as np
 from ending import documented_ending
 from numpy.typing import NDArray
 
-from fields.backend import initialise
-from fields.camera import PinholeCamera
-from modp_ti.config import load_scene
-from modp_ti.errors import InputError
-from modp_ti.exports.mesh import read_mesh
-from modp_ti.exports.open3d_io import open3d
-from modp_ti.playback.finished_run import FinishedRun, open_run
-from modp_ti.synthetic import open_synthetic
-from modp_ti.synthetic.renderer import RoomRenderer
-from modp_ti.synthetic.room import LIT_LOWER
+from fields.geometry.camera import PinholeCamera
+from fields.runtime.backend import initialise
+from modp_ti.config.scene_file import load_scene
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.synthetic import open_synthetic
+from modp_ti.inputs.synthetic.renderer import RoomRenderer
+from modp_ti.inputs.synthetic.room import LIT_LOWER
+from modp_ti.outputs.formats.mesh import read_mesh
+from modp_ti.outputs.formats.open3d_io import open3d
+from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 
 # The longest side of the room inside [m], and of it the share that counts as right.
 ROOM = 4.8

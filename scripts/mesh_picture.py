@@ -14,11 +14,11 @@ import numpy as np
 from ending import documented_ending
 from numpy.typing import NDArray
 
-from fields.camera import PinholeCamera
-from modp_ti.errors import InputError
-from modp_ti.exports.mesh import read_mesh
-from modp_ti.exports.open3d_io import open3d
-from modp_ti.playback.finished_run import open_run
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.mesh import read_mesh
+from modp_ti.outputs.formats.open3d_io import open3d
+from modp_ti.outputs.playback.finished_run import open_run
 
 # What no ray hits.
 BACKGROUND = 1.0

@@ -7,7 +7,7 @@ import argparse
 from browser import choose_mode, missing, open_page
 from ending import documented_ending
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 
 @documented_ending()

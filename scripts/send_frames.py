@@ -1,6 +1,7 @@
 """Plays the frames of any scene into a run of `tracker: {kind: socket}`, as a tracker in another program would.
 
-The messages are written here after docs/door.md, with the standard library and NumPy: an example to start from.
+The messages are written here after docs/tracker_server.md, with the standard library and NumPy: an example to start
+from.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ NOWHERE = np.zeros((4, 4))
 NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
 
-class DoorError(Exception):
-    """The door has told us why it goes no further, or is not there."""
+class ServerError(Exception):
+    """The server has told us why it goes no further, or is not there."""
 
 
 class Sender:
@@ -102,14 +103,14 @@ class Sender:
         try:
             self.socket.sendall(struct.pack("<4sHHII", b"MODP", 1, kind, len(payload), 0) + payload)
         except OSError as error:
-            raise DoorError(self._last_words() or f"the connection is gone: {error}") from None
+            raise ServerError(self._last_words() or f"the connection is gone: {error}") from None
 
     def expect(self, kind: int) -> bytes:
-        """The payload of the door's next message. Raises DoorError where that is an error."""
+        """The payload of the server's next message. Raises ServerError where that is an error."""
         _, _, answer, length, _ = struct.unpack("<4sHHII", self._read(16))
         payload = self._read(length)
         if answer != kind:
-            raise DoorError(payload.decode() if answer == ERROR else f"unexpected answer {answer}")
+            raise ServerError(payload.decode() if answer == ERROR else f"unexpected answer {answer}")
         return payload
 
     def _read(self, size: int) -> bytes:
@@ -117,14 +118,14 @@ class Sender:
         while len(data) < size:
             part = self.socket.recv(size - len(data))
             if not part:
-                raise DoorError("the door has closed the connection")
+                raise ServerError("the server has closed the connection")
             data += part
         return data
 
     def _last_words(self) -> str | None:
         try:
             return self.expect(ERROR).decode()
-        except (DoorError, OSError):
+        except (ServerError, OSError):
             return None
 
 
@@ -157,22 +158,22 @@ def _connected(address: str, deadline: float) -> socket.socket:
             return socket.create_connection((host.strip("[]"), int(port)))
         except OSError as error:
             if time.monotonic() > deadline:
-                raise DoorError(f"{address}: nobody listens there: {error}") from None
+                raise ServerError(f"{address}: nobody listens there: {error}") from None
             time.sleep(0.2)
 
 
 def play(
     scene: Path, overrides: Sequence[str], address: str, wait: float, late: int = 0, rate: float | None = None
 ) -> int:
-    """Send the scene's frames as its tracker delivers them; how many the door took.
+    """Send the scene's frames as its tracker delivers them; how many the server took.
 
     address, wait: see `Sender`. late: frames after which a frame's pose and points follow it; 0 sends them with it.
     rate: frames a second at most.
     """
-    from fields.backend import initialise
-    from fields.pose_correction import PoseCorrection
-    from modp_ti.config import load_scene
-    from modp_ti.trackers import open_tracker
+    from fields.frames.pose_correction import PoseCorrection
+    from fields.runtime.backend import initialise
+    from modp_ti.config.scene_file import load_scene
+    from modp_ti.inputs.trackers import open_tracker
 
     config = load_scene(scene, overrides)
     initialise("cpu", config.threads, config.seed)  # the demo's frames are rendered
@@ -194,7 +195,7 @@ def play(
                 sender = Sender(address, wait)
                 sender.hello(c.width, c.height, (c.fx, c.fy, c.cx, c.cy), RGBA8, name="send_frames")
             if event.camera != camera:
-                raise DoorError(f"{event.name} has another camera than the first frame: the door takes one")
+                raise ServerError(f"{event.name} has another camera than the first frame: the server takes one")
             if rate is not None:
                 time.sleep(max(next_time - time.monotonic(), 0.0))
                 next_time = max(next_time + 1.0 / rate, time.monotonic())
@@ -237,7 +238,7 @@ def main() -> None:
     arguments = parser.parse_args()
     from ending import documented_ending  # here: `Sender` is used without the rest, too
 
-    with documented_ending(DoorError):
+    with documented_ending(ServerError):
         taken = play(arguments.scene, arguments.set, arguments.to, arguments.wait, arguments.late, arguments.rate)
         print(f"{taken} frames taken")
 

@@ -16,13 +16,13 @@ import numpy as np
 from browser import choose_mode, missing, open_page
 from ending import documented_ending
 
-from fields.backend import initialise
-from modp_ti.errors import InputError
-from modp_ti.mapper import Mapper
-from modp_ti.settings import ViewSettings
-from modp_ti.synthetic import SyntheticTracker
-from modp_ti.viewer.live import LiveViewer
-from modp_ti.viewer.modes import MODES
+from fields.runtime.backend import initialise
+from modp_ti.config.settings import ViewSettings
+from modp_ti.engine.live_viewer import LiveViewer
+from modp_ti.engine.mapper import Mapper
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.synthetic import SyntheticTracker
+from modp_ti.outputs.viewer.modes import MODES
 from pipelines.settings import MappingSettings, RefineSettings
 
 CLOSED = "no browser"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 from filelock import FileLock
 
-from fields.backend import initialise
+from fields.runtime.backend import initialise
 
 if TYPE_CHECKING:
     from tests.room import Room, RoomRecording

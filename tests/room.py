@@ -12,9 +12,9 @@ import open3d as o3d
 import pycolmap
 from numpy.typing import NDArray
 
-from fields.camera import PinholeCamera
-from fields.se3 import inverse_se3
-from fields.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3
 
 LOW, HIGH = np.array([-2.5, -2.0, 0.0]), np.array([2.5, 2.0, 2.6])  # the walls, z up [m]
 CELLS = np.array([0.7, 0.22])  # of the textures [m]

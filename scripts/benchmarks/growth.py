@@ -8,14 +8,14 @@ import numpy as np
 
 from benchmarks.scene import Size, add_gaussians, arrays, camera_of, noise_frame
 from benchmarks.timing import milliseconds
-from fields.backend import initialise
-from fields.gaussians import GaussianField
-from fields.keyframes import KeyframeStore
-from fields.tracked_frame import SparsePoints, TrackedFrame
-from pipelines.adam import LearningRates
-from pipelines.mapping import OnlineMapper
-from pipelines.optimisation import MapOptimiser
-from pipelines.rendering import Renderer
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import KeyframeStore
+from fields.runtime.backend import initialise
+from pipelines.online import OnlineMapper
+from pipelines.optimise.adam import LearningRates
+from pipelines.optimise.map_optimiser import MapOptimiser
+from pipelines.render.renderer import Renderer
 from pipelines.settings import DensifySettings, KeyframeSettings, LevelSettings, MappingSettings, OptimiseSettings
 
 __all__ = ["PIXELS", "measure_frames", "measure_growth"]

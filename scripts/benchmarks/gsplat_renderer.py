@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.scene import Size, arrays, camera_of
-from fields.gaussians import SH_C0
+from fields.map.gaussians import SH_C0
 
 __all__ = ["measure_gsplat", "why_no_gsplat"]
 

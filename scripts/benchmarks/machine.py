@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import torch
 
-from fields.backend import initialise
+from fields.runtime.backend import initialise
 
 __all__ = ["measure_machine"]
 

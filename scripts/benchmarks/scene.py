@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.camera import PinholeCamera
-from fields.gaussians import GaussianField
-from fields.tracked_frame import TrackedFrame
+from fields.frames.tracked_frame import TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.map.gaussians import GaussianField
 
 __all__ = ["Size", "add_gaussians", "arrays", "camera_of", "noise_frame"]
 

@@ -6,14 +6,14 @@ import time
 
 from benchmarks.scene import Size, add_gaussians, noise_frame
 from benchmarks.timing import milliseconds, peak_memory_mb, stage_milliseconds
-from fields.backend import initialise
-from fields.gaussians import GaussianField
-from fields.keyframes import KeyframeStore
-from fields.tiles import TILE_PIXELS, TILE_WIDTH
-from pipelines.adam import LearningRates
-from pipelines.compositing_reference import ReferenceCompositing
-from pipelines.optimisation import MapOptimiser
-from pipelines.rendering import Renderer
+from fields.buffers.tiles import TILE_PIXELS, TILE_WIDTH
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import KeyframeStore
+from fields.runtime.backend import initialise
+from pipelines.optimise.adam import LearningRates
+from pipelines.optimise.map_optimiser import MapOptimiser
+from pipelines.render.compositing_reference import ReferenceCompositing
+from pipelines.render.renderer import Renderer
 from pipelines.settings import MappingSettings
 
 __all__ = ["ADAM_BYTES", "BACKWARD_FLOPS", "FORWARD_FLOPS", "LOSS_FLOPS", "STAGES", "measure_step"]
@@ -22,11 +22,12 @@ STAGES = (
     "projection", "binning", "compositing", "loss", "compositing backward", "projection backward", "penalty", "Adam",
 )  # fmt: skip
 # Additions, multiplications and divisions, a fused multiply-add counted as two; comparisons, selections and conversions
-# not counted. For a pixel-Gaussian pair in the inner loops of pipelines/compositing.py, 14 of them the exponential:
+# not counted. For a pixel-Gaussian pair in the inner loops of pipelines/render/cpu/compositing.py, 14 of them the
+# exponential:
 FORWARD_FLOPS = 34
 BACKWARD_FLOPS = 54
-# and for a pixel of a channel in pipelines/losses.py: five windows of 11 + 11 taps (the products with them), SSIM and
-# its derivatives, three windows of 11 + 11 taps, the gradient.
+# and for a pixel of a channel in pipelines/optimise/losses.py: five windows of 11 + 11 taps (the products with them),
+# SSIM and its derivatives, three windows of 11 + 11 taps, the gradient.
 LOSS_FLOPS = 110 + 110 + 45 + 132 + 10
 # Of a Gaussian that Adam touches: 14 float32 with gradient and two moments, and two counters, each read and written.
 ADAM_BYTES = (14 * 4 + 2) * 4 * 2

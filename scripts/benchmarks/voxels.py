@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fields.backend import initialise
-from fields.occupancy import OccupancyVoxels
+from fields.map.occupancy import OccupancyVoxels
+from fields.runtime.backend import initialise
 
 __all__ = ["LEVELS", "measure_voxels"]
 

@@ -64,7 +64,7 @@ def run_case(case: Case, sample: Path, folder: Path) -> Outcome:
     """Make the malformed input in `folder`, of the valid one in `sample`, and give it to the command."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(sample, folder, symlinks=True)
-    case.spoil(folder / case.file)
+    case.corrupt(folder / case.file)
     before = _listing(folder)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
     resident = _reset_resident()
@@ -113,7 +113,7 @@ def _accepted(folder: Path, arguments: tuple[str, ...]) -> str:
 
 def _command(folder: Path, arguments: tuple[str, ...], impatient: bool = True) -> tuple[int, str]:
     """Exit code and all output, of native libraries too, of `modp-ti` in the folder."""
-    from modp_ti.cli import app
+    from modp_ti.commands.app import app
 
     here = Path.cwd()
     with tempfile.TemporaryFile() as output:

@@ -1,7 +1,7 @@
 """Every reader as a function of bytes: what the fuzzer calls, and what the corpus is replayed through.
 
 A reader with several files takes its first byte as the file's number. Anything but an InputError (or its like: what
-`pipelines` and the door raise) that comes out of one is a fault of ours.
+`pipelines` and the tracker server raise) that comes out of one is a fault of ours.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from threading import Event
 import numpy as np
 
 from fault_injection.samples import SAMPLES, write_sample
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 __all__ = ["READERS", "Reader", "import_readers", "seeds"]
 
@@ -50,8 +50,8 @@ class Reader:
 
 def _open(file: Path) -> None:
     """The tracker of the scene beside the file, opened and asked for what it holds."""
-    from modp_ti.config import load_scene
-    from modp_ti.trackers import open_tracker
+    from modp_ti.config.scene_file import load_scene
+    from modp_ti.inputs.trackers import open_tracker
 
     folder = file.parent
     while not (folder / "scene.yaml").exists():
@@ -60,14 +60,14 @@ def _open(file: Path) -> None:
 
 
 def _scene(file: Path) -> None:
-    from modp_ti.config import load_scene
+    from modp_ti.config.scene_file import load_scene
 
     load_scene(file)
 
 
 def _tum(file: Path) -> None:
-    from modp_ti.exports.trajectory import read_trajectory
-    from modp_ti.trackers.trajectory import read_trajectory_file
+    from modp_ti.inputs.trackers.trajectory import read_trajectory_file
+    from modp_ti.outputs.formats.trajectory import read_trajectory
 
     try:
         read_trajectory(file)
@@ -77,19 +77,19 @@ def _tum(file: Path) -> None:
 
 
 def _points(file: Path) -> None:
-    from modp_ti.trackers.point_file import read_point_file
+    from modp_ti.inputs.trackers.point_file import read_point_file
 
     read_point_file(file)
 
 
 def _listing(file: Path) -> None:
-    from modp_ti.sources.tum_rgbd import open_tum_rgbd
+    from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
 
     open_tum_rgbd(file.parent)
 
 
 def _aria(file: Path) -> None:
-    from modp_ti.trackers import aria_mps
+    from modp_ti.inputs.trackers import aria_mps
 
     if file.name == "closed_loop_trajectory.csv":
         aria_mps.read_closed_loop(file)
@@ -102,15 +102,15 @@ def _aria(file: Path) -> None:
 
 
 def _stella(file: Path) -> None:
-    from modp_ti.trackers.stella_map import read_stella_map
+    from modp_ti.inputs.trackers.stella_map import read_stella_map
 
     read_stella_map(file)
 
 
 def _image(file: Path) -> None:
-    from modp_ti.sources.exif import focal_length_35mm
-    from modp_ti.sources.listed_images import ListedImages
-    from modp_ti.sources.vignette import read_vignette
+    from modp_ti.inputs.sources.exif import focal_length_35mm
+    from modp_ti.inputs.sources.listed_images import ListedImages
+    from modp_ti.inputs.sources.vignette import read_vignette
 
     images = ListedImages(file.parent, [file.name], [0.0])
     focal_length_35mm(file)
@@ -123,13 +123,13 @@ def _image(file: Path) -> None:
 
 
 def _container(file: Path) -> None:
-    from modp_ti.sources.video_container import missing_bytes
+    from modp_ti.inputs.sources.video_container import missing_bytes
 
     missing_bytes(file)
 
 
 def _video(file: Path) -> None:
-    from modp_ti.sources.video_file import VideoFile
+    from modp_ti.inputs.sources.video_file import VideoFile
 
     video = VideoFile(file)
     video.read(video.names[-1])
@@ -138,9 +138,9 @@ def _video(file: Path) -> None:
 
 
 def _run(file: Path) -> None:
-    from modp_ti.exports.exposure import read_exposures
-    from modp_ti.exports.scores_csv import read_scores
-    from modp_ti.playback.finished_run import open_run
+    from modp_ti.outputs.formats.exposure import read_exposures
+    from modp_ti.outputs.formats.scores_csv import read_scores
+    from modp_ti.outputs.playback.finished_run import open_run
 
     folder = next(parent for parent in file.parents if parent.name == "out")
     if file.name == "exposure.json":
@@ -152,16 +152,16 @@ def _run(file: Path) -> None:
 
 
 def _splats(file: Path) -> None:
-    from modp_ti.exports.splats_ply import read_splats
+    from modp_ti.outputs.formats.splats_ply import read_splats
 
     read_splats(file)
 
 
 def _weights(file: Path) -> None:
-    from pipelines.weights import read_weights
+    from pipelines.torch_checkpoint import read_checkpoint
 
     try:
-        read_weights(file)
+        read_checkpoint(file)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -182,12 +182,12 @@ class _Wire(socket.socket):
     def close(self) -> None: ...
 
 
-def _door(file: Path) -> None:
+def _tracker_server(file: Path) -> None:
     """A whole conversation, up to what is handed to the mapper."""
-    from modp_ti.trackers.door import messages
-    from modp_ti.trackers.door.connection import Connection, SenderGoneError
-    from modp_ti.trackers.door.ordering import Ordering
-    from modp_ti.trackers.door.spool import Spool
+    from modp_ti.inputs.tracker_server import messages
+    from modp_ti.inputs.tracker_server.connection import Connection, SenderGoneError
+    from modp_ti.inputs.tracker_server.ordering import Ordering
+    from modp_ti.inputs.tracker_server.spool import Spool
 
     connection = Connection(_Wire(file.read_bytes()), 1.0, Event())
     hello = spool = None
@@ -246,21 +246,34 @@ READERS: dict[str, Reader] = {
         Reader("splats", "run", ("out/splats.ply",), _splats),
         Reader("run", "run", RUN_FILES, _run),
         Reader("weights", "weights", ("older.pth", "weights.pth"), _weights),
-        Reader("door", "door", ("wire",), _door),
+        Reader("tracker_server", "tracker_server", ("wire",), _tracker_server),
     )
 }
 
 
 def import_readers() -> None:
     """Import every module that the readers use, once and for all processes that are forked off."""
-    kinds = ("aria", "colmap", "door", "modp", "replica", "stella_vslam", "transforms", "tum")
+    kinds = ("aria", "colmap", "modp", "replica", "stella_vslam", "transforms", "tum")
     for name in (
-        *("config", "exports.exposure", "exports.scores_csv", "exports.splats_ply", "exports.trajectory"),
-        *("playback.finished_run", "sources.exif", "sources.tum_rgbd", "sources.video_decoder", "sources.vignette"),
-        *(f"trackers.{kind}" for kind in kinds),
+        *(
+            "config.scene_file",
+            "outputs.formats.exposure",
+            "outputs.formats.scores_csv",
+            "outputs.formats.splats_ply",
+            "outputs.formats.trajectory",
+        ),
+        *(
+            "outputs.playback.finished_run",
+            "inputs.sources.exif",
+            "inputs.sources.tum_rgbd",
+            "inputs.sources.video_decoder",
+            "inputs.sources.vignette",
+        ),
+        *(f"inputs.trackers.{kind}" for kind in kinds),
+        "inputs.tracker_server",
     ):
         import_module(f"modp_ti.{name}")
-    import_module("pipelines.weights")
+    import_module("pipelines.torch_checkpoint")
 
 
 def seeds(reader: Reader, folder: Path) -> list[bytes]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 __all__ = ["COMPARED", "Ended", "contents", "finished", "metrics", "require_success", "run_until"]
 

@@ -308,7 +308,7 @@ def _message(kind: int, payload: bytes = b"") -> bytes:
 
 
 def wire() -> bytes:
-    """What a tracker sends through the door: three frames, a late pose and a correction."""
+    """What a tracker sends through the tracker server: three frames, a late pose and a correction."""
     lens = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, *[0.0] * 8]
     data = _message(1, struct.pack("<IIII12d", WIDTH, HEIGHT, 1, 0, *lens) + b"a tracker")
     poses = []
@@ -330,7 +330,7 @@ def wire() -> bytes:
     return data + _message(4, moved) + _message(5)
 
 
-def _write_door(folder: Path) -> None:
+def _write_tracker_server(folder: Path) -> None:
     write_bytes(folder, "wire", wire())
 
 
@@ -386,7 +386,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
             _write_run,
         ),
         (Sample("weights", ("weights.pth", "older.pth")), _write_weights),
-        (Sample("door", ("wire",), ()), _write_door),
+        (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
     )
 }
 

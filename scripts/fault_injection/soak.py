@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fields.backend import initialise
-from fields.tracked_frame import TrackedFrame
-from modp_ti.mapper import Mapper
-from modp_ti.synthetic import SyntheticTracker
+from fields.frames.tracked_frame import TrackedFrame
+from fields.runtime.backend import initialise
+from modp_ti.engine.mapper import Mapper
+from modp_ti.inputs.synthetic import SyntheticTracker
 from pipelines.settings import MappingSettings, OptimiseSettings
 
 __all__ = ["Soak", "soak", "soak_table"]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fault_injection.runs import finished, metrics
-from fields.backend import initialise
-from fields.se3 import exp_se3
-from modp_ti.exports.trajectory import read_trajectory, write_trajectory
-from modp_ti.synthetic import SyntheticTracker
+from fields.geometry.se3 import exp_se3
+from fields.runtime.backend import initialise
+from modp_ti.inputs.synthetic import SyntheticTracker
+from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 
 __all__ = ["FAULTS", "Stream", "map_both", "stream_table", "write_recording"]
 
@@ -80,7 +80,7 @@ def write_recording(folder: Path, frames: int, scale: float, steps: int, refine:
 
 
 def disturb(folder: Path, share: float, seed: int) -> dict[str, list[int]]:
-    """Spoil so many frames of a recording, none of them held out; the frames by what befell them."""
+    """Corruption so many frames of a recording, none of them held out; the frames by what befell them."""
     chance = random.Random(seed)
     images = sorted((folder / "images").iterdir())
     times, poses = read_trajectory(folder / "poses.txt")
@@ -131,31 +131,31 @@ def map_both(
     steps: int = 8,
     refine: int = 100,
 ) -> Stream:
-    """Map the recording in order, and with a tenth of its frames spoilt."""
+    """Map the recording in order, and with a tenth of its frames corrupted."""
     shutil.rmtree(folder, ignore_errors=True)
-    clean, spoilt = folder / "clean", folder / "spoilt"
+    clean, corrupted = folder / "clean", folder / "corrupted"
     write_recording(clean, frames, scale, steps, refine)
-    shutil.copytree(clean, spoilt)
-    faulty = disturb(spoilt, 0.1, seed)
-    say(f"{frames} frames, {sum(map(len, faulty.values()))} of them spoilt")
-    for run in (clean, spoilt):
+    shutil.copytree(clean, corrupted)
+    faulty = disturb(corrupted, 0.1, seed)
+    say(f"{frames} frames, {sum(map(len, faulty.values()))} of them corrupted")
+    for run in (clean, corrupted):
         ended = finished([str(run / "scene.yaml")], run / "out")
         say(f"{run.name}: {held_out(metrics(run / 'out')):.2f} dB on held-out frames after {ended.seconds:.0f} s")
         for line in ended.said.splitlines():
             if "left out" in line or "did not touch" in line or "no pose" in line:
                 say("  " + line)
-    return Stream(frames, faulty, metrics(clean / "out"), metrics(spoilt / "out"))
+    return Stream(frames, faulty, metrics(clean / "out"), metrics(corrupted / "out"))
 
 
 def stream_table(result: Stream) -> str:
     """The result as Markdown."""
-    spoilt = ", ".join(f"{len(places)} {kind}" for kind, places in result.faulty.items())
+    corrupted = ", ".join(f"{len(places)} {kind}" for kind, places in result.faulty.items())
     left_out = ", ".join(f"{count} {why}" for why, count in result.disturbed["frames_left_out"].items())
     return "\n".join(
         [
-            "| a recording with faulty frames | in order | spoilt |",
+            "| a recording with faulty frames | in order | corrupted |",
             "|---|---|---|",
-            f"| frames | {result.frames} | {sum(map(len, result.faulty.values()))} spoilt: {spoilt} |",
+            f"| frames | {result.frames} | {sum(map(len, result.faulty.values()))} corrupted: {corrupted} |",
             f"| frames mapped | {result.clean['frames']} | {result.disturbed['frames']} |",
             f"| left out by the run | | {left_out} |",
             f"| held-out PSNR [dB] | {held_out(result.clean):.2f} | {held_out(result.disturbed):.2f} |",

@@ -10,7 +10,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from modp_ti.exports.splats_ply import read_splats
+from modp_ti.outputs.formats.splats_ply import read_splats
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from modp_ti import cli
-from modp_ti.config import load_scene
+from modp_ti.commands import app as cli
+from modp_ti.config.scene_file import load_scene
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "tutorial.md").read_text()
 COMMANDS = re.findall(r"^modp-ti .*", PAGE, re.MULTILINE)

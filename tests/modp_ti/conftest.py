@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fields.camera import PinholeCamera
+from fields.geometry.camera import PinholeCamera
 from tests.modp_ti.runs import SHORT_RUN, finished_run
 
 if TYPE_CHECKING:

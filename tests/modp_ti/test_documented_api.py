@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modp_ti.exports.splats_ply import read_splats
+from modp_ti.outputs.formats.splats_ply import read_splats
 from tests.pipelines.wall import frame
 
 pytestmark = pytest.mark.slow

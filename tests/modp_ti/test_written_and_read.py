@@ -15,17 +15,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from fields.se3 import exp_se3
-from modp_ti.evaluation import FrameScore
-from modp_ti.exports.frames_json import read_frames, write_frames
-from modp_ti.exports.scores_csv import read_scores, write_scores
-from modp_ti.exports.splats_ply import read_splats, write_splats
-from modp_ti.exports.trajectory import read_trajectory, write_trajectory
-from modp_ti.reading import parse_json
-from modp_ti.trackers.csv_columns import read_csv_blocks
-from modp_ti.trackers.door.messages import Kind, State, encoded, parse_correction, parse_frame
-from modp_ti.trackers.number_rows import read_number_rows
-from modp_ti.trackers.point_cloud import read_ply_points
+from fields.geometry.se3 import exp_se3
+from modp_ti.files import parse_json
+from modp_ti.files.csv_columns import read_csv_blocks
+from modp_ti.files.number_rows import read_number_rows
+from modp_ti.inputs.tracker_server.messages import Kind, State, encoded, parse_correction, parse_frame
+from modp_ti.inputs.trackers.point_cloud import read_ply_points
+from modp_ti.outputs.evaluation import FrameScore
+from modp_ti.outputs.formats.frames_json import read_frames, write_frames
+from modp_ti.outputs.formats.scores_csv import read_scores, write_scores
+from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
+from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 
 quick = settings(
     derandomize=True,

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import pytest
 import taichi as ti
 
-from fields.backend import initialise
-from fields.gaussians import GaussianField
-from pipelines.rendering import Renderer
+from fields.map.gaussians import GaussianField
+from fields.runtime.backend import initialise
+from pipelines.render.renderer import Renderer
 
 MAX_SIDE = 64
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from fields.camera import PinholeCamera
+from fields.geometry.camera import PinholeCamera
 
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.camera import PinholeCamera
-from fields.se3 import exp_se3, inverse_se3
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import exp_se3, inverse_se3
 from tests.spread import disturbed
 
 NEAR = 0.05

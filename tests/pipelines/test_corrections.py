@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fields.keyframes import KeyframeStore
-from fields.pose_correction import PoseCorrection
-from fields.se3 import exp_se3, inverse_se3
-from fields.similarity import motion_around, moved_points, moved_pose, scale_of
-from pipelines.corrections import WorldMotion, lag_in_pixels, revise
-from pipelines.mapping import OnlineMapper
+from fields.frames.pose_correction import PoseCorrection
+from fields.geometry.se3 import exp_se3, inverse_se3
+from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
+from fields.map.keyframes import KeyframeStore
+from pipelines.corrections import WorldMotion, pending_motion_in_pixels, revise
 from pipelines.offline import OfflineMapper
+from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings, OfflineSettings
-
-from .wall import CAMERA, frame, pose
+from tests.pipelines.wall import CAMERA, frame, pose
 
 pytestmark = pytest.mark.slow
 
@@ -75,7 +74,7 @@ def test_keyframes_take_poses_points_and_scale_over() -> None:
     for i, view in enumerate(store):
         np.testing.assert_allclose(view.T_tracked, moved_pose(S, pose(i)), atol=1e-9)
         np.testing.assert_allclose(view.points.xyz, moved_points(S, frame(i).points.xyz), atol=1e-9)
-        np.testing.assert_allclose(view.lag, S, atol=1e-9)
+        np.testing.assert_allclose(view.pending_motion, S, atol=1e-9)
     assert store.scene_depth == pytest.approx(1.2 * depth)
 
 
@@ -85,20 +84,20 @@ def test_without_points_the_scale_stays() -> None:
         store.append(frame(i))
     revise(store, {i: frame(i).T_camera_world for i in range(3)}, correction([0, 1, 2], S, points=False))
     for i, view in enumerate(store):
-        assert scale_of(view.lag) == pytest.approx(1.0)
+        assert scale_of(view.pending_motion) == pytest.approx(1.0)
         assert view.median_depth == pytest.approx(np.median(frame(i).points.depths(pose(i))))
 
 
 def test_the_lag_is_the_shift_of_the_picture() -> None:
     store = KeyframeStore()
     view = store.append(frame(0))
-    assert lag_in_pixels(view) == 0.0
+    assert pending_motion_in_pixels(view) == 0.0
     # Sideways by a hundredth of the depth: the focal length is 60 pixels.
     view.revise(exp_se3([0.01 * view.median_depth, 0, 0, 0, 0, 0]) @ view.T_tracked, np.eye(4))
-    view.lag = motion_around(pose(0), view.T_tracked)
-    assert lag_in_pixels(view) == pytest.approx(0.6, rel=1e-6)
-    view.lag = motion_around(pose(0), exp_se3([0, 0, 0, 0, np.pi, 0]) @ pose(0))
-    assert lag_in_pixels(view) == np.inf
+    view.pending_motion = motion_around(pose(0), view.T_tracked)
+    assert pending_motion_in_pixels(view) == pytest.approx(0.6, rel=1e-6)
+    view.pending_motion = motion_around(pose(0), exp_se3([0, 0, 0, 0, np.pi, 0]) @ pose(0))
+    assert pending_motion_in_pixels(view) == np.inf
 
 
 def test_an_offline_map_starts_from_the_corrected_poses_and_points(taichi_on_the_cpu: None) -> None:
@@ -195,7 +194,7 @@ def test_small_corrections_add_up_until_they_count(mapped: OnlineMapper) -> None
     expected = T[:3, :3].T @ [-0.66 / CAMERA.focal * depth, 0, 0]
     np.testing.assert_allclose(way[mine], np.tile(expected, (mine.sum(), 1)), atol=1e-5)
     assert (way[~mine] == 0).all()
-    assert mine.sum() > 20 and lag_in_pixels(moved) == 0.0
+    assert mine.sum() > 20 and pending_motion_in_pixels(moved) == 0.0
 
 
 def test_a_world_that_moves_as_a_whole_looks_as_before_in_the_voxels_of_a_fresh_insertion(mapped: OnlineMapper) -> None:

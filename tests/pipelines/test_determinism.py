@@ -14,13 +14,13 @@ PROJECT = Path(__file__).resolve().parents[2]
 CODE = """
 import hashlib, sys
 import numpy as np
-from fields.backend import initialise
-from fields.pose_correction import PoseCorrection
-from fields.se3 import exp_se3
-from pipelines.mapping import OnlineMapper
+from fields.runtime.backend import initialise
+from fields.frames.pose_correction import PoseCorrection
+from fields.geometry.se3 import exp_se3
+from pipelines.online import OnlineMapper
 from pipelines.refinement import refine
 from pipelines.settings import RefineSettings
-from tests.pipelines.test_mapping import SETTINGS, frame
+from tests.pipelines.test_online import SETTINGS, frame
 
 initialise("cpu", threads=int(sys.argv[1]))
 mapper = OnlineMapper(SETTINGS, 64, 48, seed=5)

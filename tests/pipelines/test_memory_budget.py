@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from fields.backend import initialise
-from fields.gaussians import GaussianField
-from pipelines.guards import Guards
-from pipelines.mapping import OnlineMapper
+from fields.map.gaussians import GaussianField
+from fields.runtime.backend import initialise
+from pipelines.online import OnlineMapper
+from pipelines.optimise.safeguards import Safeguards
 from pipelines.settings import MappingSettings
-
-from .wall import frame
+from tests.pipelines.wall import frame
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +27,7 @@ class Mapped:
 
     gaussians: dict[str, np.ndarray]
     keyframes: list[int]  # their frames
-    guards: Guards
+    safeguards: Safeguards
     held: int  # what the budget says [bytes]
     counted: int  # what its arrays hold [bytes]
     renders: int  # views that it was optimised for
@@ -80,9 +79,9 @@ def test_the_budget_adds_up_what_the_map_holds(free: Mapped) -> None:
 
 
 def test_nothing_is_refused_without_a_limit_or_below_it(free: Mapped) -> None:
-    assert free.guards.warning() is None
+    assert free.safeguards.warning() is None
     roomy = mapped(free.held / 1e9 * 1.5)
-    assert roomy.guards.warning() is None
+    assert roomy.safeguards.warning() is None
     for name, array in free.gaussians.items():
         np.testing.assert_array_equal(roomy.gaussians[name], array)
 
@@ -92,9 +91,9 @@ def test_a_map_ends_within_its_memory_and_says_what_had_no_room(free: Mapped, sh
     limit = share * free.held
     tight = mapped(limit / 1e9)
     assert tight.held <= limit
-    assert tight.guards.gaussians_without_room > 0 and "mapping.memory" in tight.guards.warning()
+    assert tight.safeguards.gaussians_without_room > 0 and "mapping.memory" in tight.safeguards.warning()
     assert 0 < len(tight.gaussians["position"]) < len(free.gaussians["position"])
-    assert len(tight.keyframes) + tight.guards.keyframes_without_room == FRAMES
+    assert len(tight.keyframes) + tight.safeguards.keyframes_without_room == FRAMES
 
 
 def test_frames_without_room_go_on_optimising_the_map(free: Mapped) -> None:
@@ -111,4 +110,4 @@ def test_a_frame_without_room_is_no_keyframe(free: Mapped) -> None:
     # Without a Gaussian two frames fit, and a third does not.
     tight = mapped(2.5 * (64 * 48 * 4 + 120 * (24 + 16 + 8)) / 1e9)
     assert tight.keyframes == list(range(len(tight.keyframes))) and len(tight.keyframes) in (1, 2)
-    assert tight.guards.keyframes_without_room == FRAMES - len(tight.keyframes)
+    assert tight.safeguards.keyframes_without_room == FRAMES - len(tight.keyframes)

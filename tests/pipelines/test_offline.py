@@ -8,11 +8,11 @@ import sys
 import numpy as np
 import pytest
 
-from fields.keyframes import KeyframeStore
+from fields.map.keyframes import KeyframeStore
 from pipelines.offline import OfflineMapper, Schedule, scene_extent
 from pipelines.settings import OfflineSettings
 from tests.pipelines.test_determinism import PROJECT
-from tests.pipelines.test_mapping import CAMERA, frame
+from tests.pipelines.test_online import CAMERA, frame
 
 pytestmark = pytest.mark.slow
 
@@ -132,7 +132,7 @@ def test_held_out_frames_are_refused(mapped: tuple[OfflineMapper, dict[str, floa
 
 CODE = """
 import hashlib, sys
-from fields.backend import initialise
+from fields.runtime.backend import initialise
 from tests.pipelines.test_offline import SETTINGS, mapper
 
 initialise("cpu", threads=int(sys.argv[1]))

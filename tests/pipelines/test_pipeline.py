@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from modp_ti.errors import InputError
-from modp_ti.mapper import Mapper
-from pipelines.map_state import MapState
-from pipelines.mapping import OnlineMapper
+from modp_ti.engine.mapper import Mapper
+from modp_ti.files.errors import InputError
 from pipelines.offline import OfflineMapper
+from pipelines.online import OnlineMapper
 from pipelines.pipeline import NothingToMapError, Pipeline
 from pipelines.settings import OfflineSettings, RefineSettings
+from pipelines.state import MapState
 from tests.pipelines.wall import frame
 
 

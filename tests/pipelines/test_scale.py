@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fields.backend import initialise
-from pipelines.mapping import OnlineMapper
+from fields.runtime.backend import initialise
+from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
-
-from .wall import frame
+from tests.pipelines.wall import frame
 
 pytestmark = pytest.mark.slow
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fields.camera import PinholeCamera
-from fields.se3 import exp_se3
-from fields.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import exp_se3
 from tests.spread import disturbed
 
 CAMERA = PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)

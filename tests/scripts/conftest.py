@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from modp_ti.config import dump_scene, load_scene
+from modp_ti.config.scene_file import dump_scene, load_scene
 from pipelines.stopwatch import breakdown_percent
 
 SCENE = """

@@ -8,8 +8,8 @@ from pathlib import Path
 import ablate
 import pytest
 
-from modp_ti.config import load_scene
-from modp_ti.errors import InputError
+from modp_ti.config.scene_file import load_scene
+from modp_ti.files.errors import InputError
 
 
 @pytest.mark.parametrize("variant", list(ablate.VARIANTS))

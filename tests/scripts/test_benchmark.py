@@ -14,10 +14,10 @@ from benchmarks.growth import HIDDEN, KEYFRAMES, PIXELS, VISIBLE
 from benchmarks.scene import Size, add_gaussians, arrays, camera_of, noise_frame
 from benchmarks.step import ADAM_BYTES, BACKWARD_FLOPS, FORWARD_FLOPS, STAGES, measure_step
 
-from fields.backend import initialise
-from fields.gaussians import GaussianField
-from fields.tiles import TILE_HEIGHT, TILE_WIDTH
-from pipelines.rendering import Renderer
+from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
+from fields.map.gaussians import GaussianField
+from fields.runtime.backend import initialise
+from pipelines.render.renderer import Renderer
 
 pytestmark = pytest.mark.slow
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import compare
 import pytest
 
-from modp_ti.config import load_scene
-from modp_ti.errors import InputError
+from modp_ti.config.scene_file import load_scene
+from modp_ti.files.errors import InputError
 
 
 def test_offline_gets_as_many_steps_as_the_online_run_rendered_views(scene: Path, tmp_path: Path) -> None:

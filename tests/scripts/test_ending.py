@@ -10,7 +10,7 @@ import mesh_picture
 import pytest
 from ending import documented_ending
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 
 class RefusalError(Exception):

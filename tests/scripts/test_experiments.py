@@ -9,7 +9,7 @@ import experiments
 import pytest
 from experiments import Job, execute
 
-from modp_ti.errors import InputError
+from modp_ti.files.errors import InputError
 
 
 def jobs_of(scene: Path, folder: Path, **overrides: str) -> list[Job]:

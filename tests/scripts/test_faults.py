@@ -1,4 +1,4 @@
-"""Faults on purpose: what is spoilt is what was said, and what the tables say is what came of it."""
+"""Faults on purpose: what is corrupted is what was said, and what the tables say is what came of it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from fault_injection.runs import finished, run_until
 from fault_injection.soak import Soak, soak_table
 from fault_injection.stream import FAULTS, HOLDOUT, Stream, disturb, stream_table, write_recording
 
-from modp_ti.config import load_scene
-from modp_ti.errors import InputError
-from modp_ti.exports.trajectory import write_trajectory
-from modp_ti.trackers import open_tracker
+from modp_ti.config.scene_file import load_scene
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.trackers import open_tracker
+from modp_ti.outputs.formats.trajectory import write_trajectory
 
 FRAMES = 60
 
@@ -41,16 +41,16 @@ def test_a_tenth_of_the_frames_is_spoilt_each_in_its_way_and_no_other(recording:
     lines = (recording / "poses.txt").read_text().splitlines()
     faulty = disturb(recording, 0.1, seed=3)
     assert list(faulty) == list(FAULTS) and all(len(places) == 1 for places in faulty.values())
-    spoilt = {kind: places[0] for kind, places in faulty.items()}
-    assert not any(i % HOLDOUT == 0 or i < HOLDOUT for i in spoilt.values())
+    corrupted = {kind: places[0] for kind, places in faulty.items()}
+    assert not any(i % HOLDOUT == 0 or i < HOLDOUT for i in corrupted.values())
     changed = {i for i, image in enumerate(images) if image.read_bytes() != before[i]}
-    assert changed == {spoilt[kind] for kind in FAULTS[:3]}
-    assert (cv2.imread(str(images[spoilt["black image"]])) == 0).all()
-    cut = spoilt["cut-off image"]
+    assert changed == {corrupted[kind] for kind in FAULTS[:3]}
+    assert (cv2.imread(str(images[corrupted["black image"]])) == 0).all()
+    cut = corrupted["cut-off image"]
     assert images[cut].read_bytes() == before[cut][: len(before[cut]) // 2]
     after = (recording / "poses.txt").read_text().splitlines()
-    assert {i for i in range(FRAMES) if after[i + 1] != lines[i + 1]} == {spoilt[kind] for kind in FAULTS[3:]}
-    assert after[spoilt["pose of NaN"] + 1].count("nan") == 7
+    assert {i for i in range(FRAMES) if after[i + 1] != lines[i + 1]} == {corrupted[kind] for kind in FAULTS[3:]}
+    assert after[corrupted["pose of NaN"] + 1].count("nan") == 7
 
 
 @pytest.mark.slow
@@ -90,8 +90,8 @@ def test_the_tables_say_what_came_of_it() -> None:
     assert "| kills | 2 (0 before the first snapshot, 2 after one) |" in kills
     stage = {"held_out": {"psnr": 30.0}}
     clean = {"frames": 60, "refined": stage, "frames_left_out": {}}
-    spoilt = {"frames": 55, "refined": {"held_out": {"psnr": 29.75}}, "frames_left_out": {"blank": 1}}
-    stream = Stream(60, {"black image": [9]}, clean, spoilt)
+    corrupted = {"frames": 55, "refined": {"held_out": {"psnr": 29.75}}, "frames_left_out": {"blank": 1}}
+    stream = Stream(60, {"black image": [9]}, clean, corrupted)
     assert stream.loss == pytest.approx(0.25)
     assert "| lost [dB] | | +0.25 |" in stream_table(stream) and "| left out by the run | | 1 blank |" in stream_table(
         stream

@@ -5,8 +5,8 @@ from __future__ import annotations
 import mesh_picture
 import numpy as np
 
-from fields.camera import PinholeCamera
-from modp_ti.exports.open3d_io import open3d
+from fields.geometry.camera import PinholeCamera
+from modp_ti.outputs.formats.open3d_io import open3d
 
 CAMERA = PinholeCamera(40.0, 40.0, 32.0, 24.0, 64, 48)
 

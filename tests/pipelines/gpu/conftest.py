@@ -10,12 +10,12 @@ from typing import TypeVar
 
 import pytest
 
-from fields.backend import initialise
+from fields.runtime.backend import initialise
 
 PROJECT = Path(__file__).resolve().parents[3]
 PROBE = """
 import sys
-from fields.backend import initialise
+from fields.runtime.backend import initialise
 for device in ("cuda", "vulkan"):
     try:
         print("starts", initialise(device))

@@ -4,11 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fields.keyframes import KeyframeStore
-from pipelines.depth import EpipolarDepth
+from fields.map.keyframes import KeyframeStore
+from pipelines.densify.depth import EpipolarDepth
 from pipelines.settings import EpipolarSettings
-
-from ..wall import frame
+from tests.pipelines.wall import frame
 
 PIXELS = np.stack([a.ravel() for a in np.meshgrid(np.arange(8.5, 56), np.arange(8.5, 40))], axis=1)[::7]
 

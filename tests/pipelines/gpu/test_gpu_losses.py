@@ -1,4 +1,4 @@
-"""Loss, development and their gradients on the GPU are those of the CPU, and their values come late."""
+"""Loss, photometric model and their gradients on the GPU are those of the CPU, and their values come late."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.camera import PinholeCamera
-from fields.gaussians import GaussianField
-from pipelines.gpu import losses as gpu_losses
-from pipelines.gpu.losses import LateLossValues, photometric_loss
-from pipelines.rendering import Renderer
-
-from ..scenes import CAMERA, NEAR, POSE, random_gaussians
+from fields.geometry.camera import PinholeCamera
+from fields.map.gaussians import GaussianField
+from pipelines.optimise import gpu_losses
+from pipelines.optimise.gpu_losses import AsyncLossValues, photometric_loss
+from pipelines.render.renderer import Renderer
+from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
 # Of several tiles and blocks, of one row of tiles, and within one tile.
 GRADIENTS = ("position", "log_scale", "quaternion", "opacity_logit", "sh")
@@ -73,7 +72,7 @@ def test_values_are_right_whenever_they_are_read(results: tuple, monkeypatch: py
     loss = photometric_loss(renderer.images)
     renderer.forward(CAMERA, POSE, NEAR)  # nothing but black
 
-    def evaluate(grey: int) -> LateLossValues:
+    def evaluate(grey: int) -> AsyncLossValues:
         image = np.full((CAMERA.height, CAMERA.width, 4), 255, dtype=np.uint8)
         image[..., :3] = grey
         renderer.images.set_reference(image)

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.backend import initialise
-from fields.keyframes import KeyframeStore
-from fields.tracked_frame import SparsePoints
-from pipelines.mapping import OnlineMapper
+from fields.frames.tracked_frame import SparsePoints
+from fields.map.keyframes import KeyframeStore
+from fields.runtime.backend import initialise
 from pipelines.offline import OfflineMapper
+from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings, OfflineSettings
-
-from ..wall import frame
+from tests.pipelines.wall import frame
 
 # Vulkan has no sparse fields: no voxels. Few steps: a software driver takes a quarter of a second for a view.
 SETTINGS = MappingSettings(

@@ -9,10 +9,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from fields.backend import torch_device
-from pipelines.rasterization import rasterize
-
-from ..scenes import CAMERA, NEAR, POSE, random_gaussians
+from fields.runtime.backend import torch_device
+from pipelines.render.rasterize import rasterize
+from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
 NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")
 

@@ -10,17 +10,16 @@ import taichi as ti
 import torch
 from numpy.typing import NDArray
 
-from fields import device_pairs
-from fields.camera import PinholeCamera
-from fields.device_pairs import TILE_HEIGHT, TILE_WIDTH, tile_count
-from fields.gaussians import GaussianField
-from fields.tiles import TilePairs
-from pipelines.binning import Binning
-from pipelines.compositing import OPAQUE
-from pipelines.gpu.binning import MEMORY
-from pipelines.rendering import Renderer
-
-from ..scenes import CAMERA, NEAR, POSE, random_gaussians
+from fields.buffers import device_pairs
+from fields.buffers.device_pairs import TILE_HEIGHT, TILE_WIDTH, tile_count
+from fields.buffers.tiles import TilePairs
+from fields.geometry.camera import PinholeCamera
+from fields.map.gaussians import GaussianField
+from pipelines.render.cpu.binning import Binning
+from pipelines.render.cpu.compositing import OPAQUE
+from pipelines.render.gpu.binning import MEMORY
+from pipelines.render.renderer import Renderer
+from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
 BACKGROUND = (0.2, 0.5, 0.9)
 NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")

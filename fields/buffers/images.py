@@ -1,0 +1,239 @@
+"""`ImageBuffers`: the picture being rendered, its reference, and their gradients."""
+
+import numpy as np
+import taichi as ti
+import torch
+
+from fields.buffers.device_images import DeviceImages
+from fields.buffers.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
+from fields.runtime.backend import on_gpu
+from fields.runtime.compiled_kernel import CompiledLoop
+from fields.runtime.parallel import HANDED_OUT
+
+__all__ = ["PAD", "SCRATCH_ROWS", "STRIPS", "ImageBuffers"]
+
+# Border of zeros around every plane [px]: an 11x11 window reads 5 beyond the image without a branch.
+PAD = 8
+# Strips of rows that the loss works on in parallel, each channel of each with this many scratch rows of its own.
+STRIPS = 32
+SCRATCH_ROWS = 8
+# A thread takes eight rows at a time.
+SPREAD = HANDED_OUT // 8
+
+
+@ti.data_oriented
+class ImageBuffers:
+    """Images up to `max_width` x `max_height` pixels, any smaller size without recompiling.
+
+    Planar buffers hold one plane a channel, row-major with a border of `PAD` zeros: pixel (x, y) of channel c is
+    at `c * plane + (y + PAD) * stride + x + PAD`. Tile buffers hold the 256 pixels of a tile consecutively, so
+    that a loop over them is one vector loop. Capacities are powers of two, so that most image sizes share the
+    kernels of the offline cache.
+
+    cache_gb: device memory for copies of reference images, on a GPU.
+    masked: whether the reference has masked pixels. On a GPU always False: the loss masks them on its way.
+    """
+
+    def __init__(
+        self, builder: ti.FieldsBuilder, max_width: int, max_height: int, real=ti.f32, cache_gb: float = 2.0
+    ) -> None:
+        self.real = real
+        self.dtype = np.float64 if real == ti.f64 else np.float32
+        self.max_width, self.max_height = max_width, max_height
+        tiles = -(-max_width // TILE_WIDTH) * -(-max_height // TILE_HEIGHT)
+        self.max_tiles = 1 << (tiles - 1).bit_length()
+        # Constants of the kernels, so that LLVM sees that rows do not overlap; a power of two plus the border, so that
+        # the rows of a window do not fall into the same cache set.
+        self.stride = (1 << (max_width - 1).bit_length()) + 2 * PAD
+        self.plane = self.stride * (-(-max_height // 256) * 256 + 2 * PAD)
+        self.width = self.height = 0
+        self.masked = False
+        self._references = DeviceImages(cache_gb * 2**30) if on_gpu() else None
+        self._take_reference = CompiledLoop(
+            self._set_reference_rows if self._references is None else self._set_reference_pixels, 6
+        )
+
+        def scalar():
+            return ti.field(real)
+
+        # Tile buffers: accumulators of compositing, and what its backward pass carries along a ray.
+        self.transmittance, self.red, self.green, self.blue, self.z = (scalar() for _ in range(5))
+        self.behind, self.red_grad, self.green_grad, self.blue_grad, self.z_grad = (scalar() for _ in range(5))
+        # Planar buffers.
+        self.colour, self.depth, self.opacity = scalar(), scalar(), scalar()
+        self.colour_grad, self.depth_grad, self.opacity_grad = scalar(), scalar(), scalar()
+        self.reference, self.valid = scalar(), scalar()
+        # SSIM: its derivatives by the render's local mean, square and product (3 planes a channel), its map.
+        self.ssim_partial, self.ssim = scalar(), scalar()
+        self.rows = scalar()
+        self.background = ti.Vector.field(3, real)
+
+        tile_pixels = self.max_tiles * TILE_PIXELS
+        for buffer in (self.transmittance, self.red, self.green, self.blue, self.z, self.behind):
+            builder.dense(ti.i, tile_pixels).place(buffer)
+        for buffer in (self.red_grad, self.green_grad, self.blue_grad, self.z_grad):
+            builder.dense(ti.i, tile_pixels).place(buffer)
+        for buffer in (self.depth, self.opacity, self.depth_grad, self.opacity_grad, self.valid):
+            builder.dense(ti.i, self.plane).place(buffer)
+        for buffer in (self.colour, self.colour_grad, self.reference, self.ssim):
+            builder.dense(ti.i, 3 * self.plane).place(buffer)
+        builder.dense(ti.i, 9 * self.plane).place(self.ssim_partial)
+        builder.dense(ti.i, 3 * STRIPS * SCRATCH_ROWS * self.stride).place(self.rows)
+        builder.place(self.background)
+
+    def resize(self, width: int, height: int) -> None:
+        """Lay the buffers out for images of `width` x `height`. Raises ValueError beyond the capacity."""
+        if (width, height) == (self.width, self.height):
+            return
+        if width > self.max_width or height > self.max_height:
+            raise ValueError(
+                f"image of {width}x{height} exceeds the buffers made for {self.max_width}x{self.max_height}"
+            )
+        self.width, self.height = width, height
+        self._clear()
+
+    @ti.kernel
+    def _clear(self):
+        for i in range(self.plane):
+            self.depth[i] = 0.0
+            self.opacity[i] = 0.0
+            self.depth_grad[i] = 0.0
+            self.opacity_grad[i] = 0.0
+            self.valid[i] = 0.0
+        for i in range(3 * self.plane):
+            self.colour[i] = 0.0
+            self.colour_grad[i] = 0.0
+            self.reference[i] = 0.0
+            self.ssim[i] = 0.0
+        for i in range(9 * self.plane):
+            self.ssim_partial[i] = 0.0
+
+    @ti.kernel
+    def clip_colour(self):
+        """Clip the rendered image to [0, 1], as a file of it would."""
+        for i in range(3 * self.plane):
+            self.colour[i] = ti.min(ti.max(self.colour[i], 0.0), 1.0)
+
+    # ---- to and from NumPy -----------------------------------------------------------------------------------
+
+    def set_reference(self, image: np.ndarray) -> None:
+        """Take a reference image (H, W, 4) uint8: RGB and 255 where the pixel is valid, 0 where it is masked."""
+        self.masked = self._references is None and not image[..., 3].all()
+        pixels = np.ascontiguousarray(image) if self._references is None else self._references.of(image)
+        self._take_reference(self.width * self.height, self.width, self.height, pixels)
+
+    def set_gradients(self, *gradients: np.ndarray | torch.Tensor) -> None:
+        """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W).
+
+        Tensors must be contiguous, of the buffers' type, and lie where kernels run.
+        """
+        arrays = [a if isinstance(a, torch.Tensor) else np.ascontiguousarray(a, dtype=self.dtype) for a in gradients]
+        self._set_gradients(self.width, self.height, *arrays)
+
+    def read_into(self, colour: torch.Tensor, depth: torch.Tensor, opacity: torch.Tensor) -> None:
+        """Write the rendered picture into tensors: colour (H, W, 3), depth (H, W), opacity (H, W).
+
+        They must be contiguous, of the buffers' type, and lie where kernels run.
+        """
+        self._read_picture(self.width, self.height, colour, depth, opacity)
+
+    def colour_to_numpy(self) -> np.ndarray:
+        """The rendered image (H, W, 3), not clipped."""
+        out = np.empty((self.height, self.width, 3), dtype=self.dtype)
+        self._read_planes(self.width, self.height, self.colour, out)
+        return out
+
+    def depth_to_numpy(self) -> np.ndarray:
+        """Composited depth (H, W): the sum of weight times z, not divided by opacity."""
+        out = np.empty((self.height, self.width, 1), dtype=self.dtype)
+        self._read_planes(self.width, self.height, self.depth, out)
+        return out[..., 0]
+
+    def opacity_to_numpy(self) -> np.ndarray:
+        """Composited opacity (H, W): 1 minus the transmittance behind the last Gaussian."""
+        out = np.empty((self.height, self.width, 1), dtype=self.dtype)
+        self._read_planes(self.width, self.height, self.opacity, out)
+        return out[..., 0]
+
+    def colour_gradient_to_numpy(self) -> np.ndarray:
+        """d loss / d colour (H, W, 3)."""
+        out = np.empty((self.height, self.width, 3), dtype=self.dtype)
+        self._read_planes(self.width, self.height, self.colour_grad, out)
+        return out
+
+    def ssim_to_numpy(self) -> np.ndarray:
+        """The last SSIM map (H, W, 3)."""
+        out = np.empty((self.height, self.width, 3), dtype=self.dtype)
+        self._read_planes(self.width, self.height, self.ssim, out)
+        return out
+
+    @ti.kernel
+    def _set_reference_rows(
+        self, alone: ti.template(), width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)
+    ):
+        ti.loop_config(serialize=alone)
+        for i in range(height * SPREAD):
+            if i % SPREAD == 0:
+                y = i // SPREAD
+                row = (y + PAD) * self.stride + PAD
+                # A first access out here makes Taichi fetch the tree's root once, not at every pixel.
+                self.valid[row] = 0.0
+                for c in ti.static(range(3)):
+                    for x in range(width):
+                        self.reference[c * self.plane + row + x] = ti.cast(image[y, x, c], self.real) / 255.0
+                for x in range(width):
+                    self.valid[row + x] = ti.cast(image[y, x, 3], self.real) / 255.0
+
+    @ti.kernel
+    def _set_reference_pixels(
+        self, alone: ti.template(), width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)
+    ):
+        """The same with a thread a pixel, for a GPU."""
+        ti.loop_config(serialize=alone)
+        for i in range(width * height):
+            x, y = i % width, i // width
+            at = (y + PAD) * self.stride + PAD + x
+            for c in ti.static(range(3)):
+                self.reference[c * self.plane + at] = ti.cast(image[y, x, c], self.real) / 255.0
+            self.valid[at] = ti.cast(image[y, x, 3], self.real) / 255.0
+
+    @ti.kernel
+    def _set_gradients(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        colour: ti.types.ndarray(),
+        depth: ti.types.ndarray(),
+        opacity: ti.types.ndarray(),
+    ):
+        for i in range(width * height):
+            x, y = i % width, i // width
+            at = (y + PAD) * self.stride + PAD + x
+            for c in ti.static(range(3)):
+                self.colour_grad[c * self.plane + at] = colour[y, x, c]
+            self.depth_grad[at] = depth[y, x]
+            self.opacity_grad[at] = opacity[y, x]
+
+    @ti.kernel
+    def _read_picture(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        colour: ti.types.ndarray(),
+        depth: ti.types.ndarray(),
+        opacity: ti.types.ndarray(),
+    ):
+        for i in range(width * height):
+            x, y = i % width, i // width
+            at = (y + PAD) * self.stride + PAD + x
+            for c in ti.static(range(3)):
+                colour[y, x, c] = self.colour[c * self.plane + at]
+            depth[y, x] = self.depth[at]
+            opacity[y, x] = self.opacity[at]
+
+    @ti.kernel
+    def _read_planes(self, width: ti.i32, height: ti.i32, buffer: ti.template(), out: ti.types.ndarray()):
+        channels = out.shape[2]
+        for i in range(width * height * channels):
+            c, x, y = i % channels, i // channels % width, i // channels // width
+            out[y, x, c] = buffer[c * self.plane + (y + PAD) * self.stride + PAD + x]

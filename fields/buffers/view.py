@@ -1,0 +1,72 @@
+"""`ViewField`: the camera that is being rendered, where kernels can read it."""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike
+
+from fields.geometry.camera import PinholeCamera
+from fields.runtime.backend import without_waiting
+from fields.runtime.compiled_kernel import CompiledKernel
+
+__all__ = ["ViewField"]
+
+# Projection linearises at most this share of half the image outside the frame (1.3 tan(fov / 2), as 3DGS does).
+FRUSTUM_MARGIN = 0.3
+
+
+@ti.data_oriented
+class ViewField:
+    """Pose and intrinsics of one view: rotation and translation of T_camera_world, focal lengths, centre, size.
+
+    `limits` are the bounds of x/z and y/z (left, right, top, bottom) between which the projection is linearised;
+    `near` is the depth below which nothing is drawn, in scene units.
+    """
+
+    def __init__(self, builder: ti.FieldsBuilder, real=ti.f32) -> None:
+        self.real = real
+        self.dtype = np.float64 if real == ti.f64 else np.float32
+        self.rotation = ti.Matrix.field(3, 3, real)
+        self.translation = ti.Vector.field(3, real)
+        self.focal = ti.Vector.field(2, real)
+        self.centre = ti.Vector.field(2, real)
+        self.limits = ti.Vector.field(4, real)
+        self.near = ti.field(real)
+        self.size = ti.Vector.field(2, ti.i32)
+        builder.place(self.rotation, self.translation, self.focal, self.centre, self.limits, self.near, self.size)
+        self._write = CompiledKernel(self._set)
+        self.width = 0
+        self.height = 0
+
+    def set(self, camera: PinholeCamera, T_camera_world: ArrayLike, near: float) -> None:
+        """Look through `camera` from `T_camera_world` (4, 4)."""
+        T = np.asarray(T_camera_world, dtype=np.float64)
+        margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
+        margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+        values = np.concatenate(
+            [
+                T[:3, :3].ravel(),
+                T[:3, 3],
+                [camera.fx, camera.fy, camera.cx, camera.cy],
+                [-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x],
+                [-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y],
+                [near],
+            ]
+        )
+        self.width, self.height = camera.width, camera.height
+        self._write(without_waiting(values.astype(self.dtype)), camera.width, camera.height)
+
+    @ti.kernel
+    def _set(self, values: ti.types.ndarray(), width: ti.i32, height: ti.i32):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            for r in ti.static(range(3)):
+                for c in ti.static(range(3)):
+                    self.rotation[None][r, c] = values[3 * r + c]
+                self.translation[None][r] = values[9 + r]
+            for c in ti.static(range(2)):
+                self.focal[None][c] = values[12 + c]
+                self.centre[None][c] = values[14 + c]
+            for c in ti.static(range(4)):
+                self.limits[None][c] = values[16 + c]
+            self.near[None] = values[20]
+            self.size[None] = ti.Vector([width, height])

@@ -1,0 +1,183 @@
+"""`TrackedFrame`: what a tracker hands to the mapper, and the only thing that the mapper takes in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fields.frames.pyramid import ImageLevel, build_pyramid
+from fields.geometry.camera import PinholeCamera
+
+__all__ = ["SparsePoints", "TrackedFrame"]
+
+# Entries by which a pose may miss being rigid.
+MAX_DRIFT = 1e-3
+# Numbers for the points of a frame that come without: those of another frame are others.
+IDS_PER_FRAME = 1 << 32
+
+
+def _empty(*shape: int) -> NDArray[np.float64]:
+    return np.zeros(shape, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class SparsePoints:
+    """Tracked 3D points observed in one frame (P_i of the paper).
+
+    xyz: (N, 3) float64, world frame. pixels: (N, 2) float64, (x, y) observed in the undistorted image, pixel
+    centres at +0.5. ids: (N,) int64, the same number for the same point in every frame.
+    """
+
+    xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
+    pixels: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 2))
+    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if self.xyz.shape != (n, 3) or self.pixels.shape != (n, 2):
+            raise ValueError(
+                f"sparse points disagree in number: xyz {self.xyz.shape}, pixels {self.pixels.shape}, ids ({n},)"
+            )
+        if not (np.isfinite(self.xyz).all() and np.isfinite(self.pixels).all()):
+            raise ValueError("sparse points hold NaN or infinite values")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def depths(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (N,) of the points before a camera at this pose; negative behind it."""
+        return self.xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """One frame with its tracked pose.
+
+    index: position among the frames that the tracker delivered, from 0. timestamp: seconds.
+    image: (H, W, 3) float32 RGB in [0, 1], undistorted. camera: its intrinsics.
+    T_camera_world: (4, 4) float64, world to camera, OpenCV axes.
+    mask: (H, W) bool, True where the pixel is valid; None where all are.
+    vignette: (H, W, 3) float32 in (0, 1], the share of the light that reaches each pixel, one array for all frames of
+    a camera; None for all of it. The image shows the scene times the vignette.
+    held_out: only for evaluation; such a frame never touches the map.
+
+    `rgba` and `pyramid` are made when first asked for, which a thread may do before the mapper takes the frame in.
+    """
+
+    index: int
+    timestamp: float
+    name: str
+    image: NDArray[np.float32]
+    camera: PinholeCamera
+    T_camera_world: NDArray[np.float64]
+    points: SparsePoints = field(default_factory=SparsePoints)
+    mask: NDArray[np.bool_] | None = None
+    vignette: NDArray[np.float32] | None = None
+    held_out: bool = False
+
+    def __post_init__(self) -> None:
+        expected = (self.camera.height, self.camera.width)
+        if self.image.shape != (*expected, 3) or self.image.dtype != np.float32:
+            raise ValueError(
+                f"{self.name}: image is {self.image.shape} {self.image.dtype}, "
+                f"the camera asks for {(*expected, 3)} float32"
+            )
+        if self.mask is not None and self.mask.shape != expected:
+            raise ValueError(f"{self.name}: mask is {self.mask.shape}, the image {expected}")
+        if self.vignette is not None and self.vignette.shape != self.image.shape:
+            raise ValueError(f"{self.name}: vignette is {self.vignette.shape}, the image {self.image.shape}")
+        if self.T_camera_world.shape != (4, 4) or not np.isfinite(self.T_camera_world).all():
+            raise ValueError(f"{self.name}: T_camera_world must be a finite 4x4 matrix")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        index: int,
+        image: NDArray,
+        T_camera_world: ArrayLike,
+        intrinsics: ArrayLike,
+        xyz: ArrayLike,
+        pixels: ArrayLike,
+        ids: ArrayLike | None = None,
+        *,
+        timestamp: float | None = None,
+        name: str | None = None,
+        mask: NDArray[np.bool_] | None = None,
+        held_out: bool = False,
+    ) -> TrackedFrame:
+        """A frame of what one's own loop has, looked over: most mistakes in conventions are found here.
+
+        index: 0, 1, 2, ... in the order of the frames. image: (H, W, 3) RGB without distortion, uint8, or float32 in
+        [0, 1]. T_camera_world: (4, 4), world to camera, OpenCV axes. intrinsics: fx, fy, cx, cy [px], the centre of the
+        first pixel being (0.5, 0.5). xyz (N, 3): tracked points in the world, pixels (N, 2): where the image shows
+        them, as (x, y). ids (N,): the same integer for the same point in every frame; without, all are new ones.
+        timestamp: seconds, the index where it is not given. mask, held_out: as in the class.
+
+        Raises TypeError or ValueError in one line, naming the frame.
+        """
+        name = f"frame {index}" if name is None else name
+        image = np.asarray(image)
+        if image.dtype not in (np.uint8, np.float32):
+            raise TypeError(f"{name}: image is {image.dtype}, expected uint8, or float32 in [0, 1]")
+        if image.ndim != 3 or image.shape[2] != 3:
+            raise ValueError(f"{name}: image has shape {image.shape}, expected (H, W, 3)")
+        if image.dtype == np.uint8:
+            image = image.astype(np.float32) / np.float32(255.0)
+        elif not (image.min() >= 0.0 and image.max() <= 1.0):
+            raise ValueError(f"{name}: a float32 image holds 0 to 1, this one {image.min():g} to {image.max():g}")
+        T = np.array(T_camera_world, dtype=np.float64)
+        if T.shape != (4, 4) or not _is_rigid(T):
+            raise ValueError(f"{name}: T_camera_world must be a rigid 4x4 matrix: [R t; 0 0 0 1], R a rotation")
+        intrinsics = np.asarray(intrinsics, dtype=np.float64)
+        if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all():
+            raise ValueError(f"{name}: intrinsics must be four numbers: fx, fy, cx, cy")
+        if mask is not None and mask.dtype != np.bool_:
+            raise TypeError(f"{name}: mask is {mask.dtype}, expected bool, True where the pixel is valid")
+        height, width = image.shape[:2]
+        xyz, pixels = (np.array(array, dtype=np.float64) for array in (xyz, pixels))
+        if xyz.ndim != 2 or xyz.shape[1] != 3 or pixels.shape != (len(xyz), 2):
+            raise ValueError(f"{name}: xyz has shape {xyz.shape}, pixels {pixels.shape}, expected (N, 3) and (N, 2)")
+        numbers = index * IDS_PER_FRAME + np.arange(len(xyz)) if ids is None else np.asarray(ids)
+        if numbers.shape != (len(xyz),) or numbers.dtype.kind not in "iu":
+            raise ValueError(f"{name}: ids are {numbers.shape} {numbers.dtype}, expected ({len(xyz)},) integers")
+        try:
+            camera = PinholeCamera(*intrinsics.tolist(), width, height)
+            points = SparsePoints(xyz, pixels, numbers.astype(np.int64))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        outside = ~camera.contains(pixels)
+        if outside.any():
+            at = int(np.argmax(outside))
+            raise ValueError(f"{name}: pixel {at}, {tuple(pixels[at].tolist())}, is not in the {width}x{height} image")
+        behind = int(np.count_nonzero(points.depths(T) <= 0))
+        if 2 * behind > len(points):
+            raise ValueError(
+                f"{name}: {behind} of {len(points)} points lie behind the camera: T_camera_world takes the world to "
+                "the camera (x right, y down, z forward); is it the inverse, or OpenGL's?"
+            )
+        timestamp = float(index) if timestamp is None else timestamp
+        return cls(index, timestamp, name, image, camera, T, points, mask, held_out=held_out)
+
+    @cached_property
+    def rgba(self) -> NDArray[np.uint8]:
+        """The image with 8 bits a channel (H, W, 4), 255 in the last where the pixel is valid and all 0 where not."""
+        rgba = np.full((*self.image.shape[:2], 4), 255, dtype=np.uint8)
+        rgba[..., :3] = np.round(self.image * 255.0)
+        if self.mask is not None:
+            rgba[~self.mask] = 0
+        return rgba
+
+    @cached_property
+    def pyramid(self) -> tuple[ImageLevel, ...]:
+        """`rgba` and its halved sizes, as many levels as `build_pyramid` makes."""
+        return build_pyramid(self.rgba, self.camera)
+
+
+def _is_rigid(T: NDArray[np.float64]) -> bool:
+    """Whether T (4, 4) is a rotation and a translation."""
+    R = T[:3, :3]
+    off = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
+    return bool(np.isfinite(T).all() and off < MAX_DRIFT and np.linalg.det(R) > 0)

@@ -1,0 +1,1 @@
+"""What the map is: Gaussians, keyframes and the voxels that are occupied."""

@@ -1,0 +1,126 @@
+"""`GaussianMotion`: moves Gaussians with the views that placed them, when a tracker has revised those."""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import quaternion_from_matrix
+from fields.geometry.similarity import scale_of
+from fields.map.gaussians import GaussianField
+
+__all__ = ["GaussianMotion"]
+
+TABLE = ti.types.ndarray(ndim=2)
+BLOCKS = ti.types.ndarray(ndim=3)
+
+
+@ti.data_oriented
+class GaussianMotion:
+    """A similarity for every anchor: its Gaussians are carried along, turned and scaled, colours and all.
+
+    What Adam remembers goes with them, so that the next steps are those of a Gaussian that had always been there. For a
+    value that changes by y = M x, gradients change by M^-T: first moments are multiplied by it, second moments by its
+    elements squared, as if the components of a gradient were uncorrelated.
+    """
+
+    def __init__(self, gaussians: GaussianField) -> None:
+        self.gaussians = gaussians
+
+    def move(self, S: NDArray[np.float64], sh_rotation: NDArray[np.float64]) -> None:
+        """Move every Gaussian by the similarity of its anchor.
+
+        S: S_after_before (A, 4, 4), a row an anchor. sh_rotation: (A, K, K), what the turn makes of the coefficients of
+        K harmonics. Gaussians of an anchor whose S is the identity, and those without an anchor, keep every bit.
+        Gradients of those that move are dropped: call it between steps.
+
+        Raises ValueError where a Gaussian's anchor has no row.
+        """
+        g = self.gaussians
+        if g.count == 0:
+            return
+        if int(g.anchors().max()) >= len(S):
+            raise ValueError(f"anchor {int(g.anchors().max())} has none of the {len(S)} motions")
+        scale = scale_of(S)
+        rotation = S[:, :3, :3] / scale[:, None, None]
+        tables = (
+            S[:, :3].reshape(-1, 12),
+            rotation.reshape(-1, 9),
+            np.stack([quaternion_from_matrix(R) for R in rotation]),
+            np.stack([np.log(scale), 1.0 / scale], axis=1),
+            sh_rotation,
+        )
+        moves = (S != np.eye(4)).any(axis=(1, 2)).astype(np.int32)
+        self._move(g.count, moves, *(np.ascontiguousarray(table, dtype=g.dtype) for table in tables))
+
+    @ti.kernel
+    def _move(
+        self,
+        count: ti.i32,
+        moves: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        linear: TABLE,  # (A, 12): the upper three rows of S
+        rotations: TABLE,  # (A, 9)
+        quaternions: TABLE,  # (A, 4)
+        scales: TABLE,  # (A, 2): log s and 1 / s
+        sh_rotation: BLOCKS,  # (A, K, K)
+    ):
+        for i in range(count):
+            a = self.gaussians.anchor[i]
+            if a >= 0 and moves[ti.max(a, 0)] != 0:
+                self._move_geometry(i, a, linear, rotations, quaternions, scales)
+                if ti.static(self.gaussians.sh_degree > 0):
+                    self._turn_colour(i, a, sh_rotation)
+                self.gaussians.touched[i] = 0
+                self.gaussians.forget_gradient(i)
+
+    @ti.func
+    def _move_geometry(
+        self, i, a, linear: ti.template(), rotations: ti.template(), quaternions: ti.template(), scales: ti.template()
+    ):
+        p, m, v = self.gaussians.position[i], self.gaussians.position_m[i], self.gaussians.position_v[i]
+        for r in ti.static(range(3)):
+            self.gaussians.position[i][r] = (
+                linear[a, 4 * r] * p[0]
+                + linear[a, 4 * r + 1] * p[1]
+                + linear[a, 4 * r + 2] * p[2]
+                + linear[a, 4 * r + 3]
+            )
+            # y = s R x, so that a gradient becomes R g / s.
+            x, y, z = rotations[a, 3 * r], rotations[a, 3 * r + 1], rotations[a, 3 * r + 2]
+            shrink = scales[a, 1]
+            self.gaussians.position_m[i][r] = (x * m[0] + y * m[1] + z * m[2]) * shrink
+            self.gaussians.position_v[i][r] = (x * x * v[0] + y * y * v[1] + z * z * v[2]) * shrink * shrink
+            self.gaussians.log_scale[i][r] = self.gaussians.log_scale[i][r] + scales[a, 0]
+        w = ti.Vector([quaternions[a, 0], quaternions[a, 1], quaternions[a, 2], quaternions[a, 3]])
+        # The product with a quaternion from the left is an orthogonal matrix.
+        L = ti.Matrix(
+            [
+                [w[0], -w[1], -w[2], -w[3]],
+                [w[1], w[0], -w[3], w[2]],
+                [w[2], w[3], w[0], -w[1]],
+                [w[3], -w[2], w[1], w[0]],
+            ]
+        )
+        self.gaussians.quaternion[i] = L @ self.gaussians.quaternion[i]
+        self.gaussians.quaternion_m[i] = L @ self.gaussians.quaternion_m[i]
+        self.gaussians.quaternion_v[i] = (L * L) @ self.gaussians.quaternion_v[i]
+
+    @ti.func
+    def _turn_colour(self, i, a, sh_rotation: ti.template()):
+        self._turn(self.gaussians.sh, i, a, sh_rotation, False)
+        self._turn(self.gaussians.sh_m, i, a, sh_rotation, False)
+        self._turn(self.gaussians.sh_v, i, a, sh_rotation, True)
+
+    @ti.func
+    def _turn(self, field: ti.template(), i, a, sh_rotation: ti.template(), squared: ti.template()):
+        """field[i] <- M field[i], by way of the gradient's place."""
+        # The constant harmonic stays.
+        for k in range(1, self.gaussians.sh_count):
+            total = 0.0 * field[i, 0]
+            for j in range(1, self.gaussians.sh_count):
+                entry = sh_rotation[a, k, j]
+                if ti.static(squared):
+                    entry = entry * entry
+                total += entry * field[i, j]
+            self.gaussians.sh.grad[i, k] = total
+        for k in range(1, self.gaussians.sh_count):
+            field[i, k] = self.gaussians.sh.grad[i, k]

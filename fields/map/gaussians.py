@@ -1,0 +1,394 @@
+"""`GaussianField`: the map's Gaussians, a pool that grows without recompiling the kernels that use it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+import torch
+from numpy.typing import NDArray
+
+from fields.runtime.backend import growing, refuse_too_many_fields
+
+__all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
+
+# The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[0].
+SH_C0 = 0.28209479177387814
+BLOCK = 1024
+NO_ANCHOR = -1
+# Ends of the names of Adam's first and second moments.
+MOMENTS = ("_m", "_v")
+
+
+@ti.data_oriented
+class GaussianField:
+    """Anisotropic Gaussians in world space, with their gradients and Adam moments beside the values.
+
+    SNode tree: pointer(blocks) over dense(1024), so that memory follows the number of Gaussians and no kernel is
+    compiled anew when it grows; dense on a GPU, which holds `max_gaussians` from the start. Gaussians are
+    `0 .. count - 1`, always contiguous.
+
+    position (3), log_scale (3), quaternion (4; w, x, y, z, any length but zero), opacity_logit (1),
+    sh (K, 3) with K = (sh_degree + 1)^2 coefficients: the layout of 3DGS files. `steps` counts the updates that
+    a Gaussian has had; `anchor` is the number of the view that placed it, NO_ANCHOR where nobody has said.
+    236 bytes per Gaussian at degree 0 in float32.
+    """
+
+    def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:
+        self.sh_degree = sh_degree
+        self.sh_count = (sh_degree + 1) ** 2
+        self.real = real
+        self.count = 0
+        self.capacity = -(-max_gaussians // BLOCK) * BLOCK
+        self.dtype = np.float64 if real == ti.f64 else np.float32
+
+        def vector(n: int, needs_grad: bool = False):
+            return ti.Vector.field(n, real, needs_grad=needs_grad)
+
+        self.position, self.position_m, self.position_v = vector(3, True), vector(3), vector(3)
+        self.log_scale, self.log_scale_m, self.log_scale_v = vector(3, True), vector(3), vector(3)
+        self.quaternion, self.quaternion_m, self.quaternion_v = vector(4, True), vector(4), vector(4)
+        self.opacity_logit = ti.field(real, needs_grad=True)
+        self.opacity_logit_m, self.opacity_logit_v = ti.field(real), ti.field(real)
+        self.sh, self.sh_m, self.sh_v = vector(3, True), vector(3), vector(3)
+        self.steps = ti.field(ti.i32)
+        self.anchor = ti.field(ti.i32)
+        self.touched = ti.field(ti.i32)
+        self._caught = ti.field(ti.i32)
+
+        builder = ti.FieldsBuilder()
+        blocks = growing(builder, self.capacity // BLOCK)
+        # One dense child a use: culling reads positions without dragging moments through the cache.
+        geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
+        blocks.dense(ti.i, BLOCK).place(*geometry)
+        blocks.dense(ti.i, BLOCK).place(*(f.grad for f in geometry))
+        blocks.dense(ti.i, BLOCK).place(
+            self.position_m, self.position_v, self.log_scale_m, self.log_scale_v,
+            self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v,
+        )  # fmt: skip
+        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh)
+        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
+        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
+        blocks.dense(ti.i, BLOCK).place(self.steps, self.anchor, self.touched)
+        builder.dense(ti.i, 2).place(self._caught)
+        builder.finalize()
+        refuse_too_many_fields(self._caught)
+
+    def __len__(self) -> int:
+        return self.count
+
+    @property
+    def bytes_each(self) -> int:
+        """Bytes of a Gaussian: values, gradients and two moments, and three integers."""
+        return 4 * (11 + 3 * self.sh_count) * np.dtype(self.dtype).itemsize + 3 * 4
+
+    # ---- growing and shrinking -------------------------------------------------------------------------------
+
+    def append(
+        self,
+        position: NDArray,
+        log_scale: NDArray,
+        quaternion: NDArray,
+        opacity_logit: NDArray,
+        sh: NDArray,
+        anchor: int = NO_ANCHOR,
+    ) -> None:
+        """Add N Gaussians: position (N, 3), log_scale (N, 3), quaternion (N, 4), opacity_logit (N,), sh (N, K, 3).
+
+        Gradients, moments and step counts of the new ones are zero. anchor: of all of them.
+        Raises ValueError naming the first Gaussian that holds NaN, infinity or a zero quaternion, or where the
+        shapes disagree or the pool is full.
+        """
+        arrays = [
+            np.ascontiguousarray(a, dtype=self.dtype) for a in (position, log_scale, quaternion, opacity_logit, sh)
+        ]
+        n = len(arrays[0])
+        shapes = [(n, 3), (n, 3), (n, 4), (n,), (n, self.sh_count, 3)]
+        for array, shape, name in zip(arrays, shapes, _NAMES, strict=True):
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+            bad = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+            if bad.any():
+                raise ValueError(f"Gaussian {int(np.argmax(bad))}: {name} is not finite")
+        zero = np.linalg.norm(arrays[2], axis=1) < 1e-12
+        if zero.any():
+            raise ValueError(f"Gaussian {int(np.argmax(zero))}: quaternion is zero")
+        if self.count + n > self.capacity:
+            raise ValueError(f"{self.count + n} Gaussians exceed the pool of {self.capacity}; raise max_gaussians")
+        if n:
+            self._write(self.count, anchor, *arrays)
+            self.count += n
+
+    def remove(self, keep: NDArray[np.bool_]) -> int:
+        """Keep the Gaussians where `keep` (count,) is true; return how many went.
+
+        Survivors from the end move into the holes, in order: parallel, and the same on every run.
+        """
+        if keep.shape != (self.count,):
+            raise ValueError(f"keep has shape {keep.shape}, expected ({self.count},)")
+        kept = int(np.count_nonzero(keep))
+        removed = self.count - kept
+        if removed:
+            holes = np.flatnonzero(~keep[:kept]).astype(np.int32)
+            movers = (kept + np.flatnonzero(keep[kept:])).astype(np.int32)
+            if len(holes):
+                self._move(movers, holes)
+            self.count = kept
+        return removed
+
+    # ---- saving and loading ----------------------------------------------------------------------------------
+
+    def to_numpy(self) -> dict[str, NDArray]:
+        """Values of all Gaussians by name: position (N, 3), log_scale, quaternion, opacity_logit (N,), sh (N, K, 3)."""
+        return self._to_numpy([getattr(self, name) for name in _NAMES])
+
+    def anchors(self) -> NDArray[np.int32]:
+        """The anchor of every Gaussian (N,)."""
+        out = np.zeros(self.count, dtype=np.int32)
+        if self.count:
+            self._read_numbers(self.anchor, out)
+        return out
+
+    def gradients_to_numpy(self) -> dict[str, NDArray]:
+        """Gradients of all Gaussians, by the names and shapes of `to_numpy`."""
+        return self._to_numpy([getattr(self, name).grad for name in _NAMES])
+
+    def _to_numpy(self, fields: list) -> dict[str, NDArray]:
+        n, k = self.count, self.sh_count
+        arrays = [np.zeros(s, dtype=self.dtype) for s in ((n, 3), (n, 3), (n, 4), (n,), (n, k, 3))]
+        if n:
+            self._read(n, *fields, *arrays)
+        return dict(zip(_NAMES, arrays, strict=True))
+
+    def load(self, state: dict[str, NDArray]) -> None:
+        """Replace the content by the values of `state`, as `to_numpy` gives them.
+
+        Their anchors are those of its entry `anchor` (N,), without one they have none. Raises as `append` does, the
+        content then being what it was.
+        """
+        before, self.count = self.count, 0
+        try:
+            anchor = state.get("anchor")
+            if anchor is not None and np.shape(anchor) != np.shape(state["opacity_logit"]):
+                raise ValueError(f"anchor has shape {np.shape(anchor)}, expected {np.shape(state['opacity_logit'])}")
+            self.append(**{name: state[name] for name in _NAMES})
+        except ValueError:
+            self.count = before
+            raise
+        if anchor is not None and self.count:
+            self._write_numbers(self.anchor, np.ascontiguousarray(anchor, dtype=np.int32))
+
+    def history(self) -> dict[str, NDArray]:
+        """What the Gaussians remember beside their values: `NAME_m` and `NAME_v` of each value, `steps` and `anchor`.
+
+        With the values of `to_numpy` it is all that they are between two steps.
+        """
+        moments = {
+            name + end: array
+            for end in MOMENTS
+            for name, array in self._to_numpy([getattr(self, name + end) for name in _NAMES]).items()
+        }
+        steps = np.zeros(self.count, dtype=np.int32)
+        if self.count:
+            self._read_numbers(self.steps, steps)
+        return moments | {"steps": steps, "anchor": self.anchors()}
+
+    def restore(self, state: dict[str, NDArray]) -> None:
+        """Replace the content by values and history, as `to_numpy` and `history` gave them.
+
+        Raises KeyError for what is missing, and ValueError as `append` does and for moments that are not of the values'
+        shapes or not finite.
+        """
+        for name in (name + end for end in MOMENTS for name in _NAMES):
+            if state[name].shape != state[name[:-2]].shape or not np.isfinite(state[name]).all():
+                raise ValueError(f"{name} must be finite and {state[name[:-2]].shape}, not {state[name].shape}")
+        for name in ("steps", "anchor"):
+            if state[name].shape != state["opacity_logit"].shape:
+                raise ValueError(f"{name} has shape {state[name].shape}, expected {state['opacity_logit'].shape}")
+        self.load(state)
+        if self.count == 0:
+            return
+        for end in MOMENTS:
+            arrays = [np.ascontiguousarray(state[name + end], dtype=self.dtype) for name in _NAMES]
+            self._write_moments(*(getattr(self, name + end) for name in _NAMES), *arrays)
+        self._write_numbers(self.steps, np.ascontiguousarray(state["steps"], dtype=np.int32))
+
+    def take(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Replace the content by tensors in the order and shapes of `append`, without a way over the host.
+
+        They must be contiguous, of the field's type, lie where kernels run and hold what `append` does not refuse,
+        which is not looked at again. Raises ValueError where the pool is too small.
+        """
+        count = len(tensors[0])
+        if count > self.capacity:
+            raise ValueError(f"{count} Gaussians exceed the pool of {self.capacity}")
+        self.count = count
+        if count:
+            self._write(0, NO_ANCHOR, *tensors)
+
+    def gradients_into(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Write the gradients of all Gaussians into tensors as `take` has them."""
+        if self.count:
+            self._read(self.count, *(getattr(self, name).grad for name in _NAMES), *tensors)
+
+    def clear_gradients(self) -> None:
+        """Drop what the views rendered since the last Adam step have added to the gradients."""
+        if self.count:
+            self._clear_gradients(self.count)
+
+    def take_caught(self) -> tuple[int, int]:
+        """Steps that were left out and Gaussians that had exploded (see `Adam`), since this was asked last."""
+        caught = self._caught[0], self._caught[1]
+        self._caught.fill(0)
+        return caught
+
+    def opacities(self) -> NDArray:
+        """Opacity in (0, 1) of all Gaussians (N,)."""
+        return 1.0 / (1.0 + np.exp(-self.to_numpy()["opacity_logit"]))
+
+    @ti.kernel
+    def _clear_gradients(self, count: ti.i32):
+        for i in range(count):
+            if self.touched[i] != 0:
+                self.touched[i] = 0
+                self.forget_gradient(i)
+
+    @ti.func
+    def forget_gradient(self, i):
+        """Set the gradients of one Gaussian to zero."""
+        self.position.grad[i].fill(0.0)
+        self.log_scale.grad[i].fill(0.0)
+        self.quaternion.grad[i].fill(0.0)
+        self.opacity_logit.grad[i] = 0.0
+        for k in range(self.sh_count):
+            self.sh.grad[i, k].fill(0.0)
+
+    @ti.func
+    def _forget(self, i):
+        """A Gaussian's first state: no gradient, no history."""
+        self.forget_gradient(i)
+        self.position_m[i].fill(0.0)
+        self.position_v[i].fill(0.0)
+        self.log_scale_m[i].fill(0.0)
+        self.log_scale_v[i].fill(0.0)
+        self.quaternion_m[i].fill(0.0)
+        self.quaternion_v[i].fill(0.0)
+        self.opacity_logit_m[i] = 0.0
+        self.opacity_logit_v[i] = 0.0
+        for k in range(self.sh_count):
+            self.sh_m[i, k].fill(0.0)
+            self.sh_v[i, k].fill(0.0)
+        self.steps[i] = 0
+        self.touched[i] = 0
+
+    @ti.kernel
+    def _write(
+        self,
+        first: ti.i32,
+        anchor: ti.i32,
+        position: ti.types.ndarray(),
+        log_scale: ti.types.ndarray(),
+        quaternion: ti.types.ndarray(),
+        opacity_logit: ti.types.ndarray(),
+        sh: ti.types.ndarray(),
+    ):
+        for j in range(opacity_logit.shape[0]):
+            i = first + j
+            for c in ti.static(range(3)):
+                self.position[i][c] = position[j, c]
+                self.log_scale[i][c] = log_scale[j, c]
+            for c in ti.static(range(4)):
+                self.quaternion[i][c] = quaternion[j, c]
+            self.opacity_logit[i] = opacity_logit[j]
+            for k in range(self.sh_count):
+                for c in ti.static(range(3)):
+                    self.sh[i, k][c] = sh[j, k, c]
+            self._forget(i)
+            self.anchor[i] = anchor
+
+    @ti.kernel
+    def _read_numbers(self, field: ti.template(), out: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+        for i in range(out.shape[0]):
+            out[i] = field[i]
+
+    @ti.kernel
+    def _write_numbers(self, field: ti.template(), values: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+        for i in range(values.shape[0]):
+            field[i] = values[i]
+
+    @ti.kernel
+    def _write_moments(
+        self,
+        position: ti.template(),
+        log_scale: ti.template(),
+        quaternion: ti.template(),
+        opacity_logit: ti.template(),
+        sh: ti.template(),
+        of_position: ti.types.ndarray(),
+        of_log_scale: ti.types.ndarray(),
+        of_quaternion: ti.types.ndarray(),
+        of_opacity_logit: ti.types.ndarray(),
+        of_sh: ti.types.ndarray(),
+    ):
+        for i in range(of_opacity_logit.shape[0]):
+            for c in ti.static(range(3)):
+                position[i][c] = of_position[i, c]
+                log_scale[i][c] = of_log_scale[i, c]
+            for c in ti.static(range(4)):
+                quaternion[i][c] = of_quaternion[i, c]
+            opacity_logit[i] = of_opacity_logit[i]
+            for k in range(self.sh_count):
+                for c in ti.static(range(3)):
+                    sh[i, k][c] = of_sh[i, k, c]
+
+    @ti.kernel
+    def _read(
+        self,
+        count: ti.i32,
+        position: ti.template(),
+        log_scale: ti.template(),
+        quaternion: ti.template(),
+        opacity_logit: ti.template(),
+        sh: ti.template(),
+        out_position: ti.types.ndarray(),
+        out_log_scale: ti.types.ndarray(),
+        out_quaternion: ti.types.ndarray(),
+        out_opacity_logit: ti.types.ndarray(),
+        out_sh: ti.types.ndarray(),
+    ):
+        for i in range(count):
+            for c in ti.static(range(3)):
+                out_position[i, c] = position[i][c]
+                out_log_scale[i, c] = log_scale[i][c]
+            for c in ti.static(range(4)):
+                out_quaternion[i, c] = quaternion[i][c]
+            out_opacity_logit[i] = opacity_logit[i]
+            for k in range(self.sh_count):
+                for c in ti.static(range(3)):
+                    out_sh[i, k, c] = sh[i, k][c]
+
+    @ti.kernel
+    def _move(self, source: ti.types.ndarray(), target: ti.types.ndarray()):
+        for j in range(source.shape[0]):
+            s, t = source[j], target[j]
+            self._forget(t)
+            self.position[t] = self.position[s]
+            self.position_m[t] = self.position_m[s]
+            self.position_v[t] = self.position_v[s]
+            self.log_scale[t] = self.log_scale[s]
+            self.log_scale_m[t] = self.log_scale_m[s]
+            self.log_scale_v[t] = self.log_scale_v[s]
+            self.quaternion[t] = self.quaternion[s]
+            self.quaternion_m[t] = self.quaternion_m[s]
+            self.quaternion_v[t] = self.quaternion_v[s]
+            self.opacity_logit[t] = self.opacity_logit[s]
+            self.opacity_logit_m[t] = self.opacity_logit_m[s]
+            self.opacity_logit_v[t] = self.opacity_logit_v[s]
+            for k in range(self.sh_count):
+                self.sh[t, k] = self.sh[s, k]
+                self.sh_m[t, k] = self.sh_m[s, k]
+                self.sh_v[t, k] = self.sh_v[s, k]
+            self.steps[t] = self.steps[s]
+            self.anchor[t] = self.anchor[s]
+
+
+_NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")

@@ -1,0 +1,92 @@
+"""Keyframes as plain arrays, and back: all that is known of them but their images, which their frames bring again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.map.keyframes import Keyframe, KeyframeStore
+
+__all__ = ["KeyframeRows", "keyframe_arrays"]
+
+# Fields of `Keyframe` that are one number or one small matrix each, with their shapes.
+NUMBERS: dict[str, tuple[int, ...]] = {
+    "index": (),
+    "T_tracked": (4, 4),
+    "T_camera_world": (4, 4),
+    "median_depth": (),
+    "error": (),
+    "pose_m": (6,),
+    "pose_v": (6,),
+    "pose_steps": (),
+    "exposure_m": (3, 4),
+    "exposure_v": (3, 4),
+    "exposure_steps": (),
+    "lag": (4, 4),
+}
+# Fields whose arrays have another name in a snapshot.
+FIELDS = {"lag": "pending_motion"}
+WHOLE = ("index", "pose_steps", "exposure_steps")
+POINTS = {"xyz": 3, "pixels": 2}
+
+
+def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
+    """A row a keyframe, by the names of its fields (see FIELDS); exposure NaN where it has none.
+
+    points: how many tracked points each has; xyz (P, 3), pixels (P, 2) and ids (P,) are those of all, in their order.
+    """
+    views = list(store)
+    arrays = {
+        name: np.array(
+            [getattr(view, FIELDS.get(name, name)) for view in views], dtype=np.int64 if name in WHOLE else np.float64
+        ).reshape(-1, *shape)
+        for name, shape in NUMBERS.items()
+    }
+    unknown = np.full((3, 4), np.nan)
+    exposures = [unknown if view.exposure is None else view.exposure for view in views]
+    arrays["exposure"] = np.array(exposures).reshape(-1, 3, 4)
+    arrays["points"] = np.array([len(view.points) for view in views], dtype=np.int64)
+    for name, width in POINTS.items():
+        parts = [getattr(view.points, name) for view in views]
+        arrays[name] = np.concatenate([*parts, np.zeros((0, width))])
+    arrays["ids"] = np.concatenate([*(view.points.ids for view in views), np.zeros(0, dtype=np.int64)])
+    return arrays
+
+
+class KeyframeRows:
+    """What `keyframe_arrays` gave, to be put back into a store, frame by frame.
+
+    Raises KeyError or ValueError for arrays that are missing or of other shapes.
+    """
+
+    def __init__(self, arrays: Mapping[str, NDArray]) -> None:
+        count = len(arrays["index"])
+        for name, shape in {**NUMBERS, "exposure": (3, 4)}.items():
+            if arrays[name].shape != (count, *shape):
+                raise ValueError(f"{name} has shape {arrays[name].shape}, expected {(count, *shape)}")
+            if name != "exposure" and not np.isfinite(arrays[name]).all():
+                raise ValueError(f"{name} is not finite")
+        total = int(arrays["points"].sum())
+        if arrays["points"].shape != (count,) or (arrays["points"] < 0).any() or len(arrays["ids"]) != total:
+            raise ValueError(f"{len(arrays['ids'])} tracked points, {total} are announced")
+        self._arrays = arrays
+        self._first = np.concatenate([[0], np.cumsum(arrays["points"])])
+        self.rows = {int(index): row for row, index in enumerate(arrays["index"])}
+
+    def put(self, frame: TrackedFrame, store: KeyframeStore) -> None:
+        """Make the keyframe of `frame`, the next of those in `rows`, as it was. Raises ValueError for another one."""
+        row = len(store)
+        if self.rows.get(frame.index) != row:
+            raise ValueError(f"frame {frame.index} is not keyframe {row}")
+        view = store.append(frame)
+        for name, shape in NUMBERS.items():
+            value = self._arrays[name][row]
+            plain = int(value) if name in WHOLE else float(value) if shape == () else np.array(value)
+            setattr(view, FIELDS.get(name, name), plain)
+        exposure = self._arrays["exposure"][row]
+        view.exposure = None if np.isnan(exposure).all() else np.array(exposure)
+        own = slice(self._first[row], self._first[row + 1])
+        view.points = SparsePoints(*(np.array(self._arrays[name][own]) for name in ("xyz", "pixels", "ids")))

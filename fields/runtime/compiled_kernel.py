@@ -1,0 +1,92 @@
+"""Kernels that a step calls again and again: without Taichi's checks in Python, on as many threads as pay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import torch
+
+from fields.runtime.backend import on_gpu
+
+__all__ = ["CompiledKernel", "CompiledLoop"]
+
+# Work [ns] that the calling thread does alone in about the time that it takes to have it done by two. To wake a thread
+# and to be woken took 50 us on one machine and 180 us on another, a virtual one.
+ALONE_BELOW = 300_000.0
+
+
+class CompiledKernel:
+    """A kernel of a data-oriented object. The first call compiles it, and settles the types of its arguments.
+
+    Taichi 1.7.4 takes some 50 microseconds of Python for a launch, and a step has twenty of them a view: more than
+    many of these kernels take on a GPU. Later calls here only hand over integers, floats and contiguous arrays (NumPy's
+    on the CPU, tensors that lie where kernels run), which must have the types of the first call's.
+    """
+
+    def __init__(self, kernel: Any, reverse: bool = False, constants: tuple = ()) -> None:
+        """reverse: launch its gradient kernel. constants: values of its leading arguments, which are templates."""
+        self._first = kernel.grad if reverse else kernel
+        self._kernel = kernel._adjoint if reverse else kernel._primal
+        self._constants = constants
+        self._owner = kernel._kernel_owner
+        self._program: Any = None
+        self._make_context: Any = None
+        self._compiled: Any = None
+
+    def __call__(self, *arguments: int | float | np.ndarray | torch.Tensor) -> None:
+        if self._compiled is None:
+            self._first(*self._constants, *arguments)
+            self.compile(*arguments)
+            return
+        context = self._make_context()
+        for place, value in enumerate(arguments):
+            kind = value.__class__
+            if kind is int:
+                context.set_arg_int((place,), value)
+            elif kind is float:
+                context.set_arg_float((place,), value)
+            elif kind is torch.Tensor:
+                context.set_arg_external_array_with_shape((place,), value.data_ptr(), value.nbytes, value.shape, 0)
+            elif kind is np.ndarray:
+                address = value.__array_interface__["data"][0]
+                context.set_arg_external_array_with_shape((place,), address, value.nbytes, value.shape, 0)
+            else:
+                raise TypeError(
+                    f"argument {place} of a kernel is a {kind.__name__}, which CompiledKernel does not hand over"
+                )
+        self._program.launch_kernel(self._compiled, context)
+
+    def compile(self, *arguments: int | float | np.ndarray | torch.Tensor) -> None:
+        """Compile the kernel for arguments of these types, which are not checked."""
+        program = ti.lang.impl.get_runtime().prog
+        compiled = self._kernel.compiled_kernels[
+            self._kernel.ensure_compiled(self._owner, *self._constants, *arguments)
+        ]
+        self._program = program
+        self._make_context = compiled.make_launch_context
+        self._compiled = program.compile_kernel(program.config(), program.get_device_caps(), compiled)
+
+
+class CompiledLoop:
+    """A kernel of one parallel loop, run by the calling thread alone where waking the others would take longer.
+
+    The kernel's first argument is a template `alone`, which it hands to `ti.loop_config(serialize=alone)`. Which of the
+    two is run does not depend on the number of threads: their last bits differ.
+    """
+
+    def __init__(self, kernel: Any, nanoseconds: float, reverse: bool = False) -> None:
+        """nanoseconds: what an item takes one thread, roughly."""
+        self._alone, self._together = (CompiledKernel(kernel, reverse, (alone,)) for alone in (True, False))
+        self._most_alone = -1.0 if on_gpu() else ALONE_BELOW / nanoseconds
+        self._compiled = False
+
+    def __call__(self, items: int, *arguments: int | float | np.ndarray | torch.Tensor) -> None:
+        """Launch the kernel over `items` items."""
+        chosen = self._alone if items <= self._most_alone else self._together
+        chosen(*arguments)
+        if not self._compiled and self._most_alone >= 0.0:
+            # Both at once: a run must not stop to compile when the map outgrows one thread.
+            (self._together if chosen is self._alone else self._alone).compile(*arguments)
+        self._compiled = True

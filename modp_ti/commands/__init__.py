@@ -1,0 +1,1 @@
+"""The commands of `modp-ti`, one file each: arguments in, exit codes out."""

@@ -1,0 +1,70 @@
+"""The command `modp-ti`: one subcommand a job."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from modp_ti import __version__
+from modp_ti.commands.check import EXAMPLES as CHECK_EXAMPLES
+from modp_ti.commands.check import check
+from modp_ti.commands.export import EXAMPLES as EXPORT_EXAMPLES
+from modp_ti.commands.export import export
+from modp_ti.commands.render import EXAMPLES as RENDER_EXAMPLES
+from modp_ti.commands.render import render
+from modp_ti.commands.run import EXAMPLES as RUN_EXAMPLES
+from modp_ti.commands.run import run
+from modp_ti.commands.shared import examples
+from modp_ti.commands.view import EXAMPLES as VIEW_EXAMPLES
+from modp_ti.commands.view import view
+from modp_ti.commands.warmup import EXAMPLES as WARMUP_EXAMPLES
+from modp_ti.commands.warmup import warmup
+
+__all__ = ["app"]
+
+OVERVIEW = examples(
+    "modp-ti check scene.yaml   (is the input as it should be?)",
+    "modp-ti run scene.yaml   (the map, its poses, figures and report.html)",
+    "modp-ti render OUT --path orbit   (OUT: the output folder of a run)",
+    "modp-ti export OUT --format mesh",
+)
+ENDS = (
+    "Exit codes: 0 done; 1 (check) usable, with warnings; 2 wrong input or options; 3 a fault of the program; "
+    "130 interrupted."
+)
+
+app = typer.Typer(
+    name="modp-ti",
+    help="Photorealistic 3D Gaussian maps from one RGB camera, built while the frames arrive.",
+    epilog=f"{OVERVIEW}\n\n{ENDS}",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"modp-ti {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and end")
+    ] = False,
+) -> None:
+    pass
+
+
+app.command("run", epilog=RUN_EXAMPLES)(run)
+app.command("check", epilog=CHECK_EXAMPLES)(check)
+app.command("render", epilog=RENDER_EXAMPLES)(render)
+app.command("export", epilog=EXPORT_EXAMPLES)(export)
+app.command("view", epilog=VIEW_EXAMPLES)(view)
+app.command("warmup", epilog=WARMUP_EXAMPLES)(warmup)
+
+
+if __name__ == "__main__":
+    app()

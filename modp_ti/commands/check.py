@@ -1,0 +1,114 @@
+"""`modp-ti check scene.yaml`: reads everything, maps nothing, says what is wrong and how to mend it."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from modp_ti.commands.shared import AsJson, Overrides, Quiet, examples, one_line, outcome, progress_console, standalone
+from modp_ti.files.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from modp_ti.config.settings import SceneConfig
+    from modp_ti.inputs.inspection.report import Report
+    from modp_ti.inputs.trackers import Tracker
+
+__all__ = ["EXAMPLES", "check", "inspect_scene"]
+
+EXAMPLES = examples(
+    "modp-ti check scene.yaml",
+    "modp-ti check scene.yaml --quiet && modp-ti run scene.yaml",
+    "modp-ti check scene.yaml --json > check.json",
+)
+
+
+def check(
+    scene: Annotated[Path, typer.Argument(help="scene file (YAML); its paths are relative to it")],
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Look a scene's input over without mapping it. Exit code: 0 fine, 1 with warnings, 2 unusable."""
+    with outcome(as_json) as result:
+        # Imported here: asking for help must not wait for the readers.
+        from rich.console import Console
+
+        from modp_ti.config.scene_file import load_scene
+        from modp_ti.inputs.inspection import report as reports
+        from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
+
+        try:
+            report = inspect_scene(load_scene(scene, set_ or []), progress_console(quiet))
+        except InputError as error:
+            report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", one_line(error))])
+        result.code = verdict(report.findings)[1]
+        result.data = reports.as_json(report)
+        if not as_json:
+            reports.print_report(report, Console())
+
+
+def inspect_scene(config: SceneConfig, console: Console) -> Report:
+    """Iterate over the scene's tracker once and judge what it delivers. Progress is shown on `console`.
+
+    Raises InputError for input that cannot be read at all.
+    """
+    from fields.runtime.backend import initialise
+    from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
+    from modp_ti.inputs.inspection.pictures import judge_sequence
+    from modp_ti.inputs.inspection.report import Report
+    from modp_ti.inputs.inspection.scale import judge_scale, measure_scale
+    from modp_ti.inputs.inspection.survey import survey
+    from modp_ti.inputs.trackers import open_tracker
+    from modp_ti.outputs.progress import ProgressLine
+
+    if config.tracker.renders_frames:
+        initialise("cpu", config.threads, config.seed)
+    line = ProgressLine(console)
+    tracker = open_tracker(config, line.prepare)
+    try:
+        frames = iter(tracker)
+        first = next(frames, None)
+        if first is None:
+            raise InputError("the tracker delivered no frame: nothing to check")
+        total = tracker.frame_count
+        line.start_mapping(total, "checking")
+        try:
+            seen = survey(chain([first], frames), total, lambda _: line.frame(None))
+        finally:
+            line.stop()
+        with line.working("comparing conventions"):
+            geometry, scale = measure_geometry(seen), measure_scale(seen.frames)
+        findings = [
+            *judge_geometry(geometry),
+            *judge_sequence(seen.frames),
+            *judge_scale(seen.frames, scale, config.mapping.keyframes.min_points),
+        ]
+        return Report(seen.frames, geometry, scale, _lens(tracker), list(tracker.notes), findings)
+    finally:
+        tracker.close()
+
+
+def _lens(tracker: Tracker) -> str:
+    """The distortion that the tracker's images are freed from; empty where it does not say."""
+    undistorter = tracker.undistorter
+    if undistorter is None:
+        return ""
+    size = f"images of {undistorter.raw.width}x{undistorter.raw.height}"
+    d = undistorter.distortion
+    if d.is_identity:
+        return f"{size}, no distortion"
+    words = [f"{'fisheye' if d.fisheye else 'radial'} " + " ".join(f"{k:.4g}" for k in d.numerator)]
+    if any(d.denominator):
+        words.append("over " + " ".join(f"{k:.4g}" for k in d.denominator))
+    if any(d.tangential):
+        words.append("tangential " + " ".join(f"{k:.4g}" for k in d.tangential))
+    return f"{size}, distortion: {', '.join(words)}"
+
+
+if __name__ == "__main__":
+    standalone(check, EXAMPLES)

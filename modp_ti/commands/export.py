@@ -1,0 +1,72 @@
+"""`modp-ti export OUT --format ...`: a finished map for other programs."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from modp_ti.commands.shared import AsJson, Device, Quiet, examples, outcome, progress_console
+
+__all__ = ["EXAMPLES", "export"]
+
+EXAMPLES = examples(
+    "modp-ti export out/room --format mesh   (out/room/mesh.ply)",
+    "modp-ti export out/room --format mesh -o room.glb   (for browsers)",
+    "modp-ti export out/room --format spz   (splats, a tenth of the size)",
+    "modp-ti export out/room --format nerfstudio -o data/room",
+)
+
+
+class Format(str, Enum):
+    """What a map is exported as."""
+
+    points = "points"
+    mesh = "mesh"
+    splat = "splat"
+    spz = "spz"
+    compressed_ply = "compressed-ply"
+    colmap = "colmap"
+    nerfstudio = "nerfstudio"
+    video = "video"
+
+
+def export(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")],
+    format: Annotated[
+        Format,
+        typer.Option(
+            "--format",
+            "-f",
+            help="`points`: coloured points (PLY); `mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, "
+            "`compressed-ply`: splats, small, for viewers; `colmap`, `nerfstudio`: images with poses and points, to "
+            "train on; `video`: the recorded path",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="PATH", help="file or new folder; empty: in OUT, see docs/export.md"),
+    ] = None,
+    voxel: Annotated[
+        float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
+    ] = None,
+    device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a finished map as points, mesh, compressed splats, data set or video."""
+    with outcome(as_json) as result:
+        # Imported here: asking for help must not wait for the compiler and the readers.
+        from modp_ti.outputs.playback.export_map import ExportOptions, export_map
+        from modp_ti.outputs.playback.finished_run import open_run
+        from modp_ti.outputs.progress import ProgressLine
+
+        options = ExportOptions(voxel or None, device.value)
+        line = ProgressLine(progress_console(quiet))
+        with line.working("reading the run"):
+            run = open_run(out)
+        target = export_map(run, format.value, output, options, line)
+        result.text = f"written to {target}"
+        result.data = {"output": str(target.absolute()), "format": format.value}

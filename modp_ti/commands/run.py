@@ -1,0 +1,79 @@
+"""The main job: `modp-ti run scene.yaml [--set key=value ...]`, the same as `python -m modp_ti.run`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from modp_ti.commands.shared import (
+    AsJson,
+    Overrides,
+    Quiet,
+    examples,
+    outcome,
+    progress_console,
+)
+from modp_ti.files.errors import InputError
+
+__all__ = ["EXAMPLES", "run"]
+
+EXAMPLES = examples(
+    "modp-ti run scene.yaml",
+    "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
+    "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
+    "modp-ti run scene.yaml --set snapshot_every=50",
+    "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
+    "modp-ti run scene.yaml --quiet --json > result.json",
+)
+
+
+def run(
+    scene: Annotated[
+        Path | None, typer.Argument(help="scene file (YAML); its paths are relative to it; not needed with --resume")
+    ] = None,
+    set_: Overrides = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            "--resume", metavar="OUT", help="go on with the run whose output folder this is, from its snapshot"
+        ),
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
+) -> None:
+    """Map a posed sequence while its frames arrive, and write splats, poses, metrics, pictures and a report."""
+    if scene is None and resume is None:
+        raise typer.BadParameter("name a scene file, or the output folder of a run to go on with (--resume OUT)")
+    with outcome(as_json) as result:
+        overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
+        folder = _run(scene, resume, overrides, quiet)
+        result.text = f"written to {folder}"
+        if as_json:
+            metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+            result.data = {"output": str(folder), "metrics": metrics}
+
+
+def _run(scene: Path | None, resume: Path | None, overrides: list[str], quiet: bool) -> Path:
+    # Imported here: asking for help must not wait for the compiler and the readers.
+    from modp_ti.config.scene_file import load_scene
+
+    snapshot = None
+    if resume is not None:
+        from modp_ti.engine.snapshots import load_resumed
+
+        config, snapshot = load_resumed(resume, scene, overrides)
+    else:
+        assert scene is not None, "run() asks for one of them"
+        config = load_scene(scene, overrides)
+    if config.output.exists() and not config.output.is_dir():
+        raise InputError(f"{config.output}: output must be a folder, this is a file")
+
+    from modp_ti.engine.session import run_scene
+
+    console = progress_console(quiet)
+    return run_scene(config, console) if snapshot is None else run_scene(config, console, snapshot)

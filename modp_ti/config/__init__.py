@@ -1,0 +1,1 @@
+"""The configuration: its settings as models, `scene.yaml` read and written, and the documentation of its keys."""

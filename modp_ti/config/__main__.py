@@ -1,0 +1,7 @@
+"""`python -m modp_ti.config`: the documentation of every key as Markdown."""
+
+from modp_ti.config.keys import markdown_of_keys
+from modp_ti.config.settings import SceneConfig
+
+if __name__ == "__main__":
+    print(markdown_of_keys(SceneConfig), end="")

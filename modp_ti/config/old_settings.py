@@ -1,0 +1,53 @@
+"""What older versions wrote into settings and this one does not have, so that their files go on running.
+
+Until 0.1.0 the `tracker` section had one flat list of keys for all kinds, and a run's `config.yaml` and its snapshots
+held every one of them with its default. Now each kind has its own keys. A key of another kind is therefore dropped
+where its value is empty or what its default was: it never had an effect. With any other value it is an unknown key,
+as the user believes that it does something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from modp_ti.config.keys import variants_of
+from modp_ti.config.settings import SceneConfig
+
+__all__ = ["without_leftovers"]
+
+# The keys of the flat section beside `kind`, with their defaults.
+FLAT_TRACKER: Mapping[str, Any] = {
+    "path": None,
+    "points": None,
+    "adjust": None,
+    "max_points": 2000,
+    "max_difference": 0.02,
+    "time_offset": 0.0,
+    "camera": "camera-rgb",
+    "max_inv_dist_std": 0.005,
+    "max_dist_std": 0.05,
+    "address": None,
+    "patience": 120.0,
+    "exposure_change": 0.0,
+    "drift": 0.0,
+    "correction": False,
+}
+
+
+def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a scene as plain data, without the keys of other kinds of tracker that say nothing.
+
+    Where the kind is missing or unknown, all keys stay.
+    """
+    tracker = settings.get("tracker")
+    if not isinstance(tracker, Mapping):
+        return dict(settings)
+    model = variants_of(SceneConfig.model_fields["tracker"]).get(str(tracker.get("kind")))
+    if model is None:
+        return dict(settings)
+
+    def says_something(key: str, value: Any) -> bool:
+        return key in model.model_fields or key not in FLAT_TRACKER or value not in (None, FLAT_TRACKER[key])
+
+    return {**settings, "tracker": {key: value for key, value in tracker.items() if says_something(key, value)}}

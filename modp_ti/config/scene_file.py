@@ -1,0 +1,277 @@
+"""`scene.yaml`: the settings of a scene read from YAML with overrides, and written resolved."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from modp_ti.config.keys import as_yaml, documented_keys, sections_of, variants_of
+from modp_ti.config.old_settings import without_leftovers
+from modp_ti.config.settings import SceneConfig
+from modp_ti.config.unknown_keys import refuse_unknown_keys
+from modp_ti.files import read_text
+from modp_ti.files.atomic import replace_text
+from modp_ti.files.errors import InputError
+
+__all__ = ["dump_scene", "load_scene", "scene_from_data"]
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneConfig:
+    """Reads a scene file; `overrides` are "section.key=value" with the value in YAML, applied in their order.
+
+    Relative paths, those of overrides included, are relative to the scene file's folder; the result holds
+    absolute paths. Raises InputError (one line) for an unreadable file, an unknown key or a wrong value.
+    """
+    file = Path(path)
+    try:
+        text = read_text(file)
+    except FileNotFoundError:
+        raise InputError(f"{file}: no such scene file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+        raise InputError(f"{file}: cannot be read as text: {reason}") from None
+    if len(text) > MAX_TEXT:
+        raise InputError(f"{file}: has {len(text):,} characters, which is no scene file: at most {MAX_TEXT:,}")
+
+    lines: dict[str, int] = {}
+    data = _parse_yaml(text, str(file), lines)
+    if not isinstance(data, dict):
+        raise InputError(
+            f"{file}: a scene file has keys such as `source:`, `tracker:` and `output:`; this one holds none"
+        )
+    where = {key: f"{file}:{line}" for key, line in lines.items()}
+    return _with_absolute_paths(_resolved(data, where, str(file), overrides), file.resolve().parent)
+
+
+def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = ()) -> SceneConfig:
+    """The settings that a run has kept as plain data, `name` being the file; overrides as of `load_scene`.
+
+    Raises InputError for settings that this version does not have, and as `load_scene` does.
+    """
+    data = json.loads(json.dumps(data))
+    return _with_absolute_paths(_resolved(data, {}, name, overrides), Path.cwd())
+
+
+def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
+    """Writes every setting with absolute paths, so that the file gives the same run from wherever it lies."""
+    resolved = _with_absolute_paths(config, Path.cwd())
+    text = "# Every setting of this run: `modp-ti run` on this file gives the same map.\n"
+    text += yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    replace_text(path, text)
+
+
+def _with_absolute_paths(model: M, base: Path) -> M:
+    update: dict[str, Any] = {}
+    for name, value in model:
+        if isinstance(value, Path):
+            update[name] = _absolute_path(value, base, name)
+        elif isinstance(value, BaseModel):
+            update[name] = _with_absolute_paths(value, base)
+    return model.model_copy(update=update)
+
+
+def _absolute_path(value: Path, base: Path, name: str) -> Path:
+    """Raises InputError for what no file can be called."""
+    longest = max(len(os.fsencode(part)) for part in (*value.parts, ""))
+    if "\0" in str(value) or longest > MAX_NAME or len(os.fsencode(value)) > MAX_PATH:
+        shown = f"{value}".replace("\0", "")[:40]
+        raise InputError(f"{name}: {shown}...: no file can be called that: it is too long, or holds a NUL character")
+    try:
+        return (base / value.expanduser()).resolve()
+    except (RuntimeError, OSError) as error:  # no such user, or links that lead in a circle
+        raise InputError(f"{name}: {value}: is no path: {error}") from None
+
+
+def _resolved(data: dict[str, Any], where: dict[str, str], name: str, overrides: Iterable[str]) -> SceneConfig:
+    """The model of the raw data, which the overrides change.
+
+    where: file and line that wrote a dotted key; overrides take the place of what they change.
+    """
+    for override in overrides:
+        _apply_override(data, override, where)
+    # Only now: an override may say another `tracker.kind`, on which the keys of its section depend.
+    data = without_leftovers(data)
+    refuse_unknown_keys(data, SceneConfig, where, name)
+    return _validated(data, where, name)
+
+
+def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
+    try:
+        # Strict JSON keeps `scale: "0.5"` and `holdout: true` from passing as numbers, and still takes text
+        # as path.
+        return SceneConfig.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        problems = error.errors()
+        first = problems[0]
+        place = _place(first["loc"])
+        text = first["msg"].removeprefix("Value error, ")
+        if first["type"].startswith("union_tag"):  # a kind that is missing, or that there is not
+            place += "." + first.get("ctx", {})["discriminator"].strip("'")
+            text = _no_such_kind(place, first)
+        elif first["type"] == "missing":
+            text = f"{place} is missing: {_description(place) or 'it has no default'}"
+        elif place and first["type"] != "value_error":
+            text = f"{place}: {text.replace('Input should be', 'must be')}, not {as_yaml(first['input'])}"
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise InputError(f"{where.get(place, name)}: {text}{more}") from None
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    """The dotted key that an error of pydantic is about, which names the kind of a section as well."""
+    parts: list[str] = []
+    fields: Mapping[str, FieldInfo] = SceneConfig.model_fields
+    remaining = iter(location)
+    for part in remaining:
+        parts.append(str(part))
+        info = fields.get(str(part))
+        if info is None:
+            fields = {}
+            continue
+        variants = variants_of(info)
+        sections = [variants[str(tag)] for tag in islice(remaining, 1)] if variants else sections_of(info.annotation)
+        fields = sections[0].model_fields if sections else {}
+    return ".".join(parts)
+
+
+def _no_such_kind(key: str, error: ErrorDetails) -> str:
+    """What is wrong with the key that tells which keys its section has. error: pydantic's, of that section."""
+    if error["type"] == "union_tag_not_found":
+        return f"{key} is missing: {_description(key)}"
+    given = error["input"][key.rpartition(".")[2]]
+    kinds = [entry.variant for entry in documented_keys(SceneConfig) if entry.key == key]
+    near = difflib.get_close_matches(str(given), kinds, n=1, cutoff=0.6)
+    hint = f"; did you mean `{near[0]}`?" if near else ""
+    names = ", ".join(f"'{kind}'" for kind in kinds[:-1])
+    return f"{key}: must be {names} or '{kinds[-1]}', not {as_yaml(given)}{hint}"
+
+
+# Of a scene file: characters, values and marks between them, sections in sections; digits of a whole number.
+MAX_TEXT, MAX_EVENTS, MAX_DEPTH, MAX_DIGITS = 1 << 18, 20_000, 16, 19
+# Bytes that file systems take: of a name, of a path.
+MAX_NAME, MAX_PATH = 255, 4095
+
+_INT = re.compile(r"[-+]?[0-9]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+
+
+def _parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
+    """Plain data of a YAML text under the YAML 1.2 rules: `1e-3` is a number, `no` is text, keys are unique.
+
+    lines: filled with the line (from 1) of every dotted key.
+    """
+    try:
+        _require_flat(text, name)
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        return None if node is None else _plain(node, "", name, lines)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f"{name}:{mark.line + 1}" if mark else name
+        raise InputError(f"{place}: not valid YAML: {error.problem or error.context}") from None
+    except yaml.YAMLError as error:
+        raise InputError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
+
+
+def _require_flat(text: str, name: str) -> None:
+    """Raises InputError for YAML whose tree is deeper or larger than a scene's, before it is built.
+
+    Aliases, of which a few lines can make any number of values, are refused.
+    """
+    depth = count = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        count += 1
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{name}:{line}: an alias (*{event.anchor:.40}) is not taken here: write the value out")
+        if depth > MAX_DEPTH or count > MAX_EVENTS:
+            raise InputError(f"{name}:{line}: deeper or longer than any scene file")
+
+
+def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any:
+    line = node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        result: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            key_line = key_node.start_mark.line + 1
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise InputError(f"{name}:{key_line}: a key must be a word")
+            key = str(key_node.value)
+            inner = f"{place}.{key}" if place else key
+            if key in result:
+                raise InputError(f"{name}:{key_line}: `{inner}` stands twice (first in line {lines[inner]})")
+            lines[inner] = key_line
+            result[key] = _plain(value_node, inner, name, lines)
+        return result
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(item, f"{place}.{i}", name, lines) for i, item in enumerate(node.value)]
+    value = str(node.value)
+    if node.style is not None:  # quoted or block text
+        return value
+    if value in ("", "~", "null", "Null", "NULL"):
+        return None
+    if value in ("true", "True", "TRUE", "false", "False", "FALSE"):
+        return value[0] in "tT"
+    if _INT.fullmatch(value) and len(value) <= MAX_DIGITS:
+        return int(value)
+    number = None
+    if _FLOAT.fullmatch(value):
+        number = float(value)
+    elif value.lstrip("+-").lower() in (".inf", ".nan"):
+        number = math.inf
+    if number is not None:
+        if not math.isfinite(number):
+            raise InputError(f"{name}:{line}: {place or 'the value'}: must be a finite number, not {value}")
+        return number
+    return value
+
+
+def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
+    """Puts one "section.key=value" into the raw data."""
+    origin = f"--set {override}"
+    key, equals, text = override.partition("=")
+    key = key.strip()
+    if not equals or not key:
+        raise InputError(f"{origin}: write it as section.key=value, for example source.scale=0.5")
+    value = _parse_yaml(text, origin, {})
+
+    parts = key.split(".")
+    nested: dict[str, Any] = {parts[-1]: value}
+    for part in reversed(parts[:-1]):
+        nested = {part: nested}
+    refuse_unknown_keys(nested, SceneConfig, {}, origin, whole_key=key)
+
+    section = data
+    for part in parts[:-1]:
+        if not isinstance(section.get(part), dict):
+            section[part] = {}
+        section = section[part]
+    section[parts[-1]] = value
+    for known in [k for k in where if k == key or k.startswith(key + ".")]:
+        del where[known]
+    where[key] = origin
+
+
+def _description(key: str) -> str:
+    """What a key means; for a section, the keys that it needs."""
+    keys = list(documented_keys(SceneConfig))
+    found = [entry for entry in keys if entry.key == key]
+    if found and found[0].selects:
+        return "one of " + ", ".join(f"`{entry.variant}` ({entry.description})" for entry in found)
+    if found:
+        return f"{found[0].description} ({found[0].type})"
+    needed = dict.fromkeys(entry.key for entry in keys if entry.key.startswith(key + ".") and entry.default is None)
+    return f"it needs {', '.join(needed)}" if needed else ""

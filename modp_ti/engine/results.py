@@ -1,0 +1,170 @@
+"""The output folder of a run: everything that is written at its end, made aside and put in place at once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import TrackedFrame
+from fields.map.keyframes import KeyframeStore
+from modp_ti.config.scene_file import dump_scene
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.atomic import replace_text, write_picture
+from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
+from modp_ti.outputs.formats.colmap_model import image_names, write_image
+from modp_ti.outputs.formats.map_folder import appearing, write_map
+from modp_ti.outputs.formats.scores_csv import write_scores
+from modp_ti.outputs.formats.splats_ply import read_splats
+from modp_ti.outputs.report.page import ReportedRun, write_report
+from modp_ti.outputs.report.pictures import Album
+from modp_ti.outputs.report.record import RunRecord
+
+__all__ = ["Results", "metrics_of"]
+
+STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
+# Versions of a map that metrics.json has room for; null where a run does not make one.
+MAPS = ("online", "refined", "offline")
+
+
+# What is written of a finished map alone.
+FIGURES = ("metrics.json", "scores.csv", "report.html")
+
+
+class Results:
+    """The files of a run's last map, in `folder` beside `config.output` until `writing` ends."""
+
+    def __init__(self, config: SceneConfig, frames: DeliveredFrames) -> None:
+        self.config = config
+        self.frames = frames
+        self._names = image_names(frames.name, config.export.images)
+        self._album = Album.of(frames.held_out)
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Files are written inside, and appear in the output folder together when all went well.
+
+        Raises InputError where they cannot be written.
+        """
+        with appearing(self.config.output) as self.folder:
+            (self.folder / "renders").mkdir()
+            yield
+            dump_scene(self.config, self.folder / "config.yaml")
+
+    def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> MapVersion:
+        """Write what `formats.map_folder.write_map` does; return the map as a reader of it gets it."""
+        write_map(self.folder, version, self.frames, self._names, keyframes, near)
+        return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
+
+    def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+        """Write the pictures of a frame: its image where asked for, and beside the map (H, W, 3) where held out.
+
+        Those that the report may show are kept for it.
+        """
+        if self.config.export.images:
+            write_image(self.folder / "colmap", self._names[frame.index], frame)
+        if frame.held_out:
+            _write_pair(self.folder / "renders" / f"{frame.index:06d}.png", frame.image, render)
+        if self.config.export.report:
+            self._album.keep(frame.index, frame.image, render)
+
+    def write_scores(self, scores: list[FrameScore], metrics: dict) -> None:
+        """Write the scores of all frames, and the run's figures."""
+        write_scores(self.folder / "scores.csv", scores)
+        replace_text(self.folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+
+    def remove_figures(self) -> None:
+        """Take away what an earlier run has left in the output folder that this one, stopped, has not made."""
+        for name in FIGURES:
+            (self.config.output / name).unlink(missing_ok=True)
+
+    def write_report(
+        self,
+        record: RunRecord,
+        metrics: dict,
+        scores: list[FrameScore],
+        versions: dict[str, MapVersion],
+        keyframes: KeyframeStore,
+        truth: list[NDArray[np.float64]],
+    ) -> str | None:
+        """Write `report.html`; None, or in one line why there is none.
+
+        truth: true T_camera_world (4, 4) of all frames, or none.
+        """
+        mapped = {keyframe.index for keyframe in keyframes}
+        try:
+            last = [score for score in scores if score.stage == list(versions)[-1]]
+            run = ReportedRun(
+                config=self.config,
+                record=record,
+                metrics=metrics,
+                scores=scores,
+                versions=versions,
+                tracked=self.frames.T_tracked,
+                truth=truth,
+                keyframes=[place for place, index in enumerate(self.frames.index) if index in mapped],
+                scene_depth=keyframes.scene_depth,
+                comparisons=self._album.comparisons(last, self.folder / "renders"),
+            )
+            write_report(self.folder / "report.html", run)
+        except Exception as error:  # whatever it is, the map is finished and must not be lost
+            return f"report.html could not be made: {error!r}"
+        return None
+
+
+def metrics_of(
+    scores: list[FrameScore], versions: dict[str, MapVersion], frames: DeliveredFrames, seconds: dict[str, float]
+) -> dict:
+    """What metrics.json says of the maps, of the points under their poses, and of the time.
+
+    seconds: of the stages, and `total`.
+    """
+    points, last = frames.points, list(versions.values())[-1]
+    anew = {
+        name: points.reprojection_error(frames.camera, poses, points.placed_anew(frames.camera, poses))
+        for name, poses in (("", last.trajectory), ("_tracked", frames.T_tracked))
+    }
+    return {
+        "frames": len(frames),
+        "corrections": frames.corrections,
+        **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
+        "reprojection_error": _rounded(points.reprojection_error(frames.camera, last.trajectory)),
+        "reprojection_error_tracked": _rounded(points.reprojection_error(frames.camera, frames.T_tracked)),
+        **{f"reprojection_error_anew{name}": _rounded(error) for name, error in anew.items()},
+        "seconds": _seconds(seconds),
+    }
+
+
+def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
+    """A version's means over all frames and over those held out, and what it took."""
+    of = [score for score in scores if score.stage == stage]
+    return {
+        "all": summary(of),
+        "held_out": summary([score for score in of if score.held_out]),
+        "gaussians": len(version.gaussians["position"]),
+        "view_renders": version.view_renders,
+    }
+
+
+def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
+    """A PNG with the frame on the left and the render on the right."""
+    pair = np.hstack([image, render])
+    write_picture(path, np.round(pair * 255.0).astype(np.uint8))
+
+
+def _seconds(stages: dict[str, float]) -> dict[str, float]:
+    """Seconds of each stage of metrics.json, and what is left of the total."""
+    seconds = {"total": round(stages["total"], 3)}
+    seconds |= {stage: round(stages.get(stage, 0.0), 3) for stage in STAGES}
+    seconds["other"] = round(stages["total"] - sum(stages.get(stage, 0.0) for stage in STAGES), 3)
+    return seconds
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)

@@ -1,0 +1,353 @@
+"""One run: frames from the tracker through the mapper to the files of the output folder."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.runtime.backend import describe, initialise
+from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.interruption import Interruption, RunStopped
+from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.observer import Observer, Unobserved
+from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.engine.results import Results, metrics_of
+from modp_ti.engine.run_clock import RunClock
+from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.trackers import Tracker, open_tracker
+from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
+from modp_ti.outputs.lpips import open_lpips
+from modp_ti.outputs.progress import ProgressLine
+from modp_ti.outputs.report.record import RunRecord
+from pipelines.stopwatch import Stopwatch, breakdown_percent
+
+__all__ = ["build_mapper", "run_scene"]
+
+
+def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
+    """Map the scene of `config` and write its output folder, which is returned.
+
+    Nothing but snapshots is written before the map is finished; the files then appear together. resumed: where to go on
+    from, instead of from the beginning. Raises InputError for input that cannot be used. Ctrl-C, once the frames are
+    coming, ends it after the step that it is at: a snapshot and the map so far are written, then KeyboardInterrupt is
+    raised, which says so.
+    """
+    with ExitStack() as held:
+        return _Session(config, console or Console(quiet=True), held).run(resumed)
+
+
+class _Session:
+    """A run on its way, and what its stages share. held: takes what is to be closed at its end, however it ends."""
+
+    def __init__(self, config: SceneConfig, console: Console, held: ExitStack) -> None:
+        self.config = config
+        self.console = console
+        self.held = held
+        self.clock = RunClock()
+        self.record = RunRecord()
+        self.line = ProgressLine(console)
+        self.observer = self._open_observer()  # there before anything that takes minutes
+        self.stop = Interruption(lambda: self._print("stopping after this step; Ctrl-C again stops at once"))
+        try:
+            self.backend = initialise(config.device, config.threads, config.seed)
+        except RuntimeError as error:
+            raise InputError(str(error)) from None
+        self.record.device = describe(self.backend)
+        self._print(f"device: {self.record.device}")
+        # There once the first frame is.
+        self.tracker: Tracker
+        self.mapper: Mapper
+        self.checkpointer: Checkpointer
+
+    def run(self, resumed: Snapshot | None) -> Path:
+        """All of it; the output folder."""
+        self._map_the_stream(resumed)
+        self._say_which_frames_were_refused()
+        self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
+        versions = self._versions()
+        self.observer.on_stage("evaluating the saved map")
+        self._write(versions)
+        return self.config.output
+
+    # ---- the stream ------------------------------------------------------------------------------------------
+
+    def _map_the_stream(self, resumed: Snapshot | None) -> None:
+        """Open the tracker, make the mapper for its first frame, and map what comes; or what comes after `resumed`."""
+        tick = time.perf_counter()
+        self.tracker = open_tracker(self.config, self.line.prepare)
+        self.held.callback(self.tracker.close)
+        self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
+        with FramesAhead(self.tracker.events(), self.ahead) as arriving:
+            first = next(arriving, None)
+            if first is None:
+                raise InputError("the tracker delivered no frame: nothing to map")
+            if isinstance(first, PoseCorrection):
+                raise InputError("the tracker corrects poses before its first frame")
+            prepared = time.perf_counter() - tick
+            self._open_lpips(first.camera)
+            notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
+            self._say(*notes)
+            self.mapper = build_mapper(self.config, first.camera)
+            self.mapper.pipeline.stopwatch.seconds["track"] = prepared
+            with self.line.working("compiling kernels (the first time on this machine takes longest)"):
+                self.mapper.pipeline.compile()
+            rest: Iterator[TrackedFrame | PoseCorrection] = chain([first], arriving)
+            self._open_keeper(resumed, rest)
+            self.observer.begin(self.mapper, self.tracker.frame_count)
+            self.held.enter_context(self.stop)
+            self.clock.begin_mapping()
+            try:
+                self._map(rest)
+            except RunStopped:
+                raise self._stopped() from None
+            self.clock.end_mapping(self.observer.waited)
+        # How a live tracker's frames ended.
+        self._say(*(note for note in self.tracker.notes if note not in notes))
+
+    def _open_lpips(self, camera: PinholeCamera) -> None:
+        side = min(camera.width, camera.height)
+        self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
+
+    def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
+        """What takes the snapshots; with the map and the stream at the place where `resumed` was taken."""
+        self.checkpointer = checkpointer = Checkpointer(self.config, self.mapper, self.record, self.clock, self._say)
+        if resumed is not None:
+            with self.line.working(f"reading again what {resumed.path} was made of"):
+                replay(resumed, self.mapper, arriving, checkpointer.digest)
+            checkpointer.go_on_from(resumed)
+        elif checkpointer.path.exists():
+            self._say(f"{checkpointer.path} is of an earlier run: the first one of this run takes its place")
+
+    def _map(self, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
+        """Take in all frames and corrections, in their order, and finish the map. Raises RunStopped between two."""
+        mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
+        line.start_mapping(self.tracker.frame_count, "reading" if offline else "mapping", len(mapper.frames))
+        size = None
+        self.record.begin()
+        try:
+            for frame in _timed(arriving, mapper.pipeline.stopwatch, self.stop):
+                self.checkpointer.digest.add(frame)
+                if isinstance(frame, PoseCorrection):
+                    mapper.correct(frame)
+                    continue
+                size = size or (frame.camera.width, frame.camera.height)
+                if (frame.camera.width, frame.camera.height) != size:
+                    raise InputError(
+                        f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
+                        f"{size[0]}x{size[1]}: all images of a scene must have one size"
+                    )
+                report = mapper.add(frame)
+                line.frame(report)
+                self.record.frame(frame.index, report)
+                self.observer.on_frame(frame, report)
+                self.checkpointer.after_frame()
+            if offline:
+                line.start_offline(self.config.offline.steps)
+                mapper.finish(self._optimised)
+            else:
+                mapper.finish()
+            self.stop.check()
+        finally:
+            line.stop()
+
+    def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
+        """A step of the offline map is done."""
+        self.line.optimised(step, gaussians, psnr)
+        self.record.optimised(step, gaussians, psnr)
+        self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
+        self.stop.check()
+
+    def _say_which_frames_were_refused(self) -> None:
+        refused = [f"{count} {why}" for why, count in self._left_out().items() if count and why != "unreadable"]
+        if refused:
+            self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
+
+    def _left_out(self) -> dict[str, int]:
+        """How many frames did not touch the map because something is wrong with them, by what."""
+        return {"unreadable": len(self.tracker.unreadable), **self.mapper.pipeline.refused}
+
+    # ---- the finished map ------------------------------------------------------------------------------------
+
+    def _versions(self) -> dict[str, MapVersion]:
+        """The map as it was made, and as it is refined where it is to be; the last one is the run's."""
+        config, checkpointer = self.config, self.checkpointer
+        if len(self.mapper.pipeline.keyframes) == 0:
+            raise InputError(
+                f"no frame became a keyframe: none has {config.mapping.keyframes.min_points} tracked points; "
+                "give a tracker with points or lower mapping.keyframes.min_points"
+            )
+        versions = {config.mode: checkpointer.online or self.mapper.version()}
+        if config.refine.steps and config.mode != "offline":
+            try:
+                checkpointer.after_mapping()
+                checkpointer.online = versions[config.mode]
+                self._refine()
+            except RunStopped:
+                raise self._stopped() from None
+            versions["refined"] = self.mapper.version()
+        return versions
+
+    def _refine(self) -> None:
+        """Refine the map, or go on with it. Raises RunStopped between two steps."""
+        refine = self.config.refine
+        self.line.start_refining(refine.steps, self.checkpointer.refined)
+        try:
+            self.mapper.refine(refine.steps, refine, self._refined, self.checkpointer.refined)
+        finally:
+            self.line.stop()
+
+    def _refined(self, step: int, psnr: float) -> None:
+        """A step of refinement is done."""
+        steps = self.config.refine.steps
+        self.line.refined(step, psnr)
+        self.record.refined(step, psnr)
+        self.observer.on_step("refining", step, steps, psnr)
+        self.checkpointer.after_step(step, steps)
+        self.stop.check()
+
+    def _write(self, versions: dict[str, MapVersion]) -> None:
+        """Write the map, score it as a reader gets it, and write what came of it."""
+        pipeline = self.mapper.pipeline
+        results = Results(self.config, self.mapper.frames)
+        last = list(versions)[-1]
+        try:
+            with results.writing():
+                with self.line.working("writing the map"):
+                    versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
+                scores = self._score(versions, results)
+                metrics = None if scores is None else self._write_figures(scores, versions, results)
+        except InputError as error:
+            raise InputError(f"{error}{self.checkpointer.way_on()}") from None
+        if metrics is None:
+            results.remove_figures()
+            output = self.config.output
+            more = f"; modp-ti run --resume {output} scores it" if self.checkpointer.path.is_file() else ""
+            raise KeyboardInterrupt(f"interrupted: the finished map is in {output}, without its scores{more}")
+        self.checkpointer.remove()
+        self.line.summary(metrics)
+
+    def _score(self, versions: dict[str, MapVersion], results: Results) -> list[FrameScore] | None:
+        """Score all frames, and keep the last map's pictures; None where that was interrupted: the map is whole."""
+        last = list(versions)[-1]
+
+        def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+            self.stop.check()
+            self.line.evaluated()
+            if stage == last:
+                results.write_frame(frame, render)
+
+        self.line.start_evaluating(len(self.mapper.frames) * len(versions))
+        pipeline = self.mapper.pipeline
+        try:
+            with pipeline.stopwatch.measure("evaluate"), FramesAhead(self.tracker, self.ahead) as again:
+                return evaluate(pipeline, again, versions, self.lpips, keep)
+        except RunStopped:
+            return None
+        finally:
+            self.line.stop()
+
+    def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
+        """Write the scores, the metrics, which are returned, and the report."""
+        pipeline, frames, checkpointer = self.mapper.pipeline, self.mapper.frames, self.checkpointer
+        truth = self.tracker.ground_truth()
+        caught = pipeline.caught()
+        if warning := caught.warning():
+            self._say(warning)
+        metrics = {
+            "keyframes": len(pipeline.keyframes),
+            "gaussians": len(pipeline.gaussians),
+            "backend": self.backend,
+            "seed": self.config.seed,
+            "frames_per_second": round(len(frames) / self.clock.mapping, 4),
+            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "snapshots": {
+                "written": checkpointer.written,
+                "failed": checkpointer.failed,
+                "resumed": checkpointer.resumed,
+            },
+            "guards": caught.counts(),
+            "frames_left_out": self._left_out(),
+            "lpips_note": self.no_lpips,
+            "breakdown_percent": self.breakdown,
+            **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
+            **trajectory_errors(frames.T_tracked, list(versions.values())[-1].trajectory, truth),
+        }
+        results.write_scores(scores, metrics)
+        if self.config.export.report:
+            with self.line.working("writing the report"):
+                problem = results.write_report(self.record, metrics, scores, versions, pipeline.keyframes, truth)
+            if problem:
+                self._say(problem)
+        return metrics
+
+    # ---- beside it -------------------------------------------------------------------------------------------
+
+    def _stopped(self) -> KeyboardInterrupt:
+        """Leave a snapshot and the map so far; what is to be said of it."""
+        resumable = self.checkpointer.keep()
+        frames, keyframes, output = self.mapper.frames, self.mapper.pipeline.keyframes, self.config.output
+        said = f"interrupted after {len(frames)} frames"
+        if len(keyframes):
+            results = Results(self.config, frames)
+            try:
+                with results.writing():
+                    results.write_map(self.mapper.version(), keyframes, self.mapper.pipeline.near)
+            except InputError as error:
+                raise InputError(f"{error}{self.checkpointer.way_on()}") from None
+            results.remove_figures()
+            said += f"; the map so far is in {output}"
+        return KeyboardInterrupt(f"{said}; modp-ti run --resume {output} goes on" if resumable else said)
+
+    def _open_observer(self) -> Observer:
+        """The viewer where the scene asks for it."""
+        if not self.config.view.enabled:
+            return Unobserved()
+        # Imported here: viser is an extra.
+        from modp_ti.engine.live_viewer import LiveViewer
+
+        viewer = LiveViewer(self.config.view, self._say)
+        self.held.callback(viewer.close)
+        self._print(f"viewer: {viewer.url}")
+        return viewer
+
+    def _say(self, *notes: str) -> None:
+        """Show remarks, and keep them for the report."""
+        for note in notes:
+            self._print(f"note: {note}")
+            self.record.notes.append(note)
+
+    def _print(self, text: str) -> None:
+        self.console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
+    """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
+    settings = config.offline if config.mode == "offline" else config.mapping
+    try:
+        return Mapper(camera.width, camera.height, settings, config.seed)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def _timed(
+    frames: Iterator[TrackedFrame | PoseCorrection], watch: Stopwatch, stop: Interruption
+) -> Iterator[TrackedFrame | PoseCorrection]:
+    """The frames and corrections, the time that the mapper waits for each counted as reading."""
+    while True:
+        with watch.measure("read"), stop.waiting():
+            frame = next(frames, None)
+        if frame is None:
+            return
+        yield frame

@@ -1,0 +1,104 @@
+"""Going on from a snapshot: its settings, and the frames that it was made of, read again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.keys import as_yaml
+from modp_ti.config.old_settings import without_leftovers
+from modp_ti.config.scene_file import load_scene, scene_from_data
+from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.snapshots.digest import StreamDigest
+from modp_ti.engine.snapshots.file import FILE
+from modp_ti.engine.snapshots.snapshot import Snapshot
+from modp_ti.files.errors import InputError
+
+__all__ = ["load_resumed", "replay"]
+
+# Settings that may be others than they were: the map is the same.
+FREE = (
+    "output",
+    "threads",
+    "snapshot_every",
+    "source.prefetch",
+    "evaluation",
+    "export",
+    "view",
+)
+
+
+def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> tuple[SceneConfig, Snapshot]:
+    """The snapshot in the output folder, and the settings to go on with.
+
+    Those are the snapshot's own, or of a scene file where one is named, with the overrides. Raises InputError where
+    there is no snapshot, it cannot be used, or a setting that the map depends on is another one.
+    """
+    file = output / FILE
+    if not file.is_file():
+        if not output.is_dir():
+            raise InputError(f"{output}: no such folder (--resume): it is the output folder of a run")
+        if (output / "metrics.json").is_file():
+            raise InputError(f"{output}: the run there is finished, there is nothing to resume")
+        raise InputError(
+            f"{file}: there is no snapshot: start the run from its scene, with `snapshot_every` for next time"
+        )
+    snapshot = Snapshot.read(file)
+    if scene is None:
+        config = scene_from_data(snapshot.settings, str(file), overrides)
+    else:
+        config = load_scene(scene, overrides)
+    config = config.model_copy(update={"output": output.resolve()})
+    before, now = _leaves(without_leftovers(snapshot.settings)), _leaves(config.model_dump(mode="json"))
+    for key in [*now, *(key for key in before if key not in now)]:
+        if before.get(key) != now.get(key) and not any(key == free or key.startswith(f"{free}.") for free in FREE):
+            raise InputError(
+                f"{file}: is of another scene: its {key} is {as_yaml(before.get(key))}, here it is "
+                f"{as_yaml(now.get(key))}; resume with the settings that it was begun with"
+            )
+    return config, snapshot
+
+
+def _leaves(data: dict[str, Any], start: str = "") -> dict[str, Any]:
+    """Values by dotted keys."""
+    leaves: dict[str, Any] = {}
+    for key, value in data.items():
+        leaves |= _leaves(value, f"{start}{key}.") if isinstance(value, dict) else {f"{start}{key}": value}
+    return leaves
+
+
+def replay(
+    snapshot: Snapshot, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest
+) -> None:
+    """Take from the tracker what the snapshot was made of, and give the mapper back its state.
+
+    digest: fresh; it then stands where the snapshot was taken. Raises InputError where the tracker now delivers
+    something else, and for a snapshot whose parts do not fit.
+    """
+    position = snapshot.position
+
+    def frames() -> Iterator[TrackedFrame]:
+        while digest.events < position.events:
+            event = next(arriving, None)
+            if event is None:
+                raise _changed(snapshot, f"it ended after {digest.events} of {position.events} frames")
+            digest.add(event)
+            if isinstance(event, TrackedFrame) and not event.held_out:
+                yield event
+
+    with snapshot.fitting():
+        mapper.restore(snapshot.map, snapshot.frames(), frames(), position.finished)
+        mapper.pipeline.stopwatch.seconds |= snapshot.numbers["watch"]
+    if digest.value != position.digest:
+        raise _changed(snapshot, "its images, poses or points are others")
+
+
+def _changed(snapshot: Snapshot, how: str) -> InputError:
+    return InputError(
+        f"{snapshot.path}: the input is not what the snapshot was made of: {how}; put it back, or start the run from "
+        "its scene"
+    )

@@ -1,0 +1,165 @@
+"""`Snapshot`: everything that a stopped run needs to go on, as arrays and numbers, and the run's parts from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.engine.snapshots.file import read_arrays, write_arrays
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.outputs.evaluation import MapVersion
+from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
+from pipelines.state import MapState
+
+__all__ = ["Position", "Snapshot"]
+
+UNKNOWN = np.full((3, 4), np.nan)
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where in the run it was taken. events: frames and corrections that the tracker had delivered; digest: of them.
+
+    finished: whether the map had had what follows its last frame. refined: steps of refinement.
+    """
+
+    events: int
+    digest: int
+    finished: bool = False
+    refined: int = 0
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """settings: the run's, resolved, as JSON. groups: arrays by names `group.name`. numbers: what JSON can hold.
+
+    path: where it lies, for messages.
+    """
+
+    path: Path
+    settings: dict[str, Any]
+    position: Position
+    arrays: dict[str, NDArray]
+    numbers: dict[str, Any]
+
+    @property
+    def map(self) -> MapState:
+        return MapState(self.arrays, self.numbers["map"])
+
+    def write(self) -> None:
+        """Write it in place of the one before. Raises OSError where it cannot be written."""
+        about = {"settings": self.settings, "position": asdict(self.position), "numbers": self.numbers}
+        write_arrays(self.path, self.arrays, about)
+
+    @classmethod
+    def read(cls, path: Path) -> Snapshot:
+        """The snapshot of that file. Raises InputError (one line) where it cannot be used."""
+        arrays, about = read_arrays(path)
+        try:
+            position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise _unfit(path, error) from None
+        return cls(path, settings, position, arrays, numbers)
+
+    @contextmanager
+    def fitting(self) -> Iterator[None]:
+        """While its parts are put to use: what does not fit together is refused in one line, as InputError."""
+        try:
+            yield
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise _unfit(self.path, error) from None
+
+    def frames(self) -> DeliveredFrames:
+        """What had been kept of the frames. Raises KeyError or ValueError where it is not whole."""
+        state = MapState(self.arrays, self.numbers["frames"])
+        rows, points = state.group("frames"), state.group("points")
+        frames = DeliveredFrames(
+            index=rows["index"].tolist(),
+            name=list(state.numbers["name"]),
+            timestamp=rows["timestamp"].tolist(),
+            camera=[PinholeCamera(*row[:4], int(row[4]), int(row[5])) for row in rows["camera"].tolist()],
+            held_out=rows["held_out"].tolist(),
+            T_tracked=list(rows["T_tracked"]),
+            corrections=dict(state.numbers["corrections"]),
+        )
+        frames.points.restore(points, frames.held_out)
+        if {len(part) for part in (frames.name, frames.timestamp, frames.camera, frames.T_tracked)} != {len(frames)}:
+            raise ValueError("the frames' names, times, cameras and poses differ in number")
+        return frames
+
+    def online(self) -> MapVersion | None:
+        """The map as it was before refinement; None where that had not begun."""
+        state = MapState(self.arrays, self.numbers["online"] or {})
+        gaussians, poses = state.group("online"), state.group("online_poses")
+        if not gaussians:
+            return None
+        exposures = [None if np.isnan(row).all() else row for row in poses["exposure"]]
+        return MapVersion(gaussians, list(poses["T"]), exposures, int(state.numbers["view_renders"]))
+
+    def record(self, record: RunRecord) -> None:
+        """Put what had been noted so far into a fresh record."""
+        state = MapState(self.arrays, {})
+        rows = state.group("record")
+        columns = [rows[name].tolist() for name in ("index", "held_out", "is_keyframe", "done", "gaussians")]
+        psnr = [None if np.isnan(value) else float(value) for value in rows["psnr"]]
+        record.frames = [FrameNote(*row) for row in zip(*columns, psnr, strict=True)]
+        steps = state.group("record_steps")
+        pairs = zip(steps["step"].tolist(), steps["psnr"].tolist(), strict=True)
+        record.steps = [StepNote(step, value) for step, value in pairs]
+        record.started = float(self.numbers["started"])
+
+
+def _unfit(path: Path, error: Exception) -> InputError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return InputError(f"{path}: does not fit together ({reason}); start the run from its scene")
+
+
+def frames_state(frames: DeliveredFrames) -> MapState:
+    """What `Snapshot.frames` gives back."""
+    cameras = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in frames.camera]
+    rows = {
+        "index": np.array(frames.index, dtype=np.int64),
+        "timestamp": np.array(frames.timestamp, dtype=np.float64),
+        "camera": np.array(cameras, dtype=np.float64).reshape(-1, 6),
+        "held_out": np.array(frames.held_out, dtype=bool),
+        "T_tracked": np.array(frames.T_tracked, dtype=np.float64).reshape(-1, 4, 4),
+    }
+    numbers = {"name": frames.name, "corrections": frames.corrections}
+    return MapState.of({"frames": rows, "points": frames.points.state()}, numbers)
+
+
+def version_state(version: MapVersion | None) -> MapState:
+    """What `Snapshot.online` gives back."""
+    if version is None:
+        return MapState({}, {})
+    poses = {
+        "T": np.array(version.trajectory).reshape(-1, 4, 4),
+        "exposure": np.array([UNKNOWN if e is None else e for e in version.exposures]).reshape(-1, 3, 4),
+    }
+    return MapState.of({"online": version.gaussians, "online_poses": poses}, {"view_renders": version.view_renders})
+
+
+def record_state(record: RunRecord) -> MapState:
+    """What `Snapshot.record` gives back."""
+    notes = record.frames
+    rows = {
+        "index": np.array([note.index for note in notes], dtype=np.int64),
+        "held_out": np.array([note.held_out for note in notes], dtype=bool),
+        "is_keyframe": np.array([note.is_keyframe for note in notes], dtype=bool),
+        "done": np.array([note.done for note in notes], dtype=np.float64),
+        "gaussians": np.array([note.gaussians for note in notes], dtype=np.int64),
+        "psnr": np.array([np.nan if note.psnr is None else note.psnr for note in notes], dtype=np.float64),
+    }
+    steps = {
+        "step": np.array([note.step for note in record.steps], dtype=np.int64),
+        "psnr": np.array([note.psnr for note in record.steps], dtype=np.float64),
+    }
+    return MapState.of({"record": rows, "record_steps": steps}, {})

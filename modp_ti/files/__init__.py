@@ -1,0 +1,19 @@
+"""How files that somebody else wrote are read: what is not a file is refused, and nothing is allocated on its word."""
+
+from __future__ import annotations
+
+from modp_ti.files.json_text import parse_json, read_json
+from modp_ti.files.reading import LARGEST, exists, is_file, limited_lines, open_file, read_bytes, read_text, text_lines
+
+__all__ = [
+    "LARGEST",
+    "exists",
+    "is_file",
+    "limited_lines",
+    "open_file",
+    "parse_json",
+    "read_bytes",
+    "read_json",
+    "read_text",
+    "text_lines",
+]

@@ -1,0 +1,118 @@
+"""Columns of a CSV file with a header, plain or gzipped, read block by block: files of MPS have millions of rows."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files import LARGEST, limited_lines, open_file
+from modp_ti.files.errors import InputError
+
+__all__ = ["read_csv_blocks"]
+
+BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows
+# A gzip file may unpack to so many bytes, and beyond that to so many times its size; those of MPS do to 3 to 10 times.
+UNPACKED_AT_LEAST = 1 << 22
+MOST_SHRUNK = 25
+
+
+def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
+    """Line of the first row (from 1), and the rows as a structured array with these columns, block by block.
+
+    columns: name and numpy type of what is wanted; the file may hold others, in any order. Raises InputError with file
+    and line for a header without one of them, a row of another length, and a value that is none or not finite; with the
+    file for one that is cut off.
+    """
+    try:
+        with open_file(path) as stored:
+            unpacked = _Unpacked(path, stored) if path.suffix == ".gz" else stored
+            with io.TextIOWrapper(unpacked, encoding="utf-8") as file:
+                yield from _blocks(path, limited_lines(file), columns)
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        raise InputError(f"{path}: the gzip file is cut off or damaged; copy it again") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: holds bytes that are no text") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+class _Unpacked(gzip.GzipFile):
+    """The content of a gzip file, up to what tables of numbers shrink by: a small file may unpack to any size."""
+
+    def __init__(self, path: Path, stored: BinaryIO) -> None:
+        super().__init__(fileobj=stored, mode="rb")
+        self._path = path
+        self._left = UNPACKED_AT_LEAST + MOST_SHRUNK * os.fstat(stored.fileno()).st_size
+
+    def read1(self, size: int = -1) -> bytes:
+        data = super().read1(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise InputError(
+                f"{self._path}: unpacks to more than {MOST_SHRUNK} times its size, which is no table of numbers; "
+                "copy it again"
+            )
+        return data
+
+
+def _blocks(path: Path, file: Iterator[str], columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
+    header = [name.strip() for name in next(file, "").lstrip("\ufeff").strip().split(",")]
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise InputError(f"{path}:1: the header has no column {', '.join(missing)}")
+    places = [header.index(name) for name in columns]
+    kinds = np.dtype(list(columns.items()))
+    line = 2
+    while rows := _taken(file):
+        # The last row of a file that was cut off is shorter, or has no end.
+        for number, row in enumerate(rows, start=line):
+            if row.count(",") != len(header) - 1:
+                raise InputError(
+                    f"{path}:{number}: holds {row.count(',') + 1} columns, the header {len(header)}; "
+                    "the file is cut off or damaged"
+                )
+        try:
+            table = np.loadtxt(rows, dtype=kinds, delimiter=",", usecols=places, comments=None, ndmin=1)
+        except (ValueError, OverflowError):
+            number, name, value = _first_bad_value(rows, columns, places)
+            raise InputError(f"{path}:{line + number}: {name} is {value!r:.40}, not a number") from None
+        for name in columns:
+            if table.dtype[name].kind == "f" and not (np.abs(table[name]) <= LARGEST).all():
+                number = int(np.flatnonzero(~(np.abs(table[name]) <= LARGEST))[0])
+                raise InputError(
+                    f"{path}:{line + number}: {name} is NaN or infinite, or beyond {LARGEST:g}; take the line out"
+                )
+        yield line, table
+        line += len(rows)
+
+
+def _taken(file: Iterator[str]) -> list[str]:
+    """The next rows: BLOCK of them, or fewer of long ones."""
+    rows, room = [], BLOCK_CHARACTERS
+    for row in islice(file, BLOCK):
+        rows.append(row)
+        room -= len(row)
+        if room < 0:
+            break
+    return rows
+
+
+def _first_bad_value(rows: list[str], columns: Mapping[str, str], places: list[int]) -> tuple[int, str, str]:
+    """Row, column and text of the first value that is not of its column's type."""
+    for number, row in enumerate(rows):
+        words = row.strip().split(",")
+        for (name, kind), place in zip(columns.items(), places, strict=True):
+            try:
+                np.array(words[place].strip()).astype(kind)
+            except (ValueError, OverflowError):
+                return number, name, words[place]
+    return 0, "the row", rows[0].strip()

@@ -1,0 +1,84 @@
+"""JSON, with its structure looked over before anything is made of it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from modp_ti.files.errors import InputError
+from modp_ti.files.reading import read_text
+
+__all__ = ["parse_json", "read_json"]
+
+MAX_DEPTH = 64
+# Brackets, what opens and closes strings, in which brackets do not count, and what is escaped there.
+TOKEN = re.compile(r'\\.|["\[{\]}]', re.DOTALL)
+# What half a character of UTF-16 looks like; whole ones are pairs of them.
+HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
+CLOSES = {"]": "[", "}": "{"}
+# Digits of a whole number that is kept as one; longer ones become floats.
+DIGITS = 18
+
+
+def read_json(path: Path, setting: str) -> Any:
+    """The data of a file, as `parse_json`. setting: the key that named it, for the message where it cannot be read."""
+    try:
+        text = read_text(path, "utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+        raise InputError(f"{path}: cannot be read as text: {reason} ({setting})") from None
+    return parse_json(text, str(path))
+
+
+def parse_json(text: str, name: str, line: int | None = None) -> Any:
+    """The data in a text. name: of the file, and line: where the text stands in it, for the message.
+
+    Numbers beyond float64 become infinite, as `NaN` and `Infinity` are let through: who reads them judges them. Raises
+    InputError, with the line, for text that is no JSON, is cut off, or nested deeper than MAX_DEPTH.
+    """
+    first = 1 if line is None else line
+    _require_structure(text, name, first)
+    try:
+        data = json.loads(text, parse_int=_whole_number)
+        if HALF_CHARACTER.search(text):
+            json.dumps(data, ensure_ascii=False).encode()
+        return data
+    except json.JSONDecodeError as error:
+        raise _invalid(name, first + error.lineno - 1, error.msg) from None
+    except UnicodeEncodeError:
+        raise _invalid(name, first, "it holds half a character (a surrogate)") from None
+    except (ValueError, RecursionError) as error:
+        raise _invalid(name, first, str(error)) from None
+
+
+def _require_structure(text: str, name: str, first: int) -> None:
+    open_brackets: list[str] = []
+    in_string = False
+    for token in TOKEN.finditer(text):
+        kind = token[0]
+        if kind == '"':
+            in_string = not in_string
+        elif in_string:
+            continue
+        elif kind in "[{":
+            open_brackets.append(kind)
+            if len(open_brackets) > MAX_DEPTH:
+                raise _invalid(name, first + text.count("\n", 0, token.start()), f"nested deeper than {MAX_DEPTH}")
+        elif kind in CLOSES:
+            if not open_brackets or open_brackets.pop() != CLOSES[kind]:
+                raise _invalid(name, first + text.count("\n", 0, token.start()), f"a {kind} that closes nothing")
+    last = first + text.count("\n", 0, len(text.rstrip()))
+    if in_string:
+        raise _invalid(name, last, "it ends before its last string is closed")
+    if open_brackets:
+        raise _invalid(name, last, f"it ends before its last {open_brackets[-1]} is closed")
+
+
+def _invalid(name: str, line: int, reason: str) -> InputError:
+    return InputError(f"{name}:{line}: not valid JSON: {reason}; the file is cut off or damaged")
+
+
+def _whole_number(digits: str) -> int | float:
+    return int(digits) if len(digits) <= DIGITS else float(digits)

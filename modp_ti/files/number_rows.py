@@ -1,0 +1,81 @@
+"""Tables of numbers as text: one row a line, `#` comments, columns parted by blanks or commas."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files import LARGEST, text_lines
+from modp_ti.files.errors import InputError
+
+__all__ = ["NumberRows", "read_number_rows"]
+
+
+@dataclass(frozen=True)
+class NumberRows:
+    """values: (N, columns). lines: (N,) line of the file that each row stands in, from 1."""
+
+    path: Path
+    values: NDArray[np.float64]
+    lines: NDArray[np.int64]
+    left_out: int = 0
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def where(self, row: int) -> str:
+        """File and line of a row, for messages."""
+        return f"{self.path}:{self.lines[row]}"
+
+
+def _lines(path: Path, setting: str) -> Iterator[str]:
+    """Lines of a text file. setting: the key that named it, for the message of the InputError where it cannot be."""
+    try:
+        yield from text_lines(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file ({setting})") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+        raise InputError(f"{path}: cannot be read as text: {reason} ({setting})") from None
+
+
+def read_number_rows(
+    path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False, few: float = 0.0
+) -> NumberRows:
+    """The rows of a file whose lines hold `columns` finite numbers each; with `more`, what follows them is ignored.
+
+    meaning: the columns in words, for messages. few: share of the rows that may hold NaN or infinity, and are then left
+    out. Raises InputError with file and line for anything else, and for a file
+    without a row.
+    """
+    values, lines = array("d"), array("q")
+    bad: list[int] = []
+    for number, line in enumerate(_lines(path, setting), start=1):
+        words = line.split("#", 1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        if len(words) < columns or (len(words) > columns and not more):
+            raise InputError(f"{path}:{number}: holds {len(words)} columns instead of {columns}: {meaning}")
+        try:
+            row = [float(word) for word in words[:columns]]
+        except ValueError:
+            raise InputError(f"{path}:{number}: not a row of numbers: {meaning}") from None
+        if not all(map(math.isfinite, row)):
+            bad.append(number)
+            continue
+        if max(map(abs, row)) > LARGEST:
+            raise InputError(f"{path}:{number}: holds a number beyond {LARGEST:g}; the file is damaged")
+        values.extend(row)
+        lines.append(number)
+    if len(bad) > few * (len(lines) + len(bad)):
+        raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers; take the line out")
+    if not lines:
+        raise InputError(f"{path}: holds no row of {meaning} ({setting})")
+    rows = np.frombuffer(values).reshape(-1, columns)
+    return NumberRows(path, rows, np.frombuffer(lines, dtype=np.int64), len(bad))

@@ -1,0 +1,91 @@
+"""How poses and intrinsics may have been meant: as they stand, or in one of the ways in which they often go wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3
+
+__all__ = ["CONVENTIONS", "STATED", "Convention"]
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Convention:
+    """A reading of the same numbers.
+
+    inverse: they are camera to world where world to camera was taken, or the other way round. opengl: their camera axes
+    are y up, z back. intrinsics: factor that they need. fault, mend: what is wrong if this one fits, and what to do.
+    """
+
+    name: str
+    inverse: bool = False
+    opengl: bool = False
+    intrinsics: float = 1.0
+    focal: float = 1.0
+    fault: str = ""
+    mend: str = ""
+
+    def pose(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The true pose (4, 4), up to a turn of the world, if the given one is to be read so."""
+        T = inverse_se3(T_camera_world) if self.inverse else T_camera_world
+        return OPENGL @ T if self.opengl else T
+
+    def camera(self, camera: PinholeCamera) -> PinholeCamera:
+        """The true camera of the same image."""
+        f, c = self.intrinsics * self.focal, self.intrinsics
+        return replace(camera, fx=f * camera.fx, fy=f * camera.fy, cx=c * camera.cx, cy=c * camera.cy)
+
+
+STATED = Convention("as stated")
+CONVENTIONS = (
+    STATED,
+    Convention(
+        "inverse poses",
+        inverse=True,
+        fault="the poses are inverted: they fit the images as their inverses",
+        mend="give the other direction: invert every pose (camera to world and world to camera are exchanged)",
+    ),
+    Convention(
+        "OpenGL axes",
+        opengl=True,
+        fault="the poses have OpenGL axes (y up, z back) where OpenCV axes are expected, or the other way round",
+        mend="multiply every camera-to-world matrix by diag(1, -1, -1, 1) from the right",
+    ),
+    Convention(
+        "inverse poses with OpenGL axes",
+        inverse=True,
+        opengl=True,
+        fault="the poses are inverted, and their axes are OpenGL's (y up, z back) where OpenCV's are expected",
+        mend="invert every pose, and negate the second and third row of the world-to-camera matrix",
+    ),
+    Convention(
+        "intrinsics of half the size",
+        intrinsics=2.0,
+        fault="the intrinsics belong to images of half the size",
+        mend="multiply fx, fy, cx and cy by 2, or give the images that they were made for",
+    ),
+    Convention(
+        "intrinsics of twice the size",
+        intrinsics=0.5,
+        fault="the intrinsics belong to images of twice the size",
+        mend="multiply fx, fy, cx and cy by 0.5, or give the images that they were made for",
+    ),
+    Convention(
+        "half the focal length",
+        focal=2.0,
+        fault="the focal length is half of what fits (the principal point is right)",
+        mend="multiply fx and fy by 2",
+    ),
+    Convention(
+        "twice the focal length",
+        focal=0.5,
+        fault="the focal length is twice what fits (the principal point is right)",
+        mend="multiply fx and fy by 0.5",
+    ),
+)

@@ -1,0 +1,90 @@
+"""Blurred and repeated pictures, gaps in time, leaps of the camera: what is odd about the frames one after another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.inputs.inspection.finding import Finding, Severity
+from modp_ti.inputs.inspection.survey import FrameRecord
+
+__all__ = ["blurred", "centres", "duplicates", "judge_sequence", "time_gaps"]
+
+# A frame is blurred where it is so much less sharp than the median of those around it (as keyframe selection has it).
+BLURRED = 0.75
+AROUND = 7
+# Mean difference of thumbnails [grey levels] up to which two pictures are the same, encoded twice.
+SAME = 0.2
+# A gap is so many times the usual time between frames.
+GAP = 3.0
+# Shares of the frames from which on these are worth a warning.
+MANY_BLURRED, MANY_DUPLICATES = 0.2, 0.1
+NAMED = 5  # frames that a finding names
+
+
+def blurred(frames: Sequence[FrameRecord]) -> list[int]:
+    """Places of frames that are less sharp than their surroundings."""
+    sharp = np.array([frame.sharpness for frame in frames])
+    result = []
+    for i, value in enumerate(sharp):
+        around = np.delete(sharp[max(0, i - AROUND) : i + AROUND + 1], min(i, AROUND))
+        if len(around) and value < BLURRED * np.median(around):
+            result.append(i)
+    return result
+
+
+def duplicates(frames: Sequence[FrameRecord]) -> list[int]:
+    """Places of frames whose picture is that of the frame before."""
+    return [i for i, frame in enumerate(frames) if frame.change < SAME]
+
+
+def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
+    """Places of frames that come much later after the one before than is usual."""
+    steps = np.diff([frame.timestamp for frame in frames])
+    if len(steps) == 0 or np.median(steps) <= 0:
+        return []
+    return (np.flatnonzero(steps > GAP * np.median(steps)) + 1).tolist()
+
+
+def centres(frames: Sequence[FrameRecord]) -> NDArray[np.float64]:
+    """Where the cameras stand in the world (N, 3)."""
+    return np.array([-f.T_camera_world[:3, :3].T @ f.T_camera_world[:3, 3] for f in frames])
+
+
+def judge_sequence(frames: Sequence[FrameRecord]) -> list[Finding]:
+    """Findings on sizes, times and pictures."""
+    findings = []
+    sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
+    if len(sizes) > 1:
+        text = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        findings.append(
+            Finding(Severity.UNUSABLE, "sizes", f"images of several sizes: {text}", "all of a scene must have one size")
+        )
+    back = np.flatnonzero(np.diff([frame.timestamp for frame in frames]) <= 0)
+    if len(back):
+        text = f"time does not go on at {len(back)} frames: {_names(frames, back + 1)}"
+        findings.append(Finding(Severity.WARNING, "time_order", text, "sort the frames by time, or mend the times"))
+    gaps = time_gaps(frames)
+    if gaps:
+        text = f"{len(gaps)} gaps in time, before {_names(frames, gaps)}"
+        findings.append(Finding(Severity.NOTE, "time_gaps", text))
+    found = blurred(frames)
+    if found:
+        many = len(found) > MANY_BLURRED * len(frames)
+        text = f"{len(found)} of {len(frames)} frames are blurred: {_names(frames, found)}"
+        mend = "record slower or with more light, or leave these frames out" if many else ""
+        findings.append(Finding(Severity.WARNING if many else Severity.NOTE, "blurred", text, mend))
+    found = duplicates(frames)
+    if found:
+        many = len(found) > MANY_DUPLICATES * len(frames)
+        text = f"{len(found)} of {len(frames)} frames repeat the one before: {_names(frames, found)}"
+        mend = "take them out, or use source.step" if many else ""
+        findings.append(Finding(Severity.WARNING if many else Severity.NOTE, "duplicates", text, mend))
+    return findings
+
+
+def _names(frames: Sequence[FrameRecord], places: Sequence[int] | NDArray[np.int64]) -> str:
+    names = [frames[int(i)].name for i in places[:NAMED]]
+    return ", ".join(names) + (f" and {len(places) - NAMED} more" if len(places) > NAMED else "")

@@ -1,0 +1,147 @@
+"""An inspection as tables for a person and as JSON for a machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from modp_ti.inputs.inspection.conventions import CONVENTIONS
+from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
+from modp_ti.inputs.inspection.geometry import Geometry
+from modp_ti.inputs.inspection.pictures import blurred, duplicates, time_gaps
+from modp_ti.inputs.inspection.scale import Scale
+from modp_ti.inputs.inspection.survey import FrameRecord
+
+__all__ = ["Report", "as_json", "print_report"]
+
+SIGNS = {Severity.NOTE: "note", Severity.WARNING: "[yellow]warning[/]", Severity.UNUSABLE: "[red]unusable[/]"}
+
+
+@dataclass
+class Report:
+    """What was found. Empty but for findings where the input could not be read.
+
+    lens: the distortion, in words. notes: the tracker's own.
+    """
+
+    frames: Sequence[FrameRecord] = ()
+    geometry: Geometry | None = None
+    scale: Scale | None = None
+    lens: str = ""
+    notes: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """Plain data; numbers that are not finite are null."""
+    word, code = verdict(report.findings)
+    data: dict[str, Any] = {
+        "verdict": word,
+        "exit_code": code,
+        "findings": [
+            {"severity": f.severity.value, "code": f.code, "text": f.text, "mend": f.mend} for f in report.findings
+        ],
+        "notes": report.notes,
+    }
+    if report.geometry is None or report.scale is None:
+        return data
+    frames = report.frames
+    camera = frames[0].camera
+    points = np.array([frame.points for frame in frames])
+    steps = np.diff([frame.timestamp for frame in frames])
+    data |= {
+        "frames": len(frames),
+        "held_out": sum(frame.held_out for frame in frames),
+        "size": [camera.width, camera.height],
+        "intrinsics": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
+        "cameras": len({frame.camera for frame in frames}),
+        "lens": report.lens,
+        "masked": _number(np.mean([frame.masked for frame in frames])),
+        "seconds": _number(frames[-1].timestamp - frames[0].timestamp),
+        "seconds_between_frames": _number(np.median(steps)) if len(steps) else None,
+        "time_gaps": [frames[i].name for i in time_gaps(frames)],
+        "blurred": [frames[i].name for i in blurred(frames)],
+        "duplicates": [frames[i].name for i in duplicates(frames)],
+        "points": {"median": int(np.median(points)), "least": int(points.min()), "most": int(points.max())},
+        "scale": {
+            "depth": _number(report.scale.depth),
+            "step": _number(report.scale.step),
+            "longest_step": _number(report.scale.longest),
+            "extent": _number(report.scale.extent),
+        },
+        "conventions": [
+            {
+                "name": c.name,
+                "features_fit": _number(report.geometry.epipolar[c].share),
+                "epipolar_error": _number(report.geometry.epipolar[c].error),
+                "reprojection_error": _number(report.geometry.reprojection[c]) if report.geometry.points else None,
+            }
+            for c in CONVENTIONS
+        ],
+        "matched_features": report.geometry.epipolar[CONVENTIONS[0]].matches,
+        "observations": report.geometry.points,
+    }
+    return data
+
+
+def print_report(report: Report, console: Console) -> None:
+    """Tables, findings with their mends, and the verdict in the last line."""
+    data = as_json(report)
+    for note in report.notes:
+        console.print(f"note: {note}", highlight=False, soft_wrap=True, markup=False)
+    if "frames" in data:
+        console.print(_overview(data))
+        console.print(_conventions(data))
+    for finding in report.findings:
+        console.print(f"{SIGNS[finding.severity]}: ", end="", highlight=False)
+        console.print(finding.text, highlight=False, soft_wrap=True, markup=False)
+        if finding.mend:
+            console.print(f"    -> {finding.mend}", highlight=False, soft_wrap=True, markup=False)
+    console.print(f"verdict: {data['verdict']}", highlight=False)
+
+
+def _overview(data: dict[str, Any]) -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    k, s, p = data["intrinsics"], data["scale"], data["points"]
+    rows = {
+        "frames": f"{data['frames']}, {data['held_out']} held out",
+        "size": "{}x{}".format(*data["size"]),
+        "intrinsics": "fx {fx:.2f}  fy {fy:.2f}  cx {cx:.2f}  cy {cy:.2f}".format(**k)
+        + (f"  ({data['cameras']} cameras)" if data["cameras"] > 1 else ""),
+        "lens": data["lens"],
+        "masked": f"{data['masked']:.1%} of the pixels",
+        "time": f"{data['seconds']:.2f} s, {len(data['time_gaps'])} gaps",
+        "pictures": f"{len(data['blurred'])} blurred, {len(data['duplicates'])} repeated",
+        "points a frame": f"{p['median']} (median), {p['least']} to {p['most']}",
+        "scene": f"depth {_shown(s['depth'])} units; the camera moves by {_shown(s['step'])} depths a frame "
+        f"(at most {_shown(s['longest_step'])}), over {_shown(s['extent'])} in all",
+    }
+    for name, text in rows.items():
+        if text:
+            table.add_row(name, text)
+    return table
+
+
+def _conventions(data: dict[str, Any]) -> Table:
+    table = Table(caption=f"{data['matched_features']:,} matched features, {data['observations']:,} observed points")
+    table.add_column("poses and intrinsics", no_wrap=True)
+    for heading in ("features fit", "epipolar error [px]", "points' error [px]"):
+        table.add_column(heading, justify="right")
+    for row in data["conventions"]:
+        share = "–" if row["features_fit"] is None or not data["matched_features"] else f"{row['features_fit']:.0%}"
+        table.add_row(row["name"], share, _shown(row["epipolar_error"]), _shown(row["reprojection_error"]))
+    return table
+
+
+def _shown(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def _number(value: float) -> float | None:
+    return float(f"{float(value):.6g}") if math.isfinite(value) else None

@@ -1,0 +1,126 @@
+"""Points, depths, the way of the camera, and intrinsics: whether there is enough to map from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from modp_ti.inputs.inspection.finding import Finding, Severity
+from modp_ti.inputs.inspection.pictures import centres
+from modp_ti.inputs.inspection.survey import FrameRecord
+
+__all__ = ["Scale", "judge_scale", "measure_scale"]
+
+# The camera's whole way, in depths of the scene, below which nothing has parallax.
+LEAST_WAY = 0.01
+# A step, in depths of the scene, after which hardly anything is seen twice.
+LONG_STEP = 0.5
+# Of the image's size: how far a principal point may be from its middle.
+OFF_CENTRE = 0.15
+# Ratio of focal lengths that no camera with square pixels has.
+ANAMORPHIC = 1.1
+FIELD_OF_VIEW = (20.0, 130.0)  # [degrees] across, of cameras that are not suspicious
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How deep the scene is, and how far the camera goes in it.
+
+    depth: median over the frames of the median depth of their points [scene units], NaN without points. In depths:
+    step, the median way between frames; longest, the greatest; extent, the diagonal of the box of all camera centres.
+    """
+
+    depth: float
+    step: float
+    longest: float
+    extent: float
+
+
+def measure_scale(frames: Sequence[FrameRecord]) -> Scale:
+    """The figures of one frame at least."""
+    depths = np.array([frame.depth for frame in frames])
+    depth = float(np.nanmedian(depths)) if np.isfinite(depths).any() else float("nan")
+    places = centres(frames)
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1) / depth
+    extent = float(np.linalg.norm(np.ptp(places, axis=0)) / depth)
+    if len(steps) == 0:
+        return Scale(depth, 0.0, 0.0, extent)
+    return Scale(depth, float(np.median(steps)), float(steps.max()), extent)
+
+
+def judge_scale(frames: Sequence[FrameRecord], scale: Scale, min_points: int) -> list[Finding]:
+    """Findings on points and camera. min_points: that a keyframe needs."""
+    findings = []
+    mapped = [frame for frame in frames if not frame.held_out]
+    poor = [frame for frame in mapped if frame.points < min_points]
+    if len(poor) == len(mapped):
+        findings.append(
+            Finding(
+                Severity.UNUSABLE,
+                "points",
+                f"no frame has {min_points} tracked points: none can become a keyframe",
+                "if poses or intrinsics are wrong, mend these first; else give a tracker with points, or lower "
+                "mapping.keyframes.min_points",
+            )
+        )
+    elif poor:
+        severity = Severity.WARNING if len(poor) > 0.5 * len(mapped) else Severity.NOTE
+        text = f"{len(poor)} of {len(mapped)} frames have fewer than {min_points} tracked points"
+        findings.append(Finding(severity, "points", text))
+    if np.isfinite(scale.depth) and scale.extent < LEAST_WAY:
+        findings.append(
+            Finding(
+                Severity.WARNING,
+                "no_parallax",
+                f"the camera moves by only {scale.extent:.2g} of the scene's depth: nothing is seen from two sides",
+                "move the camera, not only turn it; if it did move, the poses' scale is not that of the points",
+            )
+        )
+    if np.isfinite(scale.depth) and scale.longest > LONG_STEP:
+        findings.append(
+            Finding(
+                Severity.NOTE,
+                "long_steps",
+                f"the camera moves by up to {scale.longest:.2g} of the scene's depth between two frames",
+            )
+        )
+    findings += _judge_camera(frames[0])
+    return findings
+
+
+def _judge_camera(frame: FrameRecord) -> list[Finding]:
+    c = frame.camera
+    findings = []
+    off = max(abs(c.cx / c.width - 0.5), abs(c.cy / c.height - 0.5))
+    if off > OFF_CENTRE:
+        findings.append(
+            Finding(
+                Severity.WARNING,
+                "principal_point",
+                f"the principal point ({c.cx:.1f}, {c.cy:.1f}) is far from the middle of {c.width}x{c.height} pixels",
+                "check that the intrinsics are of images of this size, and cx and cy not exchanged",
+            )
+        )
+    ratio = max(c.fx / c.fy, c.fy / c.fx)
+    if ratio > ANAMORPHIC:
+        findings.append(
+            Finding(
+                Severity.WARNING,
+                "focal_lengths",
+                f"fx {c.fx:.1f} and fy {c.fy:.1f} differ by {100 * (ratio - 1):.0f} %",
+                "check that the images were not stretched",
+            )
+        )
+    view = 2 * np.degrees(np.arctan(0.5 * c.width / c.fx))
+    if not FIELD_OF_VIEW[0] <= view <= FIELD_OF_VIEW[1]:
+        findings.append(
+            Finding(
+                Severity.WARNING,
+                "field_of_view",
+                f"the camera sees {view:.0f} degrees across",
+                "check the focal length",
+            )
+        )
+    return findings

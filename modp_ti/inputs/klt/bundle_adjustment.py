@@ -1,0 +1,65 @@
+"""Bundle adjustment of some keyframes of a map, others held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from modp_ti.inputs.klt.landmark_map import LandmarkMap
+from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.multiview.bundle_adjustment import adjusted_bundle
+
+__all__ = ["adjust_bundle"]
+
+
+def adjust_bundle(
+    landmarks: LandmarkMap,
+    free: Sequence[int],
+    held: Sequence[int] = (),
+    steps: int = 10,
+    focal: bool = False,
+    distortion: bool = False,
+) -> float:
+    """Moves the keyframes `free` and the landmarks that they see, to the least robust reprojection error.
+
+    held: keyframes that take part where they are; where there is none, the first two of `free` hold the world.
+    steps: Levenberg-Marquardt steps at most. focal, distortion: whether these of the camera are refined too.
+    Returns the mean cost of an observation [px^2 / 2], infinite where there is nothing to adjust.
+    """
+    views = sorted({*free, *held})
+    of, slot, ids = landmarks.observations(views)
+    free_mask = np.zeros(len(landmarks.keyframes), dtype=bool)
+    free_mask[list(free)] = True
+    wanted = np.zeros(len(landmarks.known), dtype=bool)
+    wanted[ids[free_mask[of]]] = True
+    used = wanted[ids] & (np.bincount(ids, minlength=len(wanted))[ids] >= 2)
+    of, slot, ids = of[used], slot[used], ids[used]
+    if len(ids) < 12:
+        return float("inf")
+
+    pixels = np.zeros((len(of), 2))
+    for k in views:
+        mine = of == k
+        pixels[mine] = landmarks.keyframes[k].pixels[slot[mine]]
+    poses = {k: landmarks.keyframes[k].T_camera_world for k in views}
+    bundle = adjusted_bundle(
+        landmarks.lens.camera,
+        poses,
+        of,
+        ids,
+        pixels,
+        landmarks.xyz,
+        set(free),
+        steps,
+        focal=focal,
+        distortion=distortion,
+    )
+    if bundle is None:
+        return float("inf")
+    for k, T in bundle.poses.items():
+        landmarks.keyframes[k].T_camera_world[:3] = T[:3]
+    landmarks.xyz[bundle.points] = bundle.xyz
+    if focal or distortion:
+        landmarks.use_lens(Lens(bundle.camera))
+    return bundle.cost

@@ -1,0 +1,180 @@
+"""How a map begins: features followed through the first frames until two of them tell motion and depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
+from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
+from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.klt.optical_flow import corners, flow
+from modp_ti.inputs.klt.relocalisation import describe, matches
+from modp_ti.inputs.klt.two_view import two_views
+from modp_ti.inputs.multiview.camera_pose import pose_from_points, ray_errors
+
+__all__ = ["Initialisation", "SeenFrame"]
+
+WANTED = 450  # features that are followed
+FEWEST_SHARED = 60  # of two views
+# The pair must have moved by this share of the image's longer side, and its rays by these degrees; less is asked for
+# after many frames.
+LEAST_SHIFT = 0.03
+LEAST_ANGLE = 2.5
+PATIENCE = 90  # frames
+BETWEEN = 3  # keyframes between the two views
+LONGEST = 400  # frames in memory
+
+
+@dataclass
+class SeenFrame:
+    """A frame without pose: grey and valid (H, W); features ids (N,) at pixels (N, 2)."""
+
+    number: int
+    grey: NDArray[np.uint8]
+    valid: NDArray[np.bool_] | None
+    ids: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+
+
+class Initialisation:
+    """Takes frames in until `add` returns a map. frames: those seen so far, the oldest forgotten after LONGEST.
+
+    lenses: cameras that may be the right one; the map has the one that explains the features best.
+    """
+
+    def __init__(self, lenses: Sequence[Lens], seed: int) -> None:
+        self.frames: list[SeenFrame] = []
+        self._lenses = list(lenses)
+        self._seed = seed
+        self._count = 0
+
+    def add(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> LandmarkMap | None:
+        """Takes a frame in; the map as soon as there is one, its last keyframe this frame."""
+        ids, pixels = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+        if self.frames:
+            last = self.frames[-1]
+            pixels, found = flow(last.grey, grey, last.pixels, last.pixels)
+            ids, pixels = last.ids[found], pixels[found]
+            if len(ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)) <= len(last.ids):
+                more_ids, more_pixels = self._matched(last, grey)
+                fresh = ~np.isin(more_ids, ids)
+                ids, pixels = np.concatenate([ids, more_ids[fresh]]), np.concatenate([pixels, more_pixels[fresh]])
+        frame = SeenFrame(number, grey, valid, ids, pixels)
+        self.frames.append(frame)
+        if len(self.frames) > LONGEST:
+            del self.frames[0]
+        found = self._attempt(frame)
+        if len(frame.ids) < 0.75 * WANTED:
+            new = corners(grey, frame.pixels, WANTED, valid)
+            frame.ids = np.concatenate([frame.ids, np.arange(self._count, self._count + len(new))])
+            frame.pixels = np.concatenate([frame.pixels, new])
+            self._count += len(new)
+        return found
+
+    def _matched(self, last: SeenFrame, grey: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Features of the frame before, found by their looks; they are added to that frame."""
+        a, b = describe(last.grey), describe(grey)
+        pairs = matches(a, b)
+        ids = np.arange(self._count, self._count + len(pairs))
+        self._count += len(pairs)
+        last.ids = np.concatenate([last.ids, ids])
+        last.pixels = np.concatenate([last.pixels, a.pixels[pairs[:, 0]]])
+        return ids, b.pixels[pairs[:, 1]]
+
+    def _attempt(self, frame: SeenFrame) -> LandmarkMap | None:
+        first = self._partner(frame)
+        if first is None:
+            return None
+        share, a, b = np.intersect1d(self.frames[first].ids, frame.ids, return_indices=True)
+        pixels_a, pixels_b = self.frames[first].pixels[a], frame.pixels[b]
+        least = LEAST_ANGLE if len(self.frames) < PATIENCE else 0.5 * LEAST_ANGLE
+        best, best_cost = None, np.inf
+        for lens in self._lenses:
+            pair = two_views(lens, pixels_a, pixels_b, least, self._seed)
+            if pair is None:
+                continue
+            landmarks, cost = self._mapped(lens, first, frame, share, pair.T_b_a, pair.xyz, pair.good)
+            if landmarks is not None and cost < best_cost:
+                best, best_cost = landmarks, cost
+        return best
+
+    def _partner(self, frame: SeenFrame) -> int | None:
+        """Place of the frame that moved most against this one among those that share enough features with it."""
+        size = max(frame.grey.shape)
+        best, best_shift = None, LEAST_SHIFT * size
+        older = len(self.frames) - 1
+        for i in range(older - 1, -1, -max(1, older // 40)) if older > 1 else range(older):
+            other = self.frames[i]
+            share, a, b = np.intersect1d(other.ids, frame.ids, return_indices=True)
+            if len(share) < max(FEWEST_SHARED, 0.4 * min(len(other.ids), WANTED)):
+                break
+            shift = float(np.median(np.linalg.norm(other.pixels[a] - frame.pixels[b], axis=1)))
+            if shift > best_shift:
+                best, best_shift = i, shift
+        return best
+
+    def _mapped(
+        self,
+        lens: Lens,
+        first: int,
+        frame: SeenFrame,
+        share: NDArray[np.int64],
+        T_b_a: NDArray[np.float64],
+        xyz: NDArray[np.float64],
+        good: NDArray[np.bool_],
+    ) -> tuple[LandmarkMap | None, float]:
+        """The map of a pair and of frames between, and its cost; None where it does not hold together."""
+        landmarks = LandmarkMap(lens)
+        landmarks.new_ids(self._count)
+        scale = 1.0 / float(np.median(xyz[good, 2]))  # the typical depth is the unit
+        landmarks.xyz[share[good]] = scale * xyz[good]
+        landmarks.known[share[good]] = True
+        T_last = T_b_a.copy()
+        T_last[:3, 3] *= scale
+        last = len(self.frames) - 1
+        middle = np.unique(np.linspace(first, last, BETWEEN + 2).round().astype(int)[1:-1])
+        poses = {first: np.eye(4), last: T_last}
+        for i in middle:
+            other = self.frames[i]
+            if i in poses:
+                continue
+            known = landmarks.known[other.ids]
+            rays = lens.rays(other.pixels[known])
+            found = pose_from_points(landmarks.xyz[other.ids[known]], rays, 3.0 / lens.focal, self._seed)
+            if found is not None and found[1].sum() >= max(FEWEST_SHARED // 2, 0.5 * known.sum()):
+                poses[int(i)] = found[0]
+        order = sorted(poses)
+        for i in order:
+            seen = self.frames[i]
+            pixels = seen.pixels.copy()
+            keyframe = Keyframe(seen.number, poses[i], seen.grey, seen.ids.copy(), pixels, lens.rays(pixels))
+            landmarks.add_keyframe(keyframe)
+        every = range(len(order))
+        for _ in range(2):
+            if not np.isfinite(adjust_bundle(landmarks, every, steps=30)):
+                return None, np.inf
+            landmarks.discard_outliers(every)
+            for k in every:
+                landmarks.triangulate(k)
+        cost = adjust_bundle(landmarks, every, steps=15)
+        landmarks.discard_outliers(every)
+        if not self._holds(landmarks, len(share)):
+            return None, np.inf
+        return landmarks, cost
+
+    @staticmethod
+    def _holds(landmarks: LandmarkMap, shared: int) -> bool:
+        """Whether most of what was seen agrees with the map."""
+        _, _, ids = landmarks.observations([len(landmarks.keyframes) - 1])
+        if len(ids) < max(FEWEST_SHARED // 2, 0.5 * shared):
+            return False
+        errors = []
+        for k in range(len(landmarks.keyframes)):
+            keyframe = landmarks.keyframes[k]
+            known = landmarks.known[keyframe.ids]
+            errors.append(ray_errors(keyframe.T_camera_world, landmarks.xyz[keyframe.ids[known]], keyframe.rays[known]))
+        return bool(np.median(np.concatenate(errors)) * landmarks.lens.focal < 1.0)

@@ -1,0 +1,203 @@
+"""What a tracker has mapped: keyframes, and the landmarks that they see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_se3
+from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.multiview.camera_pose import ray_errors
+from modp_ti.inputs.multiview.features import Features
+
+__all__ = ["Keyframe", "LandmarkMap"]
+
+# px: an observation farther than this from where its landmark projects is wrong.
+MAX_ERROR = 2.5
+# Degrees between the rays of a new landmark: below, its depth is a guess.
+MIN_ANGLE = 1.2
+
+
+@dataclass
+class Keyframe:
+    """A frame that the map is made of.
+
+    number: of the frame. T_camera_world: (4, 4). grey: (H, W) uint8. ids: (N,) int64 of the features that it sees,
+    landmarks or not yet, with their pixels (N, 2) and rays (N, 2) in ideal coordinates. described: its SIFT features,
+    where they were asked for, and described_ids (M,) which of `ids` each is, -1 for none.
+    """
+
+    number: int
+    T_camera_world: NDArray[np.float64]
+    grey: NDArray[np.uint8]
+    ids: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+    rays: NDArray[np.float64]
+    described: Features | None = None
+    described_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Place of the camera (3,) in the world."""
+        return inverse_se3(self.T_camera_world)[:3, 3]
+
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        self.ids, self.pixels, self.rays = self.ids[kept], self.pixels[kept], self.rays[kept]
+
+    def append(self, ids: NDArray[np.int64], pixels: NDArray[np.float64], rays: NDArray[np.float64]) -> None:
+        self.ids = np.concatenate([self.ids, ids])
+        self.pixels = np.concatenate([self.pixels, pixels])
+        self.rays = np.concatenate([self.rays, rays])
+
+
+class LandmarkMap:
+    """Keyframes and landmarks. A landmark's number is its place in the arrays here, and never given twice.
+
+    xyz: (C, 3) world. known: (C,) whether it has a place. first, first_slot: keyframe that saw it first, and its pixel
+    and ray there. looked, found: (C,) how often it was looked for from the map, and found.
+    """
+
+    def __init__(self, lens: Lens) -> None:
+        self.lens = lens
+        self.keyframes: list[Keyframe] = []
+        self._count = 0
+        self.xyz = np.zeros((0, 3))
+        self.known = np.zeros(0, dtype=bool)
+        self.first = np.zeros(0, dtype=np.int64)
+        self.first_pixel = np.zeros((0, 2))
+        self.last = np.zeros(0, dtype=np.int64)
+        self.last_pixel = np.zeros((0, 2))
+        self.looked = np.zeros(0, dtype=np.int64)
+        self.found = np.zeros(0, dtype=np.int64)
+
+    def new_ids(self, count: int) -> NDArray[np.int64]:
+        """Numbers (count,) for features that nobody has seen before."""
+        ids = np.arange(self._count, self._count + count, dtype=np.int64)
+        self._count += count
+        if self._count > len(self.known):
+            extra = max(self._count, 2 * len(self.known), 1024) - len(self.known)
+            for name, value in (
+                ("xyz", 0.0),
+                ("known", False),
+                ("first", -1),
+                ("first_pixel", 0.0),
+                ("last", -1),
+                ("last_pixel", 0.0),
+                ("looked", 0),
+                ("found", 0),
+            ):
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.full((extra, *array.shape[1:]), value, array.dtype)]))
+        return ids
+
+    def add_keyframe(self, keyframe: Keyframe) -> int:
+        """Number of the keyframe, now the last."""
+        self.keyframes.append(keyframe)
+        k = len(self.keyframes) - 1
+        self.note_observations(k, keyframe.ids, keyframe.pixels)
+        return k
+
+    def note_observations(self, k: int, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:
+        """Remember the first and the last keyframe that saw each feature."""
+        fresh = self.first[ids] < 0
+        self.first[ids[fresh]], self.first_pixel[ids[fresh]] = k, pixels[fresh]
+        late = self.last[ids] <= k
+        self.last[ids[late]], self.last_pixel[ids[late]] = k, pixels[late]
+
+    def use_lens(self, lens: Lens) -> None:
+        """Take another camera: the rays of all that was observed follow."""
+        self.lens = lens
+        for keyframe in self.keyframes:
+            keyframe.rays = lens.rays(keyframe.pixels)
+
+    def observations(self, keyframes: Iterable[int]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Keyframe, place within it and landmark, (M,) each, of what these keyframes see of landmarks with a place."""
+        of, place, ids = [], [], []
+        for k in keyframes:
+            slots = np.flatnonzero(self.known[self.keyframes[k].ids])
+            of.append(np.full(len(slots), k))
+            place.append(slots)
+            ids.append(self.keyframes[k].ids[slots])
+        if not of:
+            return (np.zeros(0, dtype=np.int64),) * 3
+        return np.concatenate(of), np.concatenate(place), np.concatenate(ids)
+
+    def triangulate(self, k: int) -> NDArray[np.int64]:
+        """Gives places to features of keyframe k whose ray there and in their first keyframe fix one; their numbers."""
+        keyframe = self.keyframes[k]
+        slots = np.flatnonzero(~self.known[keyframe.ids] & (self.first[keyframe.ids] >= 0))
+        slots = slots[self.first[keyframe.ids[slots]] != k]
+        made = []
+        for first in np.unique(self.first[keyframe.ids[slots]]):
+            other = self.keyframes[first]
+            mine = slots[self.first[keyframe.ids[slots]] == first]
+            ids = keyframe.ids[mine]
+            rays = self.lens.rays(self.first_pixel[ids])
+            xyz, good = triangulated(
+                other.T_camera_world, keyframe.T_camera_world, rays, keyframe.rays[mine], MAX_ERROR / self.lens.focal
+            )
+            self.xyz[ids[good]] = xyz[good]
+            self.known[ids[good]] = True
+            made.append(ids[good])
+        return np.concatenate(made) if made else np.zeros(0, dtype=np.int64)
+
+    def discard_outliers(self, keyframes: Iterable[int]) -> None:
+        """Takes out what these keyframes observe where it is not, and landmarks that fewer than two still see."""
+        touched = []
+        for k in keyframes:
+            keyframe = self.keyframes[k]
+            known = self.known[keyframe.ids]
+            error = np.zeros(len(known))
+            error[known] = ray_errors(keyframe.T_camera_world, self.xyz[keyframe.ids[known]], keyframe.rays[known])
+            wrong = error * self.lens.focal > MAX_ERROR
+            touched.append(keyframe.ids[wrong])
+            keyframe.keep(~wrong)
+        touched = np.unique(np.concatenate(touched)) if touched else np.zeros(0, dtype=np.int64)
+        if len(touched) == 0:
+            return
+        seen = np.zeros(len(self.known), dtype=np.int64)
+        for keyframe in self.keyframes:
+            seen[keyframe.ids] += 1
+        self.known[touched[seen[touched] < 2]] = False
+        # A first observation that was wrong must not place the feature again.
+        self.first[touched] = -1
+        lost = np.zeros(len(self.known), dtype=bool)
+        lost[touched] = True
+        for k, keyframe in enumerate(self.keyframes):
+            slots = np.flatnonzero(lost[keyframe.ids])
+            self.note_observations(k, keyframe.ids[slots], keyframe.pixels[slots])
+
+
+def triangulated(
+    T_a_world: NDArray[np.float64],
+    T_b_world: NDArray[np.float64],
+    rays_a: NDArray[np.float64],
+    rays_b: NDArray[np.float64],
+    max_error: float,
+    min_angle: float = MIN_ANGLE,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Points (N, 3) nearest to two rays each, and which of them (N,) can be relied upon.
+
+    rays: (N, 2) ideal coordinates. max_error: in ideal coordinates, in both views. min_angle: degrees between the rays.
+    """
+    if len(rays_a) == 0:
+        return np.zeros((0, 3)), np.zeros(0, dtype=bool)
+    world_a, world_b = inverse_se3(T_a_world), inverse_se3(T_b_world)
+    direction_a = np.c_[rays_a, np.ones(len(rays_a))] @ world_a[:3, :3].T
+    direction_b = np.c_[rays_b, np.ones(len(rays_b))] @ world_b[:3, :3].T
+    direction_a /= np.linalg.norm(direction_a, axis=1, keepdims=True)
+    direction_b /= np.linalg.norm(direction_b, axis=1, keepdims=True)
+    between = world_b[:3, 3] - world_a[:3, 3]
+    cosine = np.clip((direction_a * direction_b).sum(axis=1), -1.0, 1.0)
+    sine2 = np.maximum(1.0 - cosine * cosine, 1e-12)
+    along_a, along_b = direction_a @ between, direction_b @ between
+    s = (along_a - cosine * along_b) / sine2
+    t = (cosine * along_a - along_b) / sine2
+    xyz = 0.5 * (world_a[:3, 3] + s[:, None] * direction_a + world_b[:3, 3] + t[:, None] * direction_b)
+    good = (np.arccos(cosine) >= np.radians(min_angle)) & (s > 0) & (t > 0)
+    good &= ray_errors(T_a_world, xyz, rays_a) <= max_error
+    good &= ray_errors(T_b_world, xyz, rays_b) <= max_error
+    return xyz, good

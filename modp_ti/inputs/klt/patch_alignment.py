@@ -1,0 +1,174 @@
+"""Landmarks found again where the map says that they are: patches of their keyframes, warped to the view at hand.
+
+What is followed from image to image slides off its place little by little; a patch that is always compared with the
+keyframe that saw the landmark first does not. Patches lie side by side in one picture, so that one call of
+Lucas-Kanade aligns all of them.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_se3
+from modp_ti.inputs.klt.landmark_map import LandmarkMap
+
+__all__ = ["align_landmarks", "reference_views"]
+
+TILE = 40  # px, side of a patch with the room in which it is looked for
+WINDOW = 13  # px, what is compared
+COLUMNS = 16
+# Correlation of two patches that show the same.
+ALIKE = 0.75
+# A patch is not warped by more than this, nor seen more aslant (degrees).
+LARGEST_ZOOM = 1.8
+LARGEST_TURN = 40.0
+
+
+def reference_views(
+    landmarks: LandmarkMap, ids: NDArray[np.int64], T_camera_world: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Keyframe (N,) and pixel (N, 2) from which each landmark looks most as it does from this pose, and whether it may.
+
+    That is the first keyframe that saw it, where that did so from a like direction and distance, else the last.
+    """
+    centres = np.array([keyframe.centre for keyframe in landmarks.keyframes])
+    to_here = landmarks.xyz[ids] - inverse_se3(T_camera_world)[:3, 3]
+    distance = np.linalg.norm(to_here, axis=1)
+
+    def fits(keyframe: NDArray[np.int64]) -> NDArray[np.bool_]:
+        to_there = landmarks.xyz[ids] - centres[keyframe]
+        length = np.linalg.norm(to_there, axis=1)
+        cosine = (to_here * to_there).sum(axis=1) / np.maximum(distance * length, 1e-12)
+        zoom = length / np.maximum(distance, 1e-12)
+        alike = (zoom < LARGEST_ZOOM) & (zoom > 1 / LARGEST_ZOOM)
+        return alike & (cosine > np.cos(np.radians(LARGEST_TURN))) & (keyframe >= 0)
+
+    first, last = landmarks.first[ids], landmarks.last[ids]
+    from_first = fits(first)
+    keyframe = np.where(from_first, first, last)
+    pixel = np.where(from_first[:, None], landmarks.first_pixel[ids], landmarks.last_pixel[ids])
+    return keyframe, pixel, from_first | fits(last)
+
+
+def align_landmarks(
+    landmarks: LandmarkMap,
+    ids: NDArray[np.int64],
+    keyframe: NDArray[np.int64],
+    pixel: NDArray[np.float64],
+    grey: NDArray[np.uint8],
+    T_camera_world: NDArray[np.float64],
+    guess: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Pixels (N, 2) of landmarks in an image (H, W) taken from about T_camera_world, and which were recognised there.
+
+    keyframe, pixel: as from `reference_views`. guess: (N, 2) where they are looked for, within about 8 pixels.
+    """
+    count = len(ids)
+    if count == 0:
+        return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+    warp = _warps(landmarks, ids, keyframe, pixel, T_camera_world)
+    usable = np.isfinite(warp).all(axis=(1, 2)) & np.isfinite(guess).all(axis=1)
+    determinant = np.where(usable, np.linalg.det(np.where(usable[:, None, None], warp, np.eye(2))), 0.0)
+    usable &= (np.abs(determinant) > 1 / LARGEST_ZOOM**3) & (np.abs(determinant) < LARGEST_ZOOM**3)
+    warp = np.where(usable[:, None, None], warp, np.eye(2))
+    guess = np.where(usable[:, None], guess, 0.0)
+
+    offset = np.arange(TILE) - (TILE - 1) / 2
+    grid = np.stack(np.meshgrid(offset, offset), axis=-1)  # (TILE, TILE, 2)
+    unwarped = grid.reshape(-1, 2) @ np.linalg.inv(warp).transpose(0, 2, 1)  # (N, TILE * TILE, 2)
+    there = pixel[:, None, None] + unwarped.reshape(count, TILE, TILE, 2)
+    here = guess[:, None, None] + grid
+    reference = np.zeros((count, TILE, TILE), np.float32)
+    for k in np.unique(keyframe[usable]):
+        mine = np.flatnonzero(usable & (keyframe == k))
+        reference[mine] = _sampled(landmarks.keyframes[k].grey, there[mine])
+    current = _sampled(grey, here)
+
+    centre = np.array([((n % COLUMNS) + 0.5, (n // COLUMNS) + 0.5) for n in range(count)]) * TILE - 0.5
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        _mosaic(reference),
+        _mosaic(current),
+        centre.astype(np.float32)[:, None],
+        None,
+        winSize=(WINDOW, WINDOW),
+        maxLevel=1,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
+    )
+    shift = found[:, 0].astype(np.float64) - centre
+    room = (TILE - WINDOW) / 2 - 1
+    recognised = usable & (status[:, 0] > 0) & (np.abs(shift) <= room).all(axis=1)
+    result = guess + np.where(recognised[:, None], shift, 0.0)
+    half = WINDOW // 2
+    near = np.stack(np.meshgrid(*[np.arange(-half, half + 1) - 0.0] * 2), axis=-1)
+    a = _sampled_stack(reference, near)
+    b = _sampled(grey, result[:, None, None] + near)
+    recognised &= _correlation(a, b) > ALIKE
+    height, width = grey.shape
+    recognised &= (result >= half + 1).all(axis=1) & (result <= (width - half - 1, height - half - 1)).all(axis=1)
+    return result, recognised
+
+
+def _warps(
+    landmarks: LandmarkMap,
+    ids: NDArray[np.int64],
+    keyframe: NDArray[np.int64],
+    pixel: NDArray[np.float64],
+    T_camera_world: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """How the pixels around each landmark move from its keyframe to here (N, 2, 2), were it a plane facing that one."""
+    lens = landmarks.lens
+    poses = np.array([each.T_camera_world for each in landmarks.keyframes])[keyframe]
+    xyz = landmarks.xyz[ids]
+    depth = np.einsum("nj,nj->n", poses[:, 2, :3], xyz) + poses[:, 2, 3]
+    step = 4.0  # px
+    moved = []
+    for change in ((0.0, 0.0), (step, 0.0), (0.0, step)):
+        ray = lens.rays(pixel + change)
+        point = np.c_[ray, np.ones(len(ray))] * depth[:, None] - poses[:, :3, 3]
+        world = np.einsum("nji,nj->ni", poses[:, :3, :3], point)
+        moved.append(lens.pixels(world @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]))
+    return np.stack([moved[1] - moved[0], moved[2] - moved[0]], axis=-1) / step
+
+
+def _sampled(grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Grey values (N, a, b) at pixels (N, a, b, 2), centres at +0.5."""
+    n, a, b, _ = pixels.shape
+    x = np.ascontiguousarray(pixels[..., 0] - 0.5, dtype=np.float32).reshape(n * a, b)
+    y = np.ascontiguousarray(pixels[..., 1] - 0.5, dtype=np.float32).reshape(n * a, b)
+    out = np.empty((n * a, b), np.float32)
+    for start in range(0, n * a, 30000):  # cv2.remap takes no more than 32767 rows
+        part = slice(start, start + 30000)
+        out[part] = cv2.remap(grey, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return out.reshape(n, a, b)
+
+
+def _sampled_stack(tiles: NDArray[np.float32], near: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The middle of each tile (N, a, b): tiles have an even side, their middle is between pixels."""
+    half = near.shape[0] // 2
+    middle = TILE // 2
+    block = tiles[:, middle - half - 1 : middle + half + 1, middle - half - 1 : middle + half + 1]
+    return 0.25 * (block[:, :-1, :-1] + block[:, 1:, :-1] + block[:, :-1, 1:] + block[:, 1:, 1:])
+
+
+def _mosaic(tiles: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Tiles (N, TILE, TILE) side by side, each of the same brightness and contrast."""
+    inner = tiles[:, 6:-6, 6:-6]
+    mean = inner.mean(axis=(1, 2), keepdims=True)
+    deviation = np.maximum(inner.std(axis=(1, 2), keepdims=True), 3.0)
+    even = np.clip(np.round((tiles - mean) / deviation * 40.0 + 128.0), 0, 255).astype(np.uint8)
+    rows = -(-len(even) // COLUMNS)
+    sheet = np.zeros((rows * COLUMNS, TILE, TILE), np.uint8)
+    sheet[: len(even)] = even
+    return np.ascontiguousarray(
+        sheet.reshape(rows, COLUMNS, TILE, TILE).transpose(0, 2, 1, 3).reshape(rows * TILE, COLUMNS * TILE)
+    )
+
+
+def _correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Normalised cross-correlation (N,) of patches (N, h, w)."""
+    a = a - a.mean(axis=(1, 2), keepdims=True)
+    b = b - b.mean(axis=(1, 2), keepdims=True)
+    norm = np.sqrt((a * a).sum(axis=(1, 2)) * (b * b).sum(axis=(1, 2)))
+    return (a * b).sum(axis=(1, 2)) / np.maximum(norm, 1e-6)

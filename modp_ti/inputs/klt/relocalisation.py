@@ -1,0 +1,133 @@
+"""Frames placed by what they look like: SIFT features matched with a keyframe's, for gaps that flow cannot cross."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
+from modp_ti.inputs.multiview.camera_pose import pose_from_points
+from modp_ti.inputs.multiview.features import Features, detect_features, essential_matrix, match_features
+
+__all__ = ["Placed", "alike_keyframes", "describe", "inherited", "matches", "place_by_features", "thumbnail"]
+
+# px of the followed image: a place that a feature's neighbours lend it, and one of its own.
+MAX_ERROR = 5.0
+SAME_PLACE = 2.0
+MAX_OFF_LINE = 3.0  # from the epipolar line
+NEIGHBOURHOOD = 40.0
+FEWEST = 15  # matches that agree with a pose
+THUMBNAIL = (32, 24)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """T_camera_world (4, 4) of a frame; pairs (M, 2): features of the keyframe and of the frame that agree with it."""
+
+    keyframe: int
+    T_camera_world: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+
+
+def describe(grey: NDArray[np.uint8]) -> Features:
+    """SIFT features of a followed image (H, W) uint8."""
+    return detect_features(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))
+
+
+def matches(a: Features, b: Features) -> NDArray[np.int64]:
+    """Pairs (M, 2) of features that are clearly each other's best."""
+    nowhere = np.zeros((3, 3))  # no epipolar line: every place of the other image will do
+    return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0).pairs
+
+
+def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """A small blurred picture as vector of mean 0 and length 1: 0 where the image is of one grey."""
+    small = cv2.GaussianBlur(cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA), (5, 5), 0).astype(np.float32)
+    small -= small.mean()
+    return (small / max(float(np.linalg.norm(small)), 1.0)).reshape(-1)
+
+
+def alike_keyframes(thumbnails: NDArray[np.float32], grey: NDArray[np.uint8], count: int) -> list[int]:
+    """Numbers of the keyframes that look most like the image, best first."""
+    likeness = thumbnails @ thumbnail(grey)
+    return [int(k) for k in np.argsort(-likeness, kind="stable")[:count]]
+
+
+def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: int) -> Placed | None:
+    """Pose of a frame with these features by those of keyframe k; None where too few agree."""
+    keyframe = landmarks.keyframes[k]
+    if keyframe.described is None:
+        keyframe.described = describe(keyframe.grey)
+        keyframe.described_ids = np.full(len(keyframe.described.pixels), -1, dtype=np.int64)
+    pairs = matches(keyframe.described, features)
+    if len(pairs) < FEWEST:
+        return None
+    xyz = _places(landmarks, keyframe)[pairs[:, 0]]
+    placed = np.isfinite(xyz).all(axis=1)
+    if placed.sum() < FEWEST:
+        return None
+    rays = landmarks.lens.rays(features.pixels[pairs[:, 1]])
+    found = pose_from_points(xyz[placed], rays[placed], MAX_ERROR / landmarks.lens.focal, seed)
+    if found is None or found[1].sum() < max(FEWEST, 0.2 * placed.sum()):
+        return None
+    agreeing = np.ones(len(pairs), dtype=bool)
+    agreeing[placed] = found[1]
+    return Placed(k, found[0], pairs[agreeing])
+
+
+def inherited(
+    landmarks: LandmarkMap, k: int, features: Features, pairs: NDArray[np.int64], T: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Features of keyframe k that were matched in a frame at T: their numbers and pixels there.
+
+    Those that have none yet get one, and are observed by the keyframe from now on.
+    """
+    keyframe = landmarks.keyframes[k]
+    a, b = keyframe.described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
+    rays_a, rays_b = landmarks.lens.rays(a), landmarks.lens.rays(b)
+    lines = np.c_[rays_a, np.ones(len(a))] @ essential_matrix(keyframe.T_camera_world, T).T
+    off = np.abs((lines * np.c_[rays_b, np.ones(len(b))]).sum(axis=1))
+    off /= np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
+    good = off * landmarks.lens.focal < MAX_OFF_LINE
+    slots, b = pairs[good, 0], b[good]
+    slots, first = np.unique(slots, return_index=True)
+    b = b[first]
+    fresh = keyframe.described_ids[slots] < 0
+    ids = landmarks.new_ids(int(fresh.sum()))
+    keyframe.described_ids[slots[fresh]] = ids
+    pixels = keyframe.described.pixels[slots[fresh]]
+    keyframe.append(ids, pixels, landmarks.lens.rays(pixels))
+    landmarks.note_observations(k, ids, pixels)
+    return keyframe.described_ids[slots], b
+
+
+def _places(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
+    """World points (M, 3) of a keyframe's SIFT features; NaN where nothing tells how far away they are.
+
+    A feature that is a landmark lies there; any other at the depth of the landmarks around it, where they agree.
+    """
+    pixels, ids = keyframe.described.pixels, keyframe.described_ids
+    xyz = np.full((len(pixels), 3), np.nan)
+    own = np.flatnonzero(ids >= 0)
+    own = own[landmarks.known[ids[own]]]
+    xyz[own] = landmarks.xyz[ids[own]]
+    seen = np.flatnonzero(landmarks.known[keyframe.ids])
+    if len(seen) < 3 or len(pixels) == 0:
+        return xyz
+    T = keyframe.T_camera_world
+    depth = landmarks.xyz[keyframe.ids[seen]] @ T[2, :3] + T[2, 3]
+    distance = np.linalg.norm(pixels[:, None] - keyframe.pixels[seen][None], axis=2)
+    nearest = np.argpartition(distance, 2, axis=1)[:, :3]
+    away = np.take_along_axis(distance, nearest, axis=1)
+    around = depth[nearest]
+    middle = np.median(around, axis=1)
+    agree = (np.ptp(around, axis=1) < 0.1 * middle) & (away.max(axis=1) < NEIGHBOURHOOD) & (middle > 0)
+    at_one = away.min(axis=1) < SAME_PLACE
+    z = np.where(at_one, around[np.arange(len(around)), away.argmin(axis=1)], middle)
+    lent = np.flatnonzero((agree | at_one) & ~np.isfinite(xyz[:, 0]) & (z > 0))
+    point = np.c_[landmarks.lens.rays(pixels[lent]), np.ones(len(lent))] * z[lent, None] - T[:3, 3]
+    xyz[lent] = point @ T[:3, :3]
+    return xyz

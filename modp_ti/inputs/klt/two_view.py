@@ -1,0 +1,81 @@
+"""The beginning: two views of a scene whose features match, and the motion between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.inputs.klt.landmark_map import triangulated
+from modp_ti.inputs.klt.lens import Lens
+
+__all__ = ["TwoViews", "two_views"]
+
+MAX_ERROR = 1.5  # px
+FEWEST = 40  # points with parallax
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """T_b_a: (4, 4), translation of length 1. xyz: (N, 3) in the frame of a; good: (N,) which can be relied upon.
+
+    angle: median parallax of the good points, degrees. planar: whether a homography told the motion.
+    """
+
+    T_b_a: NDArray[np.float64]
+    xyz: NDArray[np.float64]
+    good: NDArray[np.bool_]
+    angle: float
+    planar: bool
+
+
+def two_views(
+    lens: Lens, pixels_a: NDArray[np.float64], pixels_b: NDArray[np.float64], min_angle: float, seed: int
+) -> TwoViews | None:
+    """Motion between two views of the same features (N, 2); None where they do not tell it.
+
+    The essential matrix or, where a homography explains as much, that of a plane. min_angle: least parallax, degrees.
+    A view that only turned has none.
+    """
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    if len(pixels_a) < FEWEST:
+        return None
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose = True
+    options.detect_watermark = False
+    options.ransac.max_error = MAX_ERROR
+    options.ransac.random_seed = seed
+    options.ransac.max_num_trials = 2000
+    pairs = np.repeat(np.arange(len(pixels_a), dtype=np.uint32)[:, None], 2, axis=1)
+    found = pycolmap.estimate_calibrated_two_view_geometry(
+        lens.camera, np.ascontiguousarray(pixels_a), lens.camera, np.ascontiguousarray(pixels_b), pairs, options
+    )
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    if found.config not in (kinds.CALIBRATED, kinds.PLANAR) or found.cam2_from_cam1 is None:
+        return None
+    T = np.eye(4)
+    T[:3] = found.cam2_from_cam1.matrix()
+    length = float(np.linalg.norm(T[:3, 3]))
+    if not np.isfinite(T).all() or length < 1e-9:
+        return None
+    T[:3, 3] /= length
+    xyz, good = triangulated(
+        np.eye(4), T, lens.rays(pixels_a), lens.rays(pixels_b), 2 * MAX_ERROR / lens.focal, min_angle=0.5
+    )
+    if good.sum() < max(FEWEST, 0.5 * len(pixels_a)):
+        return None
+    angle = float(np.degrees(np.median(_angles(T, xyz[good]))))
+    if angle < min_angle:
+        return None
+    return TwoViews(T, xyz, good, angle, found.config == kinds.PLANAR)
+
+
+def _angles(T_b_a: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Parallax (N,) of points (N, 3), radians."""
+    centre = -T_b_a[:3, :3].T @ T_b_a[:3, 3]
+    a = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+    b = xyz - centre
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    return np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))

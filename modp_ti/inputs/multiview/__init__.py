@@ -1,0 +1,1 @@
+"""Features, poses and points of several views: what trackers without points of their own are completed with."""

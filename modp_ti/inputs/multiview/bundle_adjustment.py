@@ -1,0 +1,103 @@
+"""Bundle adjustment of poses and points by what is seen of them, by pycolmap and Ceres."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+__all__ = ["Bundle", "adjusted_bundle"]
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What an adjustment has found.
+
+    poses: T_camera_world (4, 4) of the views that were free. points: (P,) numbers of those that were seen, xyz: (P, 3)
+    their places. camera: the one given, refined where that was asked for. cost: mean of an observation [px^2 / 2].
+    """
+
+    poses: dict[int, NDArray[np.float64]]
+    points: NDArray[np.int64]
+    xyz: NDArray[np.float64]
+    camera: pycolmap.Camera
+    cost: float
+
+
+def adjusted_bundle(
+    camera: pycolmap.Camera,
+    poses: Mapping[int, NDArray[np.float64]],
+    view: NDArray[np.int64],
+    point: NDArray[np.int64],
+    pixels: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    free: Collection[int],
+    steps: int,
+    loss_width: float = 1.0,
+    tolerance: float = 1e-5,
+    focal: bool = False,
+    distortion: bool = False,
+) -> Bundle | None:
+    """Poses of the views `free` and points of least robust reprojection error; None where Ceres finds none.
+
+    camera: of all views, its camera_id 1. poses: T_camera_world (4, 4) by the views' numbers; those that are not free
+    are held; where all are free, the first two hold the world. view, point: (M,), pixels: (M, 2): what is seen of
+    which point where. xyz: (C, 3) places of the points, by their numbers. steps: Levenberg-Marquardt steps at most.
+    loss_width: of Cauchy's loss [px]. tolerance: share of the cost below which a step is the last. focal, distortion:
+    whether these of the camera are refined too.
+    """
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    config = pycolmap.BundleAdjustmentConfig()
+    tracks: dict[int, list[tuple[int, int]]] = {}
+    for k, T in poses.items():
+        mine = np.flatnonzero(view == k)
+        points = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels[mine]])
+        image = pycolmap.Image(name=str(k), camera_id=1, image_id=k + 1, points2D=points)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
+        config.add_image(k + 1)
+        if k not in free:
+            config.set_constant_rig_from_world_pose(k + 1)
+        for place, number in enumerate(point[mine].tolist()):
+            tracks.setdefault(number, []).append((k + 1, place))
+    names = {}
+    for number, seen in tracks.items():
+        track = pycolmap.Track([pycolmap.TrackElement(*each) for each in seen])
+        names[number] = model.add_point3D(xyz[number], track)
+    if len(free) == len(poses):
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if not (focal or distortion):
+        config.set_constant_cam_intrinsics(1)
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length, options.refine_extra_params = focal, distortion
+    options.refine_principal_point = options.refine_sensor_from_rig = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_width
+    solver = options.ceres.solver_options
+    solver.max_num_iterations = steps
+    solver.num_threads = 1  # sums of several threads depend on who comes first
+    solver.function_tolerance = tolerance
+    summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    if not summary.is_solution_usable():
+        return None
+
+    found = {}
+    for k in free:
+        matrix = model.image(k + 1).cam_from_world().matrix()
+        if np.isfinite(matrix).all():
+            found[k] = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
+    numbers = np.fromiter(names, np.int64, len(names))
+    places = np.array([model.point3D(name).xyz for name in names.values()]).reshape(-1, 3)
+    finite = np.isfinite(places).all(axis=1)
+    cost = summary.ceres_summary.final_cost / len(view) if hasattr(summary, "ceres_summary") else 0.0
+    return Bundle(found, numbers[finite], places[finite], model.camera(1), float(cost))

@@ -1,0 +1,210 @@
+"""Corners followed from frame to frame of a video with known poses: quick, where neighbouring frames look alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.inputs.multiview.features import essential_matrix
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import PosedImage
+from modp_ti.inputs.sources import ImageSource
+
+__all__ = ["EPIPOLAR_BAND", "FollowedFeatures", "follow_features", "looks_like_video"]
+
+MAX_SIDE = 640  # longer side of the images that corners are followed in
+CORNERS = 800  # followed at a time
+REFILL_BELOW = 0.8  # share of them below which new ones are looked for
+MIN_DISTANCE = 1 / 80  # between new corners, as a share of the longer side
+QUALITY = 0.01  # of the weakest corner, as a share of the strongest
+WINDOW, LEVELS = 21, 3  # of the optical flow
+THERE_AND_BACK = 1.0  # [px] that a corner may be away from its start when it is followed back
+EPIPOLAR_BAND = 3.0  # [px] that a corner may leave the line where exact poses allow it
+
+# Frames that are looked at to tell whether a sequence is a video, and the share of corners that must survive a step.
+SAMPLES = 8
+SURVIVING = 0.5
+
+
+@dataclass(frozen=True)
+class FollowedFeatures:
+    """What was seen where: frame, track (M,) int64; pixels (M, 2) of the stored image, centres at +0.5.
+
+    pixel: size of a pixel of the image that was searched, in pixels of the stored one.
+    """
+
+    frame: NDArray[np.int64]
+    track: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+    pixel: float
+
+
+class _Picture:
+    """A frame as the optical flow takes it: grey and reduced, with its geometry."""
+
+    def __init__(self, images: ImageSource, frame: PosedImage) -> None:
+        import cv2
+
+        image = images.read(frame.name)
+        height, width = image.shape[:2]
+        self.pixel = max(1.0, max(height, width) / MAX_SIDE)
+        self.size = (max(1, round(width / self.pixel)), max(1, round(height / self.pixel)))
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if self.size != (width, height):
+            grey = cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
+        self.grey = grey
+        self.frame = frame
+        self._to_stored = np.divide((width, height), self.size)
+
+    def stored(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Pixels of the stored image; cv2 counts pixel centres from 0."""
+        return (places.astype(np.float64) + 0.5) * self._to_stored
+
+    def rays(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Ideal coordinates (N, 2) of places in the reduced image."""
+        camera, undistorter = self.frame.undistorter.camera, self.frame.undistorter
+        return (undistorter.points(self.stored(places)) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+
+    def places(self, rays: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Places in the reduced image of ideal coordinates."""
+        raw = self.frame.undistorter.raw
+        pixels = self.frame.undistorter.distortion.distort(rays) * (raw.fx, raw.fy) + (raw.cx, raw.cy)
+        return (pixels / self._to_stored - 0.5).astype(np.float32)
+
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels of the reduced image."""
+        return self.frame.undistorter.raw.focal / self.pixel
+
+
+def follow_features(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    progress: Progress | None = None,
+    band: float = EPIPOLAR_BAND,
+) -> FollowedFeatures:
+    """Corners of the frames, each followed for as long as it is found again.
+
+    solves: (F,) False for frames (held-out ones) that nothing is followed through: the chain leads from the frame
+    before them to the frame after, and they are told where its corners lie in them. So no place in another frame
+    depends on their images. band: [px] that a corner may leave the line where the poses allow it.
+    """
+    chain = np.flatnonzero(solves)
+    seen: list[tuple[int, NDArray[np.int64], NDArray[np.float64]]] = []
+    places, tracks, next_track = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
+    before: _Picture | None = None
+    pixel = 1.0
+
+    def tell(index: int, place: NDArray[np.float32], track: NDArray[np.int64], picture: _Picture) -> None:
+        seen.append((index, track, picture.stored(place)))
+
+    for done, index in enumerate(chain.tolist()):
+        picture = _Picture(images, frames[index])
+        pixel = picture.pixel
+        if before is not None:
+            places, kept = _followed(before, picture, places, band)
+            tracks = tracks[kept]
+        if len(places) < REFILL_BELOW * CORNERS:
+            fresh = _new_corners(picture, places)
+            places = np.concatenate([places, fresh])
+            tracks = np.concatenate([tracks, np.arange(next_track, next_track + len(fresh))])
+            next_track += len(fresh)
+        tell(index, places, tracks, picture)
+        # Held-out frames behind this one, and those before the first, branch off from it.
+        behind = range(index + 1, int(chain[done + 1]) if done + 1 < len(chain) else len(frames))
+        for other in [*(range(index) if done == 0 else ()), *behind]:
+            aside = _Picture(images, frames[other])
+            found, kept = _followed(picture, aside, places, band)
+            tell(other, found, tracks[kept], aside)
+        before = picture
+        if progress is not None:
+            progress("following features", done + 1, len(chain))
+    if not seen:
+        return FollowedFeatures(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), pixel)
+    return FollowedFeatures(
+        np.concatenate([np.full(len(track), index, np.int64) for index, track, _ in seen]),
+        np.concatenate([track for _, track, _ in seen]),
+        np.concatenate([pixels for _, _, pixels in seen]),
+        pixel,
+    )
+
+
+def looks_like_video(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
+    """Whether neighbouring frames look so alike that corners can be followed: tried at a few places of the sequence."""
+    chain = np.flatnonzero(solves)
+    if len(chain) < 2:
+        return False
+    shares = []
+    for at in np.unique(np.linspace(0, len(chain) - 2, SAMPLES).astype(int)):
+        one, other = (_Picture(images, frames[index]) for index in chain[at : at + 2])
+        corners = _new_corners(one, np.zeros((0, 2), np.float32))
+        if len(corners):
+            shares.append(len(_followed(one, other, corners)[0]) / len(corners))
+    return bool(shares) and float(np.median(shares)) >= SURVIVING
+
+
+def _new_corners(picture: _Picture, places: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Corners (N, 2) away from the places that are followed already."""
+    import cv2
+
+    distance = MIN_DISTANCE * max(picture.size)
+    free = np.full(picture.grey.shape, 255, np.uint8)
+    for x, y in np.round(places).astype(int).tolist():
+        cv2.circle(free, (x, y), round(distance), 0, -1)
+    wanted = CORNERS - len(places)
+    found = cv2.goodFeaturesToTrack(picture.grey, wanted, QUALITY, distance, mask=free, blockSize=5)
+    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+
+
+def _followed(
+    one: _Picture, other: _Picture, places: NDArray[np.float32], band: float = EPIPOLAR_BAND
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Places (K, 2) in the other picture of those places (N, 2) that are found there, and their numbers (K,).
+
+    The search begins where the turn between the two poses takes each place; found is what leads back to where it came
+    from and lies near the line that the poses allow.
+    """
+    import cv2
+
+    if len(places) == 0:
+        return places, np.zeros(0, np.int64)
+    rays = one.rays(places)
+    turn = other.frame.T_camera_world[:3, :3] @ one.frame.T_camera_world[:3, :3].T
+    turned = np.c_[rays, np.ones(len(rays))] @ turn.T
+    ahead = np.isfinite(turned).all(axis=1) & (turned[:, 2] > 0.1)
+    numbers = np.flatnonzero(ahead)
+    guess = other.places(turned[ahead, :2] / turned[ahead, 2:])
+    inside = ((guess >= 0) & (guess < other.size)).all(axis=1)
+    numbers, guess = numbers[inside], guess[inside]
+    if len(numbers) == 0:
+        return np.zeros((0, 2), np.float32), numbers
+    start = np.ascontiguousarray(places[numbers])
+    options = {
+        "winSize": (WINDOW, WINDOW),
+        "maxLevel": LEVELS,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
+    }
+    there, found, _ = cv2.calcOpticalFlowPyrLK(one.grey, other.grey, start, guess.copy(), **options)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(other.grey, one.grey, there, start.copy(), **options)
+    good = (found.ravel() > 0) & (found_back.ravel() > 0)
+    good &= np.linalg.norm(back - start, axis=1) <= THERE_AND_BACK
+    good &= ((there >= 0) & (there <= np.subtract(other.size, 1))).all(axis=1)
+    good[good] = _near_line(one, other, rays[numbers[good]], other.rays(there[good]), band)
+    return there[good], numbers[good]
+
+
+def _near_line(
+    one: _Picture, other: _Picture, rays_one: NDArray[np.float64], rays_other: NDArray[np.float64], band: float
+) -> NDArray[np.bool_]:
+    """Which of the rays (N, 2) of two pictures may belong to one point of the world, as the poses are."""
+    E = essential_matrix(one.frame.T_camera_world, other.frame.T_camera_world)
+    lines = np.c_[rays_one, np.ones(len(rays_one))] @ E.T
+    length = np.linalg.norm(lines[:, :2], axis=1)
+    off = np.abs((lines * np.c_[rays_other, np.ones(len(rays_other))]).sum(axis=1))
+    # Where the camera has hardly moved there is no line: off and length are both nothing.
+    return off * other.focal <= band * np.maximum(length, 1e-12)

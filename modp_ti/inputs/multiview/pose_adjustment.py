@@ -1,0 +1,151 @@
+"""Given poses made exact to a pixel: bundle adjusted with the points that they see, and left in their world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_se3, orthonormalised
+from modp_ti.inputs.multiview.bundle_adjustment import adjusted_bundle
+from modp_ti.inputs.multiview.camera_pose import ray_errors, refine_pose
+from modp_ti.inputs.multiview.observations import Observations
+from modp_ti.inputs.multiview.point_solving import solve_points
+
+__all__ = ["adjusted_poses"]
+
+STEPS = 30
+FEWEST = 8  # points that a pose rests upon, and that hold neighbouring frames together
+
+
+def adjusted_poses(
+    poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_], gates: Sequence[float]
+) -> NDArray[np.float64]:
+    """Poses (F, 4, 4) world to camera of least robust reprojection error, in the world of the given ones.
+
+    Frames with `solves` (F,) are moved together with the points. The others keep their place by the nearest of these
+    and are then moved by the points that they see. gates: reprojection errors [px of detection] beyond which an
+    observation takes no part, one for each round, falling: those that contradict wrong poses are just the ones that
+    can mend them. Frames that no points hold together are adjusted apart from each other, each such stretch turned,
+    moved and scaled as a whole to lie on its given poses.
+    """
+    given = poses
+    for gate in gates:
+        xyz, agreeing = solve_points(poses, seen, solves, gate)
+        before, poses = poses, poses.copy()
+        moved = np.zeros(len(poses), dtype=bool)
+        # What is far off pulls less; in the last rounds one pixel is as usual.
+        width = max(1.0, gate / 4)
+        for stretch in _stretches(agreeing, solves):
+            mine = agreeing.where(np.isin(agreeing.frame, stretch))
+            found = _adjusted_stretch(before, given, mine, xyz, width)
+            if found is None:
+                continue
+            for i, T in found[0].items():
+                poses[i], moved[i] = T, True
+            numbers, places = found[1:]
+            xyz[numbers] = places
+        _carry_along(poses, before, moved)
+        for i in np.flatnonzero(~moved):
+            mine = agreeing.where(agreeing.frame == i)
+            poses[i] = _resected(poses[i], mine, xyz, width)
+    return np.stack([orthonormalised(T) for T in poses])
+
+
+def _stretches(seen: Observations, solves: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Numbers of the solving frames that points hold together, for each such set of them."""
+    used = seen.where(solves[seen.frame])
+    used = used.where(np.lexsort((used.frame, used.point)))
+    follows = used.point[1:] == used.point[:-1]
+    links = np.stack([used.frame[:-1][follows], used.frame[1:][follows]], axis=1)
+    links, count = np.unique(links, axis=0, return_counts=True)
+    root = np.arange(len(solves))
+    for a, b in links[count >= FEWEST].tolist():
+        one, other = sorted((root[a], root[b]))
+        root[root == other] = one
+    sets = [np.flatnonzero(solves & (root == each)) for each in np.unique(root[solves])]
+    return [each for each in sets if len(each) >= 3]
+
+
+def _adjusted_stretch(
+    poses: NDArray[np.float64],
+    given: NDArray[np.float64],
+    seen: Observations,
+    xyz: NDArray[np.float64],
+    loss_width: float,
+) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64], NDArray[np.float64]] | None:
+    """Poses by frame, numbers (P,) of points and their places (P, 3), brought onto the given poses as a whole."""
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    # Rays in pixels of detection: a camera of that focal length, its middle at 0.
+    focal = 1.0 / float(np.median(seen.sigma))
+    side = int(2 * focal)
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=side, height=side, params=[focal, 0.0, 0.0])
+    views = np.unique(seen.frame).tolist()
+    bundle = adjusted_bundle(
+        camera,
+        {i: poses[i] for i in views},
+        seen.frame,
+        seen.point,
+        focal * seen.rays,
+        xyz,
+        set(views),
+        STEPS,
+        loss_width,
+    )
+    if bundle is None or len(bundle.poses) < len(views):
+        return None
+    adjusted = np.stack([bundle.poses[i] for i in views])
+    s, R, t = _alignment(adjusted, given[views])
+    # x_given = s R x_adjusted + t; the camera's frame grows with the world.
+    adjusted[:, :3, :3] = adjusted[:, :3, :3] @ R.T
+    adjusted[:, :3, 3] = s * adjusted[:, :3, 3] - adjusted[:, :3, :3] @ t
+    return dict(zip(views, adjusted, strict=True)), bundle.points, s * bundle.xyz @ R.T + t
+
+
+def _alignment(
+    source: NDArray[np.float64], target: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """Scale, rotation (3, 3) and translation (3,) from the world of the poses (N, 4, 4) `source` to that of `target`.
+
+    By the cameras' places and directions alike, so that a straight way or a turn on the spot has a rotation as well.
+    """
+    a, b = (np.stack([inverse_se3(T)[:3, 3] for T in poses]) for poses in (source, target))
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    a, b = a - mean_a, b - mean_b
+    directions = np.einsum("nji,njk->ik", target[:, :3, :3], source[:, :3, :3]) / len(source)
+    places = b.T @ a / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
+    U, _, Vt = np.linalg.svd(directions + places)
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    extent = float((a * a).sum())
+    s = float((b * (a @ R.T)).sum()) / extent if extent > 0 else 1.0
+    if not s > 0:  # the given places are noise
+        s = 1.0
+    return s, R, mean_b - s * R @ mean_a
+
+
+def _carry_along(poses: NDArray[np.float64], before: NDArray[np.float64], moved: NDArray[np.bool_]) -> None:
+    """Frames that were not moved stay where they were beside the nearest in time that was."""
+    there = np.flatnonzero(moved)
+    if len(there) == 0:
+        return
+    for i in np.flatnonzero(~moved):
+        k = there[np.argmin(np.abs(there - i))]
+        poses[i] = before[i] @ inverse_se3(before[k]) @ poses[k]
+
+
+def _resected(
+    T: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], width: float
+) -> NDArray[np.float64]:
+    """The pose (4, 4) of a frame moved by the points that it sees, where that makes them agree better."""
+    seen = seen.where(np.isfinite(seen.rays).all(axis=1))
+    if len(seen) < FEWEST:
+        return T
+    sigma = float(np.median(seen.sigma))
+    places = xyz[seen.point]
+    refined = T
+    for each in (4.0 * width, width):
+        refined = refine_pose(refined, places, seen.rays, each * sigma)
+    better = np.median(ray_errors(refined, places, seen.rays)) <= np.median(ray_errors(T, places, seen.rays))
+    return refined if better else T

@@ -1,0 +1,231 @@
+"""Sparse points for posed images without any: features matched or followed from view to view, and triangulated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.inputs.multiview.feature_tracks import feature_tracks
+from modp_ti.inputs.multiview.features import MAX_FEATURES, Features, detect_features, essential_matrix, match_features
+from modp_ti.inputs.multiview.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
+from modp_ti.inputs.multiview.observations import Observations
+from modp_ti.inputs.multiview.point_solving import point_errors, solve_points, surest_points
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import PosedImage, points_inside
+from modp_ti.inputs.sources import ImageSource
+
+__all__ = ["adjusted_frames", "neighbouring_views", "triangulated_frames"]
+
+# Pairs of views that are matched: these many frames apart, and as many of the nearest others by pose. The
+# growing gaps give parallax where the frames are those of a video.
+GAPS = (1, 2, 3, 5)
+NEIGHBOURS = 2
+MAX_TURN = 45.0  # degrees between the optical axes of views that are matched
+
+# Up to this many frames, features are matched between them: the wait is short, and frames may lie far apart.
+FEW_FRAMES = 60
+FEATURES_OF_MANY_FRAMES = 1000
+
+# Poses that are adjusted: features may leave the epipolar line so far [px], and points their pixels in each round,
+# before and after places that are seen again have been matched.
+WIDE_BAND = 12.0
+FIRST_GATES = (16.0, 8.0)
+GATES = (16.0, 8.0, 4.0, 2.0, 2.0)
+# Views that are matched to find places again: a new one where no more than this share of the last one's corners are
+# still followed. Each is matched with so many of the nearest by pose.
+STILL_SEEN = 0.7
+REVISITED = 6
+
+
+def triangulated_frames(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    progress: Progress | None = None,
+) -> list[PosedImage]:
+    """The frames with points that keep their ids from view to view.
+
+    solves: (F,) False for frames that must not take part in where a point lies (held-out ones): they are only
+    told which of the points they see. The result depends on nothing but the images and poses.
+
+    A few frames have their features matched with those of views around them. Of many, as of a video, corners are
+    followed from frame to frame, which takes a tenth of the time; where the frames are too far apart for that, fewer
+    features are matched.
+    """
+    follows = _are_followed(images, frames, solves)
+    seen = _seen(images, frames, solves, follows, EPIPOLAR_BAND, progress)
+    return _with_points(frames, seen, solves, follows)
+
+
+def adjusted_frames(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    progress: Progress | None = None,
+) -> tuple[list[PosedImage], str]:
+    """The same with poses that are bundle adjusted with the points; and a remark on what that has done.
+
+    A frame that does not solve takes no part in the others' poses and gets its own by the points that it sees.
+    """
+    # Imported here: readers need no compiler.
+    from modp_ti.inputs.multiview.pose_adjustment import adjusted_poses
+
+    follows = _are_followed(images, frames, solves)
+    seen = _seen(images, frames, solves, follows, WIDE_BAND, progress)
+    given = poses = np.stack([frame.T_camera_world for frame in frames])
+    if follows:
+        poses = adjusted_poses(poses, seen, solves, FIRST_GATES)
+        views, most = _views_apart(seen, solves), FEATURES_OF_MANY_FRAMES
+        again = _matched(images, frames, poses, views, solves, most, REVISITED, WIDE_BAND, progress)
+        poses = adjusted_poses(poses, seen.beside(again), solves, GATES)
+    else:
+        poses = adjusted_poses(poses, seen, solves, GATES)
+    (before, count), (after, _) = (_median_error(each, seen, solves) for each in (given, poses))
+    frames = [replace(frame, T_camera_world=T) for frame, T in zip(frames, poses, strict=True)]
+    note = (
+        f"the poses are bundle adjusted with {count} points that the images show: median reprojection error "
+        f"{before:.2f} px before, {after:.2f} px after (tracker.adjust)"
+        if count
+        else "the images show too little in common to adjust the poses: they stay as given (tracker.adjust)"
+    )
+    return _with_points(frames, seen, solves, follows), note
+
+
+def _are_followed(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
+    return len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
+
+
+def _seen(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    follows: bool,
+    band: float,
+    progress: Progress | None,
+) -> Observations:
+    """What the frames see, followed or matched."""
+    if follows:
+        return _followed(images, frames, solves, band, progress)
+    most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
+    poses = np.stack([frame.T_camera_world for frame in frames])
+    return _matched(images, frames, poses, np.arange(len(frames)), solves, most, NEIGHBOURS, band, progress)
+
+
+def _with_points(
+    frames: Sequence[PosedImage], seen: Observations, solves: NDArray[np.bool_], follows: bool
+) -> list[PosedImage]:
+    """The frames with the points that are certain enough under their poses."""
+    poses = np.stack([frame.T_camera_world for frame in frames])
+    xyz, seen = solve_points(poses, seen, solves)
+    if follows:
+        xyz, seen = surest_points(poses, seen, xyz, solves)
+    result = []
+    for i, frame in enumerate(frames):
+        mine = seen.where(seen.frame == i)
+        camera = frame.undistorter.camera
+        pixels = mine.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        points = points_inside(xyz[mine.point], pixels, mine.point, frame.undistorter, frame.T_camera_world)
+        result.append(frame.with_points(points))
+    return result
+
+
+def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_]) -> tuple[float, int]:
+    """Reprojection error [px of detection] of points placed under these poses, wide gates open; how many they are."""
+    xyz, agreeing = solve_points(poses, seen, solves, GATES[0])
+    errors = point_errors(poses, agreeing, xyz)
+    return (float(np.median(errors)) if len(errors) else float("nan")), len(xyz)
+
+
+def _followed(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    solves: NDArray[np.bool_],
+    band: float,
+    progress: Progress | None,
+) -> Observations:
+    """Corners followed along the frames."""
+    found = follow_features(images, frames, solves, progress, band)
+    rays = np.zeros((len(found.frame), 2))
+    for i, frame in enumerate(frames):
+        mine = found.frame == i
+        rays[mine] = _ideal(frame, found.pixels[mine])
+    focal = np.array([frame.undistorter.raw.focal for frame in frames])
+    return Observations(found.frame, found.track, rays, found.pixel / focal[found.frame])
+
+
+def _matched(
+    images: ImageSource,
+    frames: Sequence[PosedImage],
+    poses: NDArray[np.float64],
+    views: NDArray[np.int64],
+    solves: NDArray[np.bool_],
+    most: int,
+    neighbours: int,
+    band: float,
+    progress: Progress | None,
+) -> Observations:
+    """Features, `most` a view, matched between those of the frames `views` (V,) that may see the same."""
+    features: list[Features] = []
+    rays: list[NDArray[np.float64]] = []
+    for done, i in enumerate(views.tolist()):
+        found = detect_features(images.read(frames[i].name), most)
+        features.append(found)
+        rays.append(_ideal(frames[i], found.pixels))
+        if progress is not None:
+            progress("finding features", done + 1, len(views))
+
+    poses = poses[views]
+    pairs = neighbouring_views(poses, neighbours)
+    focal = np.array([frames[i].undistorter.raw.focal for i in views])
+    sigma = np.array([each.pixel for each in features]) / focal
+    matches = []
+    for done, (a, b) in enumerate(pairs):
+        descriptors = features[a].descriptors, features[b].descriptors
+        essential = essential_matrix(poses[a], poses[b])
+        found = match_features(*descriptors, rays[a], rays[b], essential, band * sigma[b])
+        matches.append((a, b, found))
+        if progress is not None:
+            progress("matching features", done + 1, len(pairs))
+
+    view, number, track = feature_tracks([each.pixels for each in features], matches, ~solves[views])
+    seen_rays = np.array([rays[i][j] for i, j in zip(view, number, strict=True)]).reshape(-1, 2)
+    return Observations(views[view], track, seen_rays, sigma[view])
+
+
+def _ideal(frame: PosedImage, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ideal coordinates (N, 2) of pixels of the stored image."""
+    camera = frame.undistorter.camera
+    return (frame.undistorter.points(pixels) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+
+
+def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
+    """Pairs (a, b), a < b, of views that may see the same, for poses (F, 4, 4) world to camera.
+
+    neighbours: how many of the nearest by pose a view is paired with, besides those that are near in the order.
+    """
+    count = len(poses)
+    axes = poses[:, 2, :3]
+    centres = -np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3])
+    alike = axes @ axes.T >= np.cos(np.radians(MAX_TURN))
+    pairs = {(a, a + gap) for gap in GAPS for a in range(count - gap) if alike[a, a + gap]}
+    for a in range(count):
+        distance = np.linalg.norm(centres - centres[a], axis=1)
+        distance[~alike[a]] = np.inf
+        distance[a] = np.inf
+        others = [int(b) for b in np.argsort(distance, kind="stable") if np.isfinite(distance[b])]
+        fresh = [b for b in others if (min(a, b), max(a, b)) not in pairs and abs(a - b) > max(GAPS)]
+        pairs.update((min(a, b), max(a, b)) for b in fresh[:neighbours])
+    return sorted(pairs)
+
+
+def _views_apart(seen: Observations, solves: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Solving frames (V,), the first and each that sees less than STILL_SEEN of the one taken before."""
+    of = [seen.point[seen.frame == i] for i in range(len(solves))]
+    views: list[int] = []
+    for i in np.flatnonzero(solves).tolist():
+        if not views or np.isin(of[views[-1]], of[i]).sum() <= STILL_SEEN * len(of[views[-1]]):
+            views.append(i)
+    return np.array(views, dtype=np.int64)

@@ -1,0 +1,98 @@
+"""Where images come from: one file per source, decoded frame by frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.inputs.sources.frame_reader import FrameReader, Picture
+from modp_ti.inputs.sources.image_folder import ImageFolder
+from modp_ti.inputs.sources.intrinsics import Intrinsics, given_intrinsics
+from modp_ti.inputs.sources.protocol import ImageSource, require_intrinsics
+from modp_ti.inputs.sources.recognition import recognised_kind
+from modp_ti.inputs.sources.release import open_release
+from modp_ti.inputs.sources.replica import open_replica
+from modp_ti.inputs.sources.sevenscenes import open_sevenscenes
+from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
+from modp_ti.inputs.sources.undistortion import Undistorter
+from modp_ti.inputs.sources.video_file import VideoFile
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from modp_ti.config.settings import SourceSettings
+
+__all__ = [
+    "NO_DISTORTION",
+    "Distortion",
+    "FrameReader",
+    "ImageFolder",
+    "ImageSource",
+    "Intrinsics",
+    "Picture",
+    "Undistorter",
+    "VideoFile",
+    "open_source",
+    "require_intrinsics",
+]
+
+
+def open_source(source: SourceSettings) -> ImageSource:
+    """The images that the configuration names, with `source.intrinsics` where they are given.
+
+    Raises InputError where there are none, or the intrinsics are those of another size.
+    """
+    if source.stream is not None:
+        from modp_ti.inputs.sources.live import LiveSource
+
+        live = LiveSource(source.stream)
+        try:
+            return _with_camera(live, source)
+        except InputError:
+            live.close()
+            raise
+    path = source.require_path()
+    kind = recognised_kind(path) if source.kind == "auto" else source.kind
+    images = _OPENERS[kind](path, source)
+    if source.kind == "auto" and kind not in ("images", "video", "vrs"):
+        images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
+    return _with_camera(images, source)
+
+
+def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:
+    # Imported here: projectaria-tools is an extra.
+    from modp_ti.inputs.sources.aria_vrs import AriaRecording
+
+    return AriaRecording(path, source.vrs, source.vignette)
+
+
+_OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
+    "images": lambda path, source: ImageFolder(path, source.fps),
+    "video": lambda path, source: VideoFile(path, source.fps, source.stop),
+    "tum_rgbd": lambda path, _: open_tum_rgbd(path),
+    "replica": lambda path, source: open_replica(path, source.fps),
+    "sevenscenes": lambda path, source: open_sevenscenes(path, source.fps),
+    "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
+    "vrs": _open_vrs,
+}
+"""What opens a path, by `source.kind`."""
+
+
+def _with_camera(images: ImageSource, source: SourceSettings) -> ImageSource:
+    """The source with the user's intrinsics, or its own where they are of the images' size."""
+    if source.intrinsics.given:
+        images.intrinsics = given_intrinsics(source.intrinsics, *images.frame_size)
+        return images
+    if images.intrinsics is None:
+        return images
+    camera = images.intrinsics.camera
+    width, height = images.frame_size
+    if (camera.width, camera.height) != (width, height):
+        images.intrinsics = None
+        images.add_note(
+            f"{images.path}: the images are {width}x{height}, the data set's camera {camera.width}x{camera.height}: "
+            "give source.intrinsics where the tracker brings no camera"
+        )
+    return images

@@ -1,0 +1,190 @@
+"""Source `vrs`: the RGB camera of a Project Aria recording, undistorted to pinhole images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.known_frames import KnownFrames
+from modp_ti.inputs.sources.vignette import read_vignette
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import VrsSettings
+
+__all__ = ["AriaRecording"]
+
+RGB = "camera-rgb"
+
+
+class AriaRecording(KnownFrames):
+    """An `ImageSource` of a VRS file's `camera-rgb`. Frame n is called `<file's name without suffix>_<n, six digits>`.
+
+    The images are those of a pinhole camera in the place of the fisheye, with its axes: Aria's RGB camera is mounted
+    on its side, so that the scene's "up" is the image's left. Times are those of capture on the device's clock [s],
+    which MPS trajectories use as well.
+
+    T_device_camera (4, 4): where the camera is on the device, OpenCV axes, by the recording's calibration. vignette
+    (H, W, 3): how much light reaches each part of the pinhole image, 0 where the fisheye does not look; None where
+    nothing is known and it looks everywhere. mask: Aria's vignetting mask, of the recorded image.
+
+    Raises InputError where projectaria-tools is not installed, for a file that is missing, no recording, without RGB
+    images or their calibration, and for a mask that is not of the recorded size.
+    """
+
+    def __init__(self, path: Path, pinhole: VrsSettings, mask: Path | None = None) -> None:
+        try:
+            from projectaria_tools.core import calibration, data_provider, sensor_data
+        except ImportError as error:
+            raise InputError(
+                f"{path}: reading a VRS recording needs projectaria-tools ({error}): pip install 'modp-ti[aria]'"
+            ) from None
+        self._lock = Lock()
+        if not path.is_file():
+            raise InputError(f"{path}: no such VRS file (source.path)")
+        try:
+            with _quiet():
+                provider = data_provider.create_vrs_data_provider(str(path))
+        except RuntimeError:  # as for a file that ends before its configuration
+            provider = None
+        if provider is None:
+            raise InputError(f"{path}: not a VRS recording, or it is cut off before its first image; copy it again")
+        self._provider: Any = provider
+        labels = [provider.get_label_from_stream_id(stream) for stream in provider.get_all_streams()]
+        self._stream = provider.get_stream_id_from_label(RGB) if RGB in labels else None
+        if self._stream is None:
+            raise InputError(
+                f"{path}: holds no stream {RGB}, which the map is made of; it holds {', '.join(labels) or 'none'}: "
+                "record with a profile that has RGB"
+            )
+        if provider.get_num_data(self._stream) == 0:
+            raise InputError(f"{path}: holds no image of {RGB}, which the map is made of; is the file cut off?")
+        device = provider.get_device_calibration()
+        fisheye = None if device is None else device.get_camera_calib(RGB)
+        if fisheye is None:
+            raise InputError(f"{path}: holds no calibration of {RGB}, without which its images cannot be undistorted")
+        T_device_camera = np.asarray(fisheye.get_transform_device_camera().to_matrix())
+
+        nanoseconds = provider.get_timestamps_ns(self._stream, sensor_data.TimeDomain.DEVICE_TIME)
+        times = np.array(nanoseconds, dtype=np.float64) * 1e-9
+        super().__init__(path, [f"{path.stem}_{i:06d}" for i in range(len(times))], times)
+        self.T_device_camera = T_device_camera
+
+        raw = self._recorded(0)
+        width, height = (int(value) for value in fisheye.get_image_size())
+        if raw.shape[:2] != (height, width):
+            raise InputError(
+                f"{path}: images of {RGB} are {raw.shape[1]}x{raw.shape[0]}, their calibration is for {width}x{height}"
+            )
+        camera = calibration.get_linear_camera_calibration(pinhole.width, pinhole.height, pinhole.focal)
+        self._rectification = _Rectification(calibration.distort_by_calibration, camera, fisheye)
+        fx, fy = (float(value) for value in camera.get_focal_lengths())
+        cx, cy = (float(value) for value in camera.get_principal_point())  # of pixel centres at whole numbers
+        self.intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, pinhole.width, pinhole.height))
+        self.vignette = self._light(mask, width, height)
+        self.add_note(
+            f"{path.name} is undistorted to {pinhole.width}x{pinhole.height}, f = {pinhole.focal:g} px, and lies on "
+            "its side as it was recorded: the scene's up is the image's left"
+        )
+        if mask is None:
+            self.add_note(
+                "Aria's lens darkens toward the edge: give its vignetting mask as source.vignette "
+                "(rgb_vignetting_half_reso_mask.png or rgb_vignetting_full_reso_mask.png of Project Aria)"
+            )
+
+    def size(self, name: str) -> tuple[int, int]:
+        """(width, height) of the pinhole images."""
+        assert name in self._position and self.intrinsics is not None, name
+        return self.intrinsics.camera.width, self.intrinsics.camera.height
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Pinhole image (H, W, 3) uint8 RGB; black where the fisheye does not look.
+
+        Raises InputError where it cannot be decoded.
+        """
+        return self._rectification(self._recorded(self._position[name]))
+
+    def close(self) -> None:
+        """Close the recording."""
+        with self._lock:
+            self._provider = None
+
+    def _recorded(self, index: int) -> NDArray[np.uint8]:
+        """The fisheye image (H, W, 3) uint8 RGB."""
+        with self._lock:
+            try:
+                data, _ = self._provider.get_image_data_by_index(self._stream, index)
+                image = data.to_numpy_array() if data.is_valid() else None
+            except (RuntimeError, ValueError, IndexError):
+                image = None
+        if image is None or image.dtype != np.uint8:
+            raise InputError(f"{self.path}: image {index} of {RGB} cannot be decoded; the recording is damaged there")
+        return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+    def _light(self, mask: Path | None, width: int, height: int) -> NDArray[np.float32] | None:
+        """`vignette`."""
+        covered = self._rectification.covered
+        if mask is None:
+            return None if covered.all() else np.repeat(covered[..., None], 3, axis=2).astype(np.float32)
+        light = read_vignette(mask)
+        if light.shape[:2] != (height, width):
+            raise InputError(
+                f"{mask} is {light.shape[1]}x{light.shape[0]}, the recorded images are {width}x{height}: give Aria's "
+                "mask of that size (rgb_vignetting_half_reso_mask.png is for 1408, ..._full_reso_mask.png for 2880)"
+            )
+        return np.where(covered[..., None], np.clip(self._rectification(light), 0.0, 1.0), 0.0)
+
+
+class _Rectification:
+    """Takes fisheye images (H0, W0, 3) of uint8 or float32 to those of the pinhole camera (H, W, 3).
+
+    covered: (H, W), where the fisheye looks. distort: projectaria-tools' `distort_by_calibration`, which says where
+    each pixel looks; from there on a lookup serves, ten times as fast, and with what a smaller image needs against
+    aliasing.
+    """
+
+    def __init__(self, distort, camera, fisheye) -> None:
+        width, height = (int(value) for value in fisheye.get_image_size())
+        # Images of the coordinates, from 1 on: the library writes 0 where a pixel sees nothing.
+        x, y = np.meshgrid(np.arange(1, width + 1, dtype=np.float32), np.arange(1, height + 1, dtype=np.float32))
+        x, y = (np.asarray(distort(np.ascontiguousarray(plane), camera, fisheye)) for plane in (x, y))
+        self.covered: NDArray[np.bool_] = (x > 0) & (y > 0)
+        shrink = min(1.0, float(camera.get_focal_lengths()[0] / fisheye.get_focal_lengths()[0]))
+        self._size = (round(width * shrink), round(height * shrink))
+        # x - 1 is the coordinate with pixel centres at whole numbers, x - 0.5 at +0.5.
+        self._x = ((x - 0.5) * (self._size[0] / width) - 0.5).astype(np.float32)
+        self._y = ((y - 0.5) * (self._size[1] / height) - 0.5).astype(np.float32)
+
+    def __call__(self, image: NDArray) -> NDArray:
+        import cv2
+
+        if self._size != (image.shape[1], image.shape[0]):
+            image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        image = cv2.remap(image, self._x, self._y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        image[~self.covered] = 0
+        return image
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps the library from telling what it opens: it writes past Python, to the process's own output."""
+    kept = [os.dup(1), os.dup(2)]
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 1)
+        os.dup2(nothing, 2)
+        yield
+    finally:
+        os.dup2(kept[0], 1)
+        os.dup2(kept[1], 2)
+        for descriptor in (*kept, nothing):
+            os.close(descriptor)

@@ -1,0 +1,146 @@
+"""What an encoded image says of its size, held against its bytes and the memory before a decoder believes it."""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from PIL import BmpImagePlugin, PpmImagePlugin
+from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
+
+from modp_ti.files.memory import available_memory
+from modp_ti.inputs.sources.image_header import HEADER_ERRORS, HeaderReader, JpegHeader, read_tiff_directory
+
+__all__ = ["MAX_IMAGE_PIXELS", "why_undecodable"]
+
+MAX_IMAGE_PIXELS = 1 << 27
+"""Of an image; the largest cameras have about 150 million, and the map works on far fewer."""
+
+# Bytes a pixel while it is decoded: the colours of up to 16 bits a channel, and the copy in the order of ours.
+DECODED_BYTES = 12
+# Deflate makes 1032 bytes of one at most; JPEG spends a bit at least on a block of 64 pixels, in the channel that has
+# the most of them, which is at least a quarter of the image's size.
+MOST_INFLATED = 1032
+INFLATED_AT_A_TIME = 1 << 18
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's kind of colour
+MOST_JPEG_PIXELS = 2048  # a byte
+# Least bits per pixel of the PNM formats: text has a digit and a separator per value, except in bitmaps.
+PNM_BITS = {b"1": 8, b"2": 16, b"3": 48, b"4": 1, b"5": 8, b"6": 24}
+
+
+@dataclass(frozen=True)
+class _Claim:
+    """width, height [px]; least: bytes that the file must have for that."""
+
+    width: int
+    height: int
+    least: int = 0
+
+
+def why_undecodable(data: bytes) -> str | None:
+    """Why a decoder should not be let near these bytes, in words; None where it may be.
+
+    JPEG, PNG, BMP, TIFF, WebP and PNM are let through, with a size that memory and the file's length allow.
+    """
+    read = next((reader for magic, reader in FORMATS if re.match(magic, data[:16], re.DOTALL)), None)
+    if read is None:
+        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM or PGM)"
+    try:
+        claim = read(data)
+    except HEADER_ERRORS:
+        return "its header is damaged"
+    if claim.width < 1 or claim.height < 1:
+        return f"its header says {claim.width}x{claim.height} pixels"
+    if claim.width * claim.height > MAX_IMAGE_PIXELS:
+        return f"its {claim.width}x{claim.height} pixels are more than {MAX_IMAGE_PIXELS:,}"
+    if claim.width * claim.height * DECODED_BYTES > available_memory():
+        return f"its {claim.width}x{claim.height} pixels do not fit into this machine's memory"
+    if claim.least > len(data):
+        return f"the file is cut off: {claim.width}x{claim.height} pixels cannot be in {len(data)} bytes"
+    if read is _png and not _inflates(data):
+        return "its pixels are damaged or missing"
+    return None
+
+
+def _png(data: bytes) -> _Claim:
+    if data[12:16] != b"IHDR":
+        raise ValueError
+    width, height, depth, kind, *_ = struct.unpack_from(">IIBBBBB", data, 16)
+    channels = PNG_CHANNELS.get(kind, 0)
+    if channels == 0 or depth not in (1, 2, 4, 8, 16):
+        raise ValueError
+    return _Claim(width, height, height * (1 + width * channels * depth // 8) // MOST_INFLATED)
+
+
+def _inflates(data: bytes) -> bool:
+    """Whether a PNG's content unpacks to all of its rows. The decoder would find out too, and write to the terminal."""
+    width, height, depth, kind, _, _, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
+    wanted = 0 if interlaced else height * (1 + (width * PNG_CHANNELS[kind] * depth + 7) // 8)
+    inflater, found, at = zlib.decompressobj(), 0, 8
+    try:
+        while at + 12 <= len(data) and not inflater.eof:
+            (length,) = struct.unpack_from(">I", data, at)
+            if data[at + 4 : at + 8] == b"IDAT":
+                rest = memoryview(data)[at + 8 : at + 8 + length]
+                while rest and not inflater.eof:
+                    found += len(inflater.decompress(rest, INFLATED_AT_A_TIME))
+                    rest = inflater.unconsumed_tail
+            at += 12 + length
+    except zlib.error:
+        return False
+    return inflater.eof and found >= wanted
+
+
+def _jpeg(data: bytes) -> _Claim:
+    width, height = JpegHeader(HeaderReader(io.BytesIO(data))).size
+    return _Claim(width, height, width * height // MOST_JPEG_PIXELS)
+
+
+def _bmp(data: bytes) -> _Claim:
+    image = BmpImagePlugin.BmpImageFile(HeaderReader(io.BytesIO(data)))
+    codec, _, _, parameters = image.tile[0]
+    # The last row may lack its padding.
+    return _Claim(*image.size, (image.height - 1) * parameters[1] if codec == "raw" else 0)
+
+
+def _pnm(data: bytes) -> _Claim:
+    width, height = PpmImagePlugin.PpmImageFile(HeaderReader(io.BytesIO(data))).size
+    return _Claim(width, height, width * height * PNM_BITS[data[1:2]] // 8)
+
+
+def _webp(data: bytes) -> _Claim:
+    """Without Pillow, whose reader allocates two canvases of the declared size."""
+    kind = data[12:16]
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", data, 26)
+        return _Claim(width & 0x3FFF, height & 0x3FFF)
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return _Claim((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
+    if kind == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+        return _Claim(width, height)
+    raise ValueError
+
+
+def _tiff(data: bytes) -> _Claim:
+    """Of the first image in the file. A tile may be larger than the image, and is decoded as a whole."""
+    found = read_tiff_directory(data)
+    sizes = found[IMAGEWIDTH], found[IMAGELENGTH], found.get(TILEWIDTH, 1), found.get(TILELENGTH, 1)
+    if not all(isinstance(size, int) for size in sizes):
+        raise ValueError
+    return _Claim(max(sizes[::2]), max(sizes[1::2]))
+
+
+FORMATS: tuple[tuple[bytes, Callable[[bytes], _Claim]], ...] = (
+    (rb"\x89PNG\r\n\x1a\n", _png),
+    (rb"\xff\xd8", _jpeg),
+    (rb"BM", _bmp),
+    (rb"II\*\0|MM\0\*|II\+\0|MM\0\+", _tiff),
+    (rb"RIFF....WEBP", _webp),
+    (rb"P[1-6]\s", _pnm),
+)

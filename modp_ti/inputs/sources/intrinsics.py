@@ -1,0 +1,78 @@
+"""Intrinsics of stored images, before they are undistorted and scaled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.inputs.sources.undistortion import Undistorter
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import IntrinsicsSettings
+
+__all__ = ["MAX_SIDE", "Intrinsics", "given_intrinsics", "require_plausible"]
+
+MAX_SIDE = 1 << 16
+"""Pixels on a side of an image; no camera has more."""
+# Numbers of a camera beyond these were damaged on their way: focal lengths and centres [px], coefficients of a lens.
+MAX_PIXELS_OF_FOCUS = 1e7
+MAX_COEFFICIENT = 1e6
+
+# A principal point this far from the middle, as a share of the image's side, is more likely of another image size.
+# Intrinsics of twice or half the size put it at 1 or at 0.25.
+OFF_CENTRE = 0.2
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """camera: pinhole part at the stored size, pixel centres at +0.5. distortion: the lens.
+
+    note: what the user should know where they are relied upon.
+    """
+
+    camera: PinholeCamera
+    distortion: Distortion = NO_DISTORTION
+    note: str | None = None
+
+    def undistorter(self, scale: float) -> Undistorter:
+        """What takes the stored images to the working size."""
+        return Undistorter(self.camera, self.distortion, scale)
+
+
+def given_intrinsics(given: IntrinsicsSettings, width: int, height: int) -> Intrinsics:
+    """`source.intrinsics`, which are given, for stored images of this size.
+
+    Raises InputError where they belong to another size.
+    """
+    assert given.fx is not None
+    if given.width is not None and (given.width, given.height) != (width, height):
+        raise InputError(
+            f"source.intrinsics are for {given.width}x{given.height}, the images are {width}x{height}: give those of "
+            "the stored images (source.scale scales both)"
+        )
+    cx, cy = (width / 2 if given.cx is None else given.cx), (height / 2 if given.cy is None else given.cy)
+    if given.width is None and max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > OFF_CENTRE:
+        raise InputError(
+            f"source.intrinsics: cx {cx:g}, cy {cy:g} lie far from the middle of the {width}x{height} images: give "
+            "those of the stored size; where they are right, add width and height to them"
+        )
+    camera = PinholeCamera(given.fx, given.fy or given.fx, cx, cy, width, height)
+    if given.fisheye:
+        return Intrinsics(camera, Distortion((given.k1, given.k2, given.k3, given.k4), fisheye=True))
+    return Intrinsics(camera, Distortion((given.k1, given.k2, given.k3), tangential=(given.p1, given.p2)))
+
+
+def require_plausible(camera: PinholeCamera, lens: Distortion, what: str) -> tuple[PinholeCamera, Distortion]:
+    """The camera and its lens as a file states them. Raises InputError that starts with `what` where they cannot be."""
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise InputError(f"{what}: images of {camera.width:.6g}x{camera.height:.6g} pixels: at most {MAX_SIDE} a side")
+    if not (camera.fx > 1 / MAX_PIXELS_OF_FOCUS and camera.fy > 1 / MAX_PIXELS_OF_FOCUS):
+        raise InputError(f"{what}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are none")
+    if not all(abs(value) <= MAX_PIXELS_OF_FOCUS for value in (camera.fx, camera.fy, camera.cx, camera.cy)):
+        raise InputError(f"{what}: fx, fy, cx or cy is no number of pixels that a camera has")
+    if not all(abs(value) <= MAX_COEFFICIENT for value in (*lens.numerator, *lens.denominator, *lens.tangential)):
+        raise InputError(f"{what}: the lens's coefficients are none that a lens has")
+    return camera, lens

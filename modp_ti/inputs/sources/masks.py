@@ -1,0 +1,60 @@
+"""Which pixels of a stored image count: a folder of masks, a colour that stands for "nothing here", or both."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.image_folder import ImageFolder
+
+__all__ = ["MaskFolder", "differs_from_colour"]
+
+VALID_FROM = 128  # grey value
+
+
+class MaskFolder:
+    """One mask an image, white where it is valid and black where it is to be ignored.
+
+    A mask has the image's path below the folder, or only its name, with any image suffix in the place of the image's
+    own or behind it (`0001.png` or `0001.jpg.png` for `0001.jpg`). Raises InputError where there is no such folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._images = ImageFolder(path, setting="source.masks")
+
+    def find(self, name: str) -> str:
+        """The mask of the image `name`. Raises InputError where there is none."""
+        parts = PurePosixPath(name).parts
+        for first in range(len(parts)):
+            tail = PurePosixPath(*parts[first:])
+            for stem in (tail.with_suffix(""), tail):
+                found = self._images.with_stem(str(stem))
+                if found is not None:
+                    return found
+        raise InputError(
+            f"{self._images.path}: has no mask for {name}: add {PurePosixPath(name).stem}.png, white where the image "
+            "is valid (source.masks)"
+        )
+
+    def require_size(self, name: str, width: int, height: int) -> None:
+        """Raises InputError where the image's mask is missing, unreadable or not of the stored image's size."""
+        mask = self.find(name)
+        found = self._images.size(mask)
+        if found != (width, height):
+            raise InputError(
+                f"{self._images.path / mask} is {found[0]}x{found[1]}, its image {name} is {width}x{height}: "
+                "masks must have the size of the stored images"
+            )
+
+    def read(self, name: str) -> NDArray[np.bool_]:
+        """True (H, W) where the image `name` is valid. Raises InputError for a mask that is missing or unreadable."""
+        return self._images.read(self.find(name)).max(axis=2) >= VALID_FROM
+
+
+def differs_from_colour(image: NDArray[np.uint8], colour: tuple[int, int, int], tolerance: int) -> NDArray[np.bool_]:
+    """True (H, W) where a channel of the image (H, W, 3) is more than `tolerance` away from `colour`."""
+    difference = np.abs(image.astype(np.int16) - np.array(colour, dtype=np.int16))
+    return (difference > tolerance).any(axis=2)

@@ -1,0 +1,108 @@
+"""Source `tum_rgbd`: a folder of the TUM RGB-D benchmark, listed with its time stamps in `rgb.txt`."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files import LARGEST, is_file, text_lines
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.listed_images import ListedImages
+
+__all__ = ["open_tum_rgbd", "read_listing"]
+
+WIDTH, HEIGHT = 640, 480
+
+# What the benchmark publishes for its three cameras: fx, fy, cx, cy with pixel centres at whole numbers, and the lens
+# (the images of the third are undistorted).
+CAMERAS = {
+    1: (517.3, 516.5, 318.6, 255.3, Distortion((0.2624, -0.9531, 1.1633), tangential=(-0.0054, 0.0026))),
+    2: (520.9, 521.0, 325.1, 249.7, Distortion((0.2312, -0.7849, 0.9172), tangential=(-0.0033, -0.0001))),
+    3: (535.4, 539.2, 320.1, 247.6, NO_DISTORTION),
+}
+CAMERA_NAME = re.compile(r"(?:freiburg|fr)[-_ ]?([123])(?![0-9])", re.IGNORECASE)
+
+
+def open_tum_rgbd(path: Path) -> ListedImages:
+    """The images that `rgb.txt` lists and that are there. Times are the listing's.
+
+    Raises InputError (with file and line) for a listing that is missing, malformed, unordered, or without any image.
+    """
+    listing = path / "rgb.txt"
+    entries = read_listing(listing)
+    there = [(time, name) for time, name in entries if is_file(path / name)]
+    if not there:
+        raise InputError(
+            f"{listing}: none of its {len(entries)} images is there, the first is {entries[0][1]}: "
+            "unpack the whole sequence, or correct the listing"
+        )
+    notes = []
+    if len(there) < len(entries):
+        notes.append(f"{len(entries) - len(there)} of the {len(entries)} images that {listing} lists are not there")
+    number = _camera_number(path, listing)
+    if number is None:
+        intrinsics = None
+        notes.append(
+            f"{path} names none of the benchmark's cameras (freiburg1, freiburg2, freiburg3 or fr1, fr2, fr3): "
+            "give source.intrinsics where the tracker brings no camera"
+        )
+    else:
+        fx, fy, cx, cy, distortion = CAMERAS[number]
+        # Their pixel centres lie at whole numbers, ours at +0.5.
+        intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, WIDTH, HEIGHT), distortion)
+        notes.append(f"the camera is taken to be the benchmark's freiburg{number}")
+    return ListedImages(path, [name for _, name in there], [time for time, _ in there], intrinsics, notes)
+
+
+def read_listing(file: Path) -> list[tuple[float, str]]:
+    """(time [s], path) of each line of a listing such as `rgb.txt`; `#` starts a comment.
+
+    Raises InputError for a listing that is missing, empty or malformed, times out of order, a path listed twice.
+    """
+    entries: list[tuple[float, str]] = []
+    first_line: dict[str, int] = {}
+    for number, line in enumerate(_lines(file), 1):
+        words = line.partition("#")[0].split(maxsplit=1)
+        if not words:
+            continue
+        where = f"{file}:{number}"
+        if len(words) != 2:
+            raise InputError(f"{where}: must be a time stamp and a path, not {line.strip()!r}")
+        name = Path(words[1].strip()).as_posix()
+        try:
+            time = float(words[0])
+        except ValueError:
+            time = math.nan
+        if not abs(time) <= LARGEST:
+            raise InputError(f"{where}: the time stamp {words[0]!r} is no finite number of seconds")
+        if entries and time <= entries[-1][0]:
+            raise InputError(f"{where}: time stamp {words[0]} is not later than the one before; sort the listing")
+        if name in first_line:
+            raise InputError(f"{where}: {name} is listed before, in line {first_line[name]}; take one of them out")
+        first_line[name] = number
+        entries.append((time, name))
+    if not entries:
+        raise InputError(f"{file}: lists no image; its lines must be a time stamp and a path")
+    return entries
+
+
+def _lines(file: Path) -> Iterator[str]:
+    try:
+        yield from text_lines(file, "utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InputError(f"{file}: the listing of the images cannot be read: {reason}") from None
+
+
+def _camera_number(path: Path, listing: Path) -> int | None:
+    """1, 2 or 3, from the folder's name, else from the recording that the listing's comments name."""
+    found = CAMERA_NAME.search(path.resolve().name)
+    if found is None:
+        comments = [line for line in _lines(listing) if line.startswith("#")]
+        found = next(filter(None, map(CAMERA_NAME.search, comments)), None)
+    return None if found is None else int(found.group(1))

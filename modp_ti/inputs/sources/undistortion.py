@@ -1,0 +1,135 @@
+"""From stored images to pinhole images at the working size."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+
+__all__ = ["Undistorter"]
+
+# Ideal points are searched for up to this multiple of the image corner's radius; beyond it they are far
+# outside.
+SEARCH_MARGIN = 1.5
+
+
+class Undistorter:
+    """Takes a camera's images and pixels to those of a pinhole camera of the same focal length, scaled.
+
+    raw: intrinsics and size of the stored images. scale: factor on width and height; the size is rounded to
+    whole pixels and each axis of the intrinsics follows its exact ratio. `camera` is the camera of the
+    result.
+    """
+
+    def __init__(self, raw: PinholeCamera, distortion: Distortion = NO_DISTORTION, scale: float = 1.0) -> None:
+        self.raw = raw
+        self.distortion = distortion
+        self.camera = raw.resized(max(1, round(raw.width * scale)), max(1, round(raw.height * scale)))
+        corners = np.array([[0, 0], [raw.width, 0], [0, raw.height], [raw.width, raw.height]], dtype=np.float64)
+        self._limit = SEARCH_MARGIN * float(np.linalg.norm(_normalised(raw, corners), axis=1).max())
+
+    def points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Pixels (N, 2) of the result for pixels (N, 2) of the stored image.
+
+        NaN where the lens model has no inverse.
+        """
+        if self.distortion.is_identity:
+            size, out = (self.raw.width, self.raw.height), (self.camera.width, self.camera.height)
+            return np.asarray(pixels, dtype=np.float64) * np.divide(out, size)
+        return _pixels(self.camera, self.distortion.undistort(_normalised(self.raw, pixels), self._limit))
+
+    def image(
+        self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+        """Undistorted, scaled image (H, W, 3) float32 in [0, 1] of a stored one (H0, W0, 3) uint8.
+
+        With it the mask (H, W) of the pixels that the stored image covers, None where it covers all. valid: (H0, W0),
+        False for pixels of the stored image to be ignored: nothing of them comes into the image, and a pixel that more
+        than half consists of them is masked.
+        """
+        if raw.shape != (self.raw.height, self.raw.width, 3) or raw.dtype != np.uint8:
+            raise ValueError(f"image is {raw.shape} {raw.dtype}, the camera {self.raw.width}x{self.raw.height}")
+        mask = None if self._lookup is None else self._lookup[2]
+        if valid is None:
+            return self._resampled(raw).astype(np.float32) / 255.0, mask
+        if valid.shape != raw.shape[:2]:
+            raise ValueError(f"valid is {valid.shape}, the image {raw.shape}")
+        share = self._resampled(valid.astype(np.float32))
+        image = self._resampled(np.where(valid[..., None], raw, 0).astype(np.float32))
+        image = np.clip(image / np.maximum(share, 0.5)[..., None] / 255.0, 0.0, 1.0)
+        kept = share >= 0.5
+        return image, kept if mask is None else kept & mask
+
+    def grey(
+        self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """Grey image (H, W) uint8, undistorted and scaled, of a stored one, for features; its mask as for `image`.
+
+        Ignored pixels keep their grey: no feature may be where the mask is False.
+        """
+        import cv2
+
+        mask = None if self._lookup is None else self._lookup[2]
+        grey = self._resampled(cv2.cvtColor(raw, cv2.COLOR_RGB2GRAY))
+        if valid is None:
+            return grey, mask
+        kept = self._resampled(valid.astype(np.float32)) >= 0.5
+        return grey, kept if mask is None else kept & mask
+
+    def smooth(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A smooth picture of the stored image's field of view (H1, W1, 3), as it is in the delivered one (H, W, 3)."""
+        import cv2
+
+        size = (self.camera.width, self.camera.height)
+        shrinks = picture.shape[1] > size[0]
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return self._remapped(picture, cv2.INTER_LINEAR)
+
+    def _resampled(self, image: NDArray) -> NDArray:
+        """A stored image, or one such channel, at the working size and undistorted."""
+        import cv2
+
+        size = (self.camera.width, self.camera.height)
+        if size != (self.raw.width, self.raw.height):
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        # Cubic: at about one sample a pixel the linear filter blurs by an amount that depends on the place.
+        return self._remapped(image, cv2.INTER_CUBIC)
+
+    def _remapped(self, image: NDArray, interpolation: int) -> NDArray:
+        import cv2
+
+        if self._lookup is None:
+            return image
+        x, y, _ = self._lookup
+        return cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
+
+    @cached_property
+    def _lookup(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_] | None] | None:
+        """Where each pixel looks in the scaled image, x and y in cv2's coordinates, and the mask."""
+        if self.distortion.is_identity:
+            return None
+        camera = self.camera
+        columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+        ideal = _normalised(camera, np.stack(np.meshgrid(columns, rows), axis=-1))
+        source = _pixels(camera, self.distortion.distort(ideal))
+        valid_radius = self.distortion.valid_radius(self._limit)
+        inside = np.linalg.norm(ideal, axis=-1) <= valid_radius
+        inside &= camera.contains(source.reshape(-1, 2)).reshape(inside.shape)
+        mask = None if inside.all() else inside
+        if mask is not None:
+            mask.flags.writeable = False  # one array serves every frame
+        lookup = (source - 0.5).astype(np.float32)
+        return np.ascontiguousarray(lookup[..., 0]), np.ascontiguousarray(lookup[..., 1]), mask
+
+
+def _normalised(camera: PinholeCamera, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+    pixels = np.asarray(pixels, dtype=np.float64)
+    return (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+
+
+def _pixels(camera: PinholeCamera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return points * (camera.fx, camera.fy) + (camera.cx, camera.cy)

@@ -1,0 +1,128 @@
+"""Decoding of a video file with PyAV (FFmpeg): frames with their index, time stamp and rotation, and seeking."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from av.video.reformatter import VideoReformatter
+from numpy.typing import NDArray
+
+from modp_ti.inputs.sources.image_bounds import MAX_IMAGE_PIXELS
+
+__all__ = ["VideoDecoder"]
+
+# FFmpeg's names of the formats that may be opened: video containers, but no playlists, which refer to other files.
+CONTAINERS = (
+    "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo,h264,hevc,vvc,m4v,mjpeg,asf,flv,ogg,"
+    "ivf,obu,av1,dv,gxf,mxf,nut,rm,wtv,yuv4mpegpipe,gif,apng"
+)
+# Options of the decoder.
+LIMITS = {"max_pixels": str(MAX_IMAGE_PIXELS)}
+# What PyAV raises for malformed files.
+DECODING_ERRORS = (av.FFmpegError, OSError, ValueError, ArithmeticError, MemoryError)
+
+
+class VideoDecoder:
+    """Decodes the first video stream of a file, frame by frame.
+
+    Args:
+        path: The video file.
+        in_threads: Decode in several threads. This is faster, but damaged parts look different each time.
+        form: (width, height, degrees clockwise) that all frames are scaled and rotated to; the first frame's if None.
+
+    Attributes:
+        index: Index of the frame that was decoded last, -1 before the first.
+        form: As the argument, set when the first image is taken.
+
+    Raises:
+        OSError: FFmpeg does not recognise the file as a video.
+    """
+
+    def __init__(self, path: Path, in_threads: bool, form: tuple[int, int, int] | None = None) -> None:
+        options = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file", **LIMITS}
+        try:
+            self._container = av.open(f"file:{path}", options=options, metadata_errors="replace")
+        except DECODING_ERRORS:
+            raise OSError(str(path)) from None
+        self._stream = next(iter(self._container.streams.video), None)
+        if self._stream is None or self._stream.codec_context is None:  # a codec unknown to FFmpeg
+            self._container.close()
+            raise OSError(str(path))
+        self._stream.codec_context.options = LIMITS
+        if in_threads:
+            self._stream.thread_type = "AUTO"
+        else:
+            self._stream.codec_context.thread_count = 1
+        self._unit = float(self._stream.time_base or 0)  # [s]
+        self._start = self._stream.start_time or 0
+        self._reformatter = VideoReformatter()  # kept: a new one prepares its tables for each frame
+        self._frame: av.VideoFrame | None = None
+        self._frames = self._decoded()
+        self.form = form
+        self.index = -1
+
+    @property
+    def shown(self) -> float:
+        """Time stamp of the frame [ms] from the start of the stream; 0 where the container has none."""
+        if self._frame is None or self._frame.pts is None:
+            return 0.0
+        return (self._frame.pts - self._start) * self._unit * 1000.0
+
+    def advance(self) -> bool:
+        """Decode the next frame; False at the end."""
+        self._frame = next(self._frames, None)
+        self.index += self._frame is not None
+        return self._frame is not None
+
+    def advance_to(self, index: int) -> bool:
+        while self.index < index:
+            if not self.advance():
+                return False
+        return self.index == index
+
+    def seek(self, milliseconds: float) -> float | None:
+        """Seek to about this time and decode a frame: its time stamp, or None at the end. `index` is invalid then."""
+        try:
+            self._container.seek(self._start + round(milliseconds / 1000.0 / self._unit), stream=self._stream)
+        except (*DECODING_ERRORS, AssertionError):  # the last if the container is closed
+            return None
+        self._frames = self._decoded()
+        return self.shown if self.advance() else None
+
+    def image(self) -> NDArray[np.uint8] | None:
+        """The frame that was decoded last, (H, W, 3) RGB; None if it cannot be converted."""
+        if self._frame is None:
+            return None
+        if self.form is None:
+            quarters, rest = divmod(1 - self._frame.rotation, 90)  # PyAV truncates 89.99 to 89
+            self.form = self._frame.width, self._frame.height, quarters % 4 * 90 if rest <= 2 else 0
+        width, height, turned = self.form
+        try:
+            # BGR and this filter make frames bit-identical to those of OpenCV's reader; direct RGB not always.
+            shown = self._reformatter.reformat(self._frame, width, height, "bgr24", interpolation="BICUBIC")
+            image = shown.to_ndarray()[..., ::-1]
+        except DECODING_ERRORS:
+            return None
+        return np.ascontiguousarray(np.rot90(image, -turned // 90))
+
+    def close(self) -> None:
+        self._frame, self._frames = None, iter(())
+        self._container.close()
+
+    def _decoded(self) -> Iterator[av.VideoFrame]:
+        """The frames from here on. Packets that cannot be decoded are skipped, as `ffmpeg` does."""
+        for packet in self._packets():
+            try:
+                yield from self._stream.decode(packet)
+            except DECODING_ERRORS:
+                continue
+
+    def _packets(self) -> Iterator[av.Packet | None]:
+        """The packets from here on; after a read error None, which flushes the decoder."""
+        try:
+            yield from self._container.demux(self._stream)
+        except DECODING_ERRORS:
+            yield None

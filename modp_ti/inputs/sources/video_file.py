@@ -1,0 +1,200 @@
+"""Source `video`: the frames of a video file, in any order."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.known_frames import KnownFrames
+from modp_ti.inputs.sources.video_container import missing_bytes
+
+if TYPE_CHECKING:
+    from modp_ti.inputs.sources.video_decoder import VideoDecoder
+
+__all__ = ["VIDEO_SUFFIXES", "VideoFile"]
+
+VIDEO_SUFFIXES = (
+    *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
+    *(".wmv", ".flv", ".3gp", ".ogv", ".h264", ".h265", ".hevc", ".mjpg", ".mjpeg"),
+)
+
+# Up to this many frames ahead are decoded and passed over; further ones are sought, which decodes from the last
+# keyframe of the stream, some 250 frames away at most.
+PASSED_OVER = 60
+# How long before the wanted frame [s] to seek; the next one is tried if a seek lands behind the frame.
+SEEK_MARGINS = (0.0, 1.0, 10.0, 100.0)
+
+
+class VideoFile(KnownFrames):
+    """An `ImageSource` of a video file. Frame n, from 0, is called `<file's name without suffix>_<n with six digits>`.
+
+    The file is decoded once when it is opened, as only that tells how many frames it has and when they are shown;
+    with `stop`, up to there. Frames are turned as the file asks (phones record portraits lying). Times are the
+    container's; fps: where it has none.
+
+    A frame is the same whenever and in whatever order it is read: new ones come from a decoder that goes forward from
+    the first, older ones from a second one, which seeks, and whose frames are compared with a checksum of the first
+    reading. May be read from several threads.
+
+    Raises InputError for a file that is missing, no video, without a frame, or cut off before `stop`.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], fps: float = 30.0, stop: int | None = None) -> None:
+        self.path = Path(path)
+        if not self.path.exists():
+            raise InputError(f"{self.path}: no such video file (source.path)")
+        if not self.path.is_file():
+            raise InputError(f"{self.path}: a video must be a file, this is a folder or a pipe (source.kind)")
+        try:
+            missing = missing_bytes(self.path)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be opened: {error.strerror}") from None
+        self._lock = Lock()
+        self._checksums: dict[int, int] = {}
+        self._seeks = True
+        self._form: tuple[int, int, int] | None = None
+        self._front = self._decoder(missing, in_threads=True)
+        self._back: VideoDecoder | None = None
+
+        shown: list[float] = []
+        first = None
+        while (stop is None or len(shown) < stop) and self._front.advance():
+            shown.append(self._front.shown)
+            if len(shown) == 1:
+                first, self._form = self._front.image(), self._front.form
+        cut_off = bool(missing) and (stop is None or len(shown) < stop)
+        if first is None or cut_off:
+            self.close()
+        if first is None or self._form is None:
+            raise self._useless(missing)
+        if cut_off:
+            raise InputError(
+                f"{self.path}: the video is cut off, {missing} bytes are missing: copy it again, or set source.stop: "
+                f"{len(shown)} to use the frames that can be read"
+            )
+        self._shown = np.array(shown)
+        times, timed = _frame_times(self._shown, fps)
+        super().__init__(self.path, [f"{self.path.stem}_{i:06d}" for i in range(len(shown))], times)
+
+        height, width = first.shape[:2]
+        self._size = (width, height)
+        if turned := self._form[2]:
+            self.add_note(
+                f"{self.path} asks to be turned clockwise by {turned} degrees, and is: its frames are "
+                f"{width}x{height}, and intrinsics are for that"
+            )
+        if not timed:
+            self.add_note(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
+        self._front.close()
+        self._front = self._decoder(missing)
+
+    def size(self, name: str) -> tuple[int, int]:
+        """(width, height) of the frames."""
+        assert name in self._position, name
+        return self._size
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Decoded frame (H, W, 3) uint8 RGB. Raises InputError where it cannot be decoded."""
+        with self._lock:
+            index = self._position[name]
+            image = self._new(index) if index > self._front.index else self._old(index)
+        if image is None:
+            raise InputError(f"{self.path}: frame {index} cannot be decoded (any more); was the file changed?")
+        return image
+
+    def close(self) -> None:
+        """Close the file."""
+        for decoder in (self._front, self._back):
+            if decoder is not None:
+                decoder.close()
+
+    def _new(self, index: int) -> NDArray[np.uint8] | None:
+        """A frame behind all that were read: decoding goes on to there."""
+        if not self._front.advance_to(index):
+            return None
+        image = self._front.image()
+        if image is not None:
+            self._checksums[index] = _checksum(image)
+        return image
+
+    def _old(self, index: int) -> NDArray[np.uint8] | None:
+        """A frame from before the front, checked against its checksum where it was read then."""
+        known = self._checksums.get(index)
+        if self._back is None:
+            self._back = self._decoder()
+        ahead = index - self._back.index
+        if not 0 < ahead <= PASSED_OVER and known is not None and self._seeks and self._seek(index):
+            image = self._back.image()
+            if image is not None and _checksum(image) == known:
+                return image
+            self._seeks = False  # this container's times do not find frames
+        if index <= self._back.index or not self._seeks:
+            self._back.close()
+            self._back = self._decoder()
+        if not self._back.advance_to(index):
+            return None
+        image = self._back.image()
+        if image is None:
+            return None
+        if known is None:
+            self._checksums[index] = _checksum(image)
+        elif _checksum(image) != known and self._seeks:
+            self._seeks = False  # frames were lost behind a place that was sought
+            return self._old(index)
+        return image
+
+    def _seek(self, index: int) -> bool:
+        """Whether the second decoder stands at the frame after a search by its time."""
+        assert self._back is not None
+        for margin in SEEK_MARGINS:
+            landed = self._back.seek(float(self._shown[index]) - 1000.0 * margin)
+            found = [] if landed is None else np.flatnonzero(self._shown == landed)
+            if len(found) == 1 and found[0] <= index:
+                self._back.index = int(found[0])
+                return self._back.advance_to(index)
+        self._back.index = len(self.names)  # somewhere: what comes next begins anew
+        return False
+
+    def _decoder(self, missing: int | None = None, in_threads: bool = False) -> VideoDecoder:
+        from modp_ti.inputs.sources.video_decoder import VideoDecoder
+
+        try:
+            return VideoDecoder(self.path, in_threads, self._form)
+        except OSError:
+            raise self._useless(missing) from None
+
+    def _useless(self, missing: int | None) -> InputError:
+        if self.path.stat().st_size == 0:
+            return InputError(f"{self.path}: the video file is empty")
+        if missing:
+            return InputError(f"{self.path}: the video is cut off, {missing} bytes are missing: copy it again")
+        return InputError(
+            f"{self.path}: no video that FFmpeg can read, or without a frame: convert it, for example with "
+            "`ffmpeg -i in -c:v libx264 out.mp4`"
+        )
+
+
+def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.float64], bool]:
+    """Times [s] that increase, of the times [ms] that a container says; and whether they are the container's.
+
+    Some containers leave the last frames without one: they follow at the usual distance.
+    """
+    falls = np.flatnonzero(np.diff(shown) <= 0)
+    good = int(falls[0]) + 1 if len(falls) else len(shown)
+    if good < max(len(shown) - 32, min(2, len(shown))):
+        return np.arange(len(shown)) / fps, False
+    times = shown / 1000.0
+    distance = float(np.median(np.diff(times[:good]))) if good > 1 else 1.0 / fps
+    times[good:] = times[good - 1] + distance * np.arange(1, len(shown) - good + 1)
+    return times, True
+
+
+def _checksum(image: NDArray[np.uint8]) -> int:
+    return zlib.crc32(np.ascontiguousarray(image))

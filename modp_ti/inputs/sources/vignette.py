@@ -1,0 +1,47 @@
+"""A lens's vignette, photographed: how much of the light reaches each pixel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files import read_bytes
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.image_bounds import why_undecodable
+
+__all__ = ["LEAST_LIGHT", "read_vignette"]
+
+# Where less of the light than this arrives, a pixel holds more noise than picture: it counts as masked.
+LEAST_LIGHT = 0.05
+
+
+def read_vignette(path: Path) -> NDArray[np.float32]:
+    """Vignette image (H, W, 3) float32 of maximum 1, from a grey or colour image of 8 or 16 bits.
+
+    Raises InputError where it is unreadable or black.
+    """
+    import cv2
+
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise InputError(f"{path}: the vignette cannot be opened: {error.strerror} (source.vignette)") from None
+    reason = why_undecodable(data)
+    if data and reason is not None:
+        raise InputError(f"{path}: the vignette is no image that can be used: {reason} (source.vignette)")
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:  # silent: the one line that the user gets is ours
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error:
+        image = None
+    finally:
+        cv2.utils.logging.setLogLevel(log_level)
+    if image is None or not 0 < image.max() < np.inf:
+        raise InputError(f"{path}: the vignette is {'no image' if image is None else 'black'} (source.vignette)")
+    image = image.astype(np.float32) / float(image.max())
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, axis=2)
+    return np.ascontiguousarray(image[..., ::-1])

@@ -1,0 +1,181 @@
+"""The tracked points of a run and where its frames saw them: what is kept for the exports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import TrackedFrame
+from fields.geometry.similarity import moved_points
+from modp_ti.inputs.multiview.observations import Observations
+from modp_ti.inputs.multiview.point_solving import placed_anew
+from pipelines.memory_budget import OBSERVATION
+
+__all__ = ["TrackedPoints"]
+
+# Of a point that only held-out frames saw: their pictures must not come into what is trained on elsewhere.
+UNSEEN = (128, 128, 128)
+# Bytes of a point.
+POINT = 64
+# Rows and pixels of a frame that saw none.
+NOTHING = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+
+
+class TrackedPoints:
+    """Points by the tracker's ids; 12 bytes an observation, 64 a point.
+
+    `rows[i]` (N,) int32 and `pixels[i]` (N, 2) float32 are the points that frame i saw, as rows of `xyz`, and their
+    pixels; none of a frame whose observations found no room.
+    """
+
+    def __init__(self) -> None:
+        self.rows: list[NDArray[np.int32]] = []
+        self.pixels: list[NDArray[np.float32]] = []
+        self._held_out: list[bool] = []
+        self._row_of: dict[int, int] = {}
+        self._xyz = np.zeros((0, 3))
+        self._colours = np.zeros((0, 4))  # sums of red, green, blue, and of how many
+        self._last = np.zeros((0, 1), dtype=np.int64)  # the frame that saw it last
+        self._observations = 0
+
+    def __len__(self) -> int:
+        return len(self._row_of)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of points and observations."""
+        return self._observations * OBSERVATION + len(self) * POINT
+
+    def add(self, frame: TrackedFrame) -> None:
+        """Keep what the next frame saw. A point is where the last frame says that it is."""
+        points = frame.points
+        of = self._row_of
+        rows = np.array([of.setdefault(i, len(of)) for i in points.ids.tolist()], dtype=np.int32)
+        self._grow(len(of))
+        self._xyz[rows] = points.xyz
+        self._last[rows, 0] = len(self.rows)
+        if not frame.held_out:
+            column, row = np.floor(points.pixels).astype(int).T
+            rgba = frame.rgba[row, column]
+            seen = rgba[:, 3] > 0
+            np.add.at(self._colours, rows[seen], np.c_[rgba[seen, :3], np.ones(seen.sum())])
+        self._append(rows, points.pixels.astype(np.float32), frame.held_out)
+
+    def leave_out(self, frame: TrackedFrame) -> None:
+        """Keep nothing of what the next frame saw."""
+        self._append(*NOTHING, frame.held_out)
+
+    def _append(self, rows: NDArray[np.int32], pixels: NDArray[np.float32], held_out: bool) -> None:
+        self.rows.append(rows)
+        self.pixels.append(pixels)
+        self._held_out.append(held_out)
+        self._observations += len(rows)
+
+    def correct(self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Sequence[NDArray[np.float64]]) -> None:
+        """The tracker has revised its map: points `ids` (N,) are at xyz (N, 3) now, as far as frames saw them.
+
+        The others move with the frame that saw them last. motions: S_after_before (4, 4) of the world around a frame.
+        """
+        last, places = self._last[: len(self), 0], self.xyz
+        for frame in np.unique(last):
+            seen = last == frame
+            places[seen] = moved_points(motions[frame], places[seen])
+        rows = np.array([self._row_of.get(i, -1) for i in ids.tolist()], dtype=np.int64)
+        places[rows[rows >= 0]] = xyz[rows >= 0]
+
+    def state(self) -> dict[str, NDArray]:
+        """All of it as arrays, for `restore`."""
+        return {
+            "counts": np.array([len(rows) for rows in self.rows], dtype=np.int64),
+            "rows": np.concatenate([*self.rows, NOTHING[0]]),
+            "pixels": np.concatenate([*self.pixels, NOTHING[1]]),
+            "ids": self.ids,
+            "xyz": self.xyz,
+            "colours": self._colours[: len(self)],
+            "last": self._last[: len(self)],
+        }
+
+    def restore(self, state: Mapping[str, NDArray], held_out: Sequence[bool]) -> None:
+        """Become what `state` was taken of. held_out: which frames are.
+
+        Raises KeyError or ValueError for what is no such state.
+        """
+        count, frames = len(state["ids"]), len(held_out)
+        shapes = {"xyz": (count, 3), "colours": (count, 4), "last": (count, 1), "counts": (frames,)}
+        seen = int(state["counts"].sum())
+        for name, shape in (shapes | {"rows": (seen,), "pixels": (seen, 2)}).items():
+            if state[name].shape != shape:
+                raise ValueError(f"{name} of the points has shape {state[name].shape}, expected {shape}")
+        for name, limit in (("rows", count), ("last", frames)):
+            if ((state[name] < 0) | (state[name] >= limit)).any():
+                raise ValueError(f"{name} of the points names some that there are not")
+        cuts = np.cumsum(state["counts"])[:-1] if frames else []
+        self.rows = np.split(state["rows"], cuts) if frames else []
+        self.pixels = np.split(state["pixels"], cuts) if frames else []
+        self._held_out = list(held_out)
+        self._observations = seen
+        self._row_of = {i: row for row, i in enumerate(state["ids"].tolist())}
+        self._xyz, self._colours, self._last = state["xyz"], state["colours"], state["last"]
+
+    def _grow(self, count: int) -> None:
+        if count <= len(self._xyz):
+            return
+        size = max(count, 2 * len(self._xyz))
+        for name in ("_xyz", "_colours", "_last"):
+            old = getattr(self, name)
+            new = np.zeros((size, old.shape[1]), dtype=old.dtype)
+            new[: len(old)] = old
+            setattr(self, name, new)
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """The tracker's ids (P,)."""
+        return np.fromiter(self._row_of, np.int64, len(self))
+
+    @property
+    def xyz(self) -> NDArray[np.float64]:
+        """Places (P, 3) in the world."""
+        return self._xyz[: len(self)]
+
+    @property
+    def colours(self) -> NDArray[np.uint8]:
+        """Mean colours (P, 3) in the frames that are not held out."""
+        sums = self._colours[: len(self)]
+        mean = np.round(sums[:, :3] / np.maximum(sums[:, 3:], 1)).astype(np.uint8)
+        mean[sums[:, 3] == 0] = UNSEEN
+        return mean
+
+    def reprojection_error(
+        self, cameras: list, poses: list[NDArray[np.float64]], places: NDArray[np.float64] | None = None
+    ) -> float | None:
+        """Mean distance [px] of the points from their pixels in cameras at T_camera_world (4, 4), frame by frame.
+
+        Over all observations before the camera; None where there is none. places: (P, 3), others than `xyz`.
+        """
+        xyz = self.xyz if places is None else places
+        total, count = 0.0, 0
+        for camera, T, rows, pixels in zip(cameras, poses, self.rows, self.pixels, strict=True):
+            p = xyz[rows] @ T[:3, :3].T + T[:3, 3]
+            before = p[:, 2] > 0
+            total += float(np.linalg.norm(camera.project(p[before]) - pixels[before], axis=1).sum())
+            count += int(before.sum())
+        return total / count if count else None
+
+    def placed_anew(self, cameras: list, poses: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Places (P, 3) of the points under other poses than the tracker's: where frames not held out see them."""
+        if len(self) == 0:
+            return self.xyz
+        rays = [
+            (pixels.astype(np.float64) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+            for camera, pixels in zip(cameras, self.pixels, strict=True)
+        ]
+        counts = [len(rows) for rows in self.rows]
+        seen = Observations(
+            np.repeat(np.arange(len(counts)), counts),
+            np.concatenate(self.rows),
+            np.concatenate(rays),
+            np.repeat([1.0 / camera.fx for camera in cameras], counts),
+        )
+        return placed_anew(np.stack(poses), seen, self.xyz, ~np.array(self._held_out))

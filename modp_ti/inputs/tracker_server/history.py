@@ -1,0 +1,72 @@
+"""The frames that were delivered, with the poses and points that they have by now."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import SparsePoints
+from fields.geometry.se3 import interpolate_se3, inverse_se3
+
+__all__ = ["Delivered", "History"]
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """A frame as it went to the mapper; its image and points lie on disk under its name."""
+
+    name: str
+    timestamp: float
+    T_camera_world: NDArray[np.float64]
+
+
+class History:
+    """Delivered frames by index, as corrections have left them."""
+
+    def __init__(self) -> None:
+        self.frames: list[Delivered] = []
+        self._moved: dict[int, NDArray[np.float64]] = {}
+        self._known: set[int] = set()
+
+    def add(self, frame: Delivered, points: SparsePoints) -> None:
+        ids = points.ids.tolist()
+        self._known.update(ids)
+        for i in ids:  # what a later frame says of a point is newer than a correction before it
+            self._moved.pop(i, None)
+        self.frames.append(frame)
+
+    def correct(self, correction: PoseCorrection) -> None:
+        """Revise poses. A frame that is not named moves as the world around the named ones on both its sides does."""
+        named = correction.index.tolist()
+        motions = [
+            inverse_se3(self.frames[i].T_camera_world) @ T
+            for i, T in zip(named, correction.T_camera_world, strict=True)
+        ]
+        given = dict(zip(named, correction.T_camera_world, strict=True))
+        for i, frame in enumerate(self.frames):
+            if i in given:
+                pose = given[i]
+            else:
+                after = bisect_left(named, i)
+                if after in (0, len(named)):
+                    motion = motions[min(after, len(named) - 1)]
+                else:
+                    a, b = named[after - 1], named[after]
+                    motion = interpolate_se3(motions[after - 1], motions[after], (i - a) / (b - a))
+                pose = frame.T_camera_world @ motion
+            self.frames[i] = replace(frame, T_camera_world=pose)
+        for i, xyz in zip(correction.ids.tolist(), correction.xyz, strict=True):
+            if i in self._known:
+                self._moved[i] = xyz
+
+    def placed(self, points: SparsePoints) -> SparsePoints:
+        """Points of a frame at the places that they have by now."""
+        if not self._moved:
+            return points
+        pairs = zip(points.ids.tolist(), points.xyz, strict=True)
+        xyz = np.array([self._moved.get(i, old) for i, old in pairs]).reshape(-1, 3)
+        return replace(points, xyz=xyz)

@@ -1,0 +1,92 @@
+"""Where the server listens: a TCP address, of this machine alone unless another is asked for, or a Unix socket."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import stat
+from pathlib import Path
+
+from modp_ti.files.errors import InputError
+
+__all__ = ["DEFAULT_ADDRESS", "listen", "open_to_others"]
+
+DEFAULT_ADDRESS = "127.0.0.1:7007"
+# A Unix socket's path may have so many bytes.
+MAX_SOCKET_PATH = 107
+# Connections that the system lets wait while a tracker is heard.
+WAITING = 8
+
+
+def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
+    """A listening socket and what to call it: at `path` where that is given, else at "host:port".
+
+    Raises InputError where it cannot be.
+    """
+    if path is not None:
+        return _at_path(path), f"unix:{path}"
+    host, port = _parts(address or DEFAULT_ADDRESS)
+    try:
+        family, _, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        listener = socket.socket(family, socket.SOCK_STREAM)
+    except OSError as error:
+        raise InputError(f"tracker.address {address}: no such address of this machine: {error.strerror}") from None
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(where)
+        listener.listen(WAITING)
+    except OSError as error:
+        listener.close()
+        raise InputError(
+            f"tracker.address {address or DEFAULT_ADDRESS}: cannot listen there: {error.strerror}; "
+            "take another port or end the program that has it"
+        ) from None
+    host, port = listener.getsockname()[:2]
+    return listener, f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def open_to_others(listener: socket.socket) -> bool:
+    """Whether other machines can reach it."""
+    if listener.family == socket.AF_UNIX:
+        return False
+    return not ipaddress.ip_address(listener.getsockname()[0]).is_loopback
+
+
+def _parts(address: str) -> tuple[str, int]:
+    host, colon, port = address.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
+        raise InputError(f"tracker.address: write it as host:port, for example {DEFAULT_ADDRESS}, not {address}")
+    return host, int(port)
+
+
+def _at_path(path: Path) -> socket.socket:
+    if len(str(path).encode()) > MAX_SOCKET_PATH:
+        raise InputError(f"{path}: a Unix socket's path has at most {MAX_SOCKET_PATH} bytes (tracker.path)")
+    _remove_left_over(path)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listener.bind(str(path))
+        path.chmod(0o600)  # of this user alone
+        listener.listen(WAITING)
+    except OSError as error:
+        listener.close()
+        raise InputError(f"{path}: cannot listen there: {error.strerror} (tracker.path)") from None
+    return listener
+
+
+def _remove_left_over(path: Path) -> None:
+    """Take away a socket that nobody listens at any more. Raises InputError for anything else in the place."""
+    try:
+        mode = path.lstat().st_mode
+    except OSError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise InputError(f"{path}: is there already and no socket; tracker.path must name a new one")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            path.unlink(missing_ok=True)
+            return
+    raise InputError(f"{path}: another program listens there (tracker.path)")

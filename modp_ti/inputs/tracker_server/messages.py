@@ -1,0 +1,325 @@
+"""The messages: what their bytes mean, and what is refused. `docs/tracker_server.md` shows them byte by byte."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files import LARGEST
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.replay import FARTHEST, checked_pose
+from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
+from modp_ti.inputs.sources.intrinsics import require_plausible
+
+__all__ = [
+    "HEADER",
+    "POINT",
+    "Correction",
+    "Encoding",
+    "Frame",
+    "Header",
+    "Hello",
+    "Kind",
+    "ProtocolError",
+    "State",
+    "UnfitError",
+    "encoded",
+    "parse_correction",
+    "parse_frame",
+    "parse_header",
+    "parse_hello",
+    "parse_points",
+]
+
+MAGIC = b"MODP"
+VERSION = 1
+
+# All numbers are little-endian, without padding.
+HEADER = struct.Struct("<4sHHII")  # magic, version, kind, length of the payload, 0
+HELLO = struct.Struct("<IIII4d8d")  # width, height, encoding, lens, fx fy cx cy, coefficients; then the tracker's name
+FRAME = struct.Struct("<IId16dII")  # number, state, time, T_camera_world, points, bytes of the image; then both
+CORRECTION = struct.Struct("<II")  # poses, points; then both
+POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("pixel", "<f8", 2)])
+MOVED_POSE = np.dtype([("number", "<u4"), ("zero", "<u4"), ("T", "<f8", (4, 4))])
+MOVED_POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3)])
+
+# Nothing is allocated for a message beyond these.
+MAX_SIDE = 16_384  # [px]
+MAX_PIXELS = 36_000_000  # an image of 8192x4320 fits
+MAX_POINTS = 100_000  # of a frame
+MAX_MOVED_POSES = 200_000  # of a correction
+MAX_MOVED_POINTS = 1_000_000
+MAX_NAME = 64  # bytes
+MOST_BYTES_A_PIXEL = 4  # a JPEG or PNG image beyond that, and beyond what its headers take, is none
+IMAGE_OVERHEAD = 65_536
+
+# A rotation with less than this defect is taken bit for bit: its numbers are float64 already.
+ROUNDING = 1e-12
+
+
+class ProtocolError(Exception):
+    """What the other side sent is no message, or none at its place. The text is the one line that it is told."""
+
+
+class UnfitError(ProtocolError):
+    """A message in its right form and place says what cannot be: it is left out, and the next one heard.
+
+    number: of the frame that it is about, where it is one.
+    """
+
+    def __init__(self, text: str, number: int | None = None) -> None:
+        super().__init__(text)
+        self.number = number
+
+
+class Kind(IntEnum):
+    """What a message is. From 64 on: those of the server."""
+
+    HELLO = 1
+    FRAME = 2
+    POSE = 3
+    CORRECTION = 4
+    END = 5
+    WELCOME = 64
+    DONE = 65
+    ERROR = 66
+
+
+class Encoding(IntEnum):
+    """How images are stored. Pixels of RGBA images (PNG's too) whose alpha is 0 are ignored."""
+
+    JPEG = 1
+    PNG = 2
+    GREY8 = 3
+    RGB8 = 4
+    RGBA8 = 5
+
+    @property
+    def channels(self) -> int | None:
+        """Bytes a pixel of a raw encoding; None for a file format."""
+        return {Encoding.GREY8: 1, Encoding.RGB8: 3, Encoding.RGBA8: 4}.get(self)
+
+    @property
+    def suffix(self) -> str:
+        return {Encoding.JPEG: ".jpg", Encoding.PNG: ".png"}.get(self, f".{self.name.lower()}")
+
+
+class State(IntEnum):
+    """What the tracker knows of a frame's pose."""
+
+    LATER = 0
+    KNOWN = 1
+    LOST = 2
+
+
+@dataclass(frozen=True)
+class Header:
+    """kind: of the message. length: bytes of payload that follow."""
+
+    kind: Kind
+    length: int
+
+
+@dataclass(frozen=True)
+class Hello:
+    """The first message: the camera whose images will come."""
+
+    intrinsics: Intrinsics
+    encoding: Encoding
+    name: str
+
+    @property
+    def image_bytes(self) -> int:
+        """The most that one image takes."""
+        pixels = self.intrinsics.camera.width * self.intrinsics.camera.height
+        channels = self.encoding.channels
+        return pixels * MOST_BYTES_A_PIXEL + IMAGE_OVERHEAD if channels is None else pixels * channels
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame, or a pose that comes after it: then without an image.
+
+    number: of the sender's choice. T_camera_world: (4, 4), None unless `state` is KNOWN. points: the pixels are those
+    of the image as sent. image: its bytes as sent.
+    """
+
+    number: int
+    state: State
+    timestamp: float
+    T_camera_world: NDArray[np.float64] | None
+    points: SparsePoints
+    image: bytes
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Revised poses (N, 4, 4) of frames by their numbers (N,), and places (M, 3) of points by their ids (M,)."""
+
+    numbers: NDArray[np.int64]
+    T_camera_world: NDArray[np.float64]
+    ids: NDArray[np.int64]
+    xyz: NDArray[np.float64]
+
+
+def encoded(kind: Kind, payload: bytes) -> bytes:
+    """A whole message."""
+    return HEADER.pack(MAGIC, VERSION, kind, len(payload), 0) + payload
+
+
+def parse_header(data: bytes, hello: Hello | None) -> Header:
+    """The header in 16 bytes. hello: what the connection began with, which bounds the payload; None at its start.
+
+    Raises ProtocolError for what is none, for a kind that only the server sends and for a payload too long or too
+    short.
+    """
+    magic, version, kind, length, zero = HEADER.unpack(data)
+    if magic != MAGIC:
+        raise ProtocolError(f"a message must begin with 'MODP', not with the bytes {magic.hex(' ')}")
+    if version != VERSION:
+        raise ProtocolError(f"version {version} is not spoken here: send version {VERSION}")
+    if zero:
+        raise ProtocolError(f"the last 4 bytes of the header must be 0, not {zero}")
+    if kind not in (Kind.HELLO, Kind.FRAME, Kind.POSE, Kind.CORRECTION, Kind.END):
+        raise ProtocolError(f"message kind {kind} is not known: 1 HELLO, 2 FRAME, 3 POSE, 4 CORRECTION, 5 END")
+    kind = Kind(kind)
+    if kind is not Kind.HELLO and hello is None:
+        raise ProtocolError(f"{kind.name} before HELLO: the first message must be HELLO")
+    if kind is Kind.HELLO and hello is not None:
+        raise ProtocolError("HELLO twice: it is the first message alone")
+    least, most = {
+        Kind.HELLO: (HELLO.size, HELLO.size + MAX_NAME),
+        Kind.FRAME: (FRAME.size, FRAME.size + MAX_POINTS * POINT.itemsize + (hello.image_bytes if hello else 0)),
+        Kind.POSE: (FRAME.size, FRAME.size + MAX_POINTS * POINT.itemsize),
+        Kind.CORRECTION: (
+            CORRECTION.size + MOVED_POSE.itemsize,
+            CORRECTION.size + MAX_MOVED_POSES * MOVED_POSE.itemsize + MAX_MOVED_POINTS * MOVED_POINT.itemsize,
+        ),
+        Kind.END: (0, 0),
+    }[kind]
+    if not least <= length <= most:
+        raise ProtocolError(f"a {kind.name} of {length} bytes: its payload has {least} to {most}")
+    return Header(kind, length)
+
+
+def parse_hello(payload: bytes) -> Hello:
+    """Raises ProtocolError for a camera that cannot be."""
+    width, height, encoding, lens, *numbers = HELLO.unpack_from(payload)
+    (fx, fy, cx, cy), k = numbers[:4], numbers[4:]
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise ProtocolError(f"HELLO: images of {width}x{height} are not taken: at most {MAX_PIXELS:,} pixels")
+    if encoding not in tuple(Encoding):
+        raise ProtocolError(f"HELLO: image encoding {encoding} is not known: {_choices(Encoding)}")
+    if not all(map(math.isfinite, numbers)):
+        raise ProtocolError("HELLO: intrinsics and distortion must be finite numbers")
+    if not (fx > 0 and fy > 0):
+        raise ProtocolError(f"HELLO: focal lengths must be positive, not {fx:g} and {fy:g}")
+    if not (-width < cx < 2 * width and -height < cy < 2 * height):
+        raise ProtocolError(f"HELLO: the principal point ({cx:g}, {cy:g}) is far outside of {width}x{height} pixels")
+    if lens == 0:
+        distortion = NO_DISTORTION
+    elif lens == 1:
+        distortion = Distortion((k[0], k[1], k[4]), tuple(k[5:8]), (k[2], k[3]))
+    elif lens == 2:
+        distortion = Distortion(tuple(k[:4]), fisheye=True)
+    else:
+        raise ProtocolError(f"HELLO: lens model {lens} is not known: 0 none, 1 k1 k2 p1 p2 k3 k4 k5 k6, 2 fisheye")
+    used = {0: 0, 1: 8, 2: 4}[lens]
+    if any(k[used:]):
+        raise ProtocolError(f"HELLO: lens model {lens} has {used} coefficients, the others must be 0")
+    try:
+        name = payload[HELLO.size :].decode("utf-8")
+    except UnicodeDecodeError:
+        raise ProtocolError("HELLO: the tracker's name must be UTF-8") from None
+    camera = PinholeCamera(fx, fy, cx, cy, width, height)
+    try:
+        require_plausible(camera, distortion, "HELLO")
+    except InputError as error:
+        raise ProtocolError(str(error)) from None
+    # A terminal shows it: nothing that it could take for more than text.
+    name = "".join(c if c.isalnum() or c in " ._-" else "?" for c in name)
+    return Hello(Intrinsics(camera, distortion), Encoding(encoding), name)
+
+
+def parse_frame(payload: bytes, kind: Kind) -> Frame:
+    """The payload of a FRAME, or of a POSE, which is the same without an image.
+
+    Raises ProtocolError for sizes that disagree, UnfitError for numbers that are no pose, time or point.
+    """
+    number, state, timestamp, *matrix, count, length = FRAME.unpack_from(payload)
+    what = f"{kind.name} {number}"
+    if count > MAX_POINTS:
+        raise ProtocolError(f"{what}: {count} points, at most {MAX_POINTS} are taken")
+    if FRAME.size + count * POINT.itemsize + length != len(payload):
+        raise ProtocolError(
+            f"{what}: {count} points and {length} bytes of image make {FRAME.size + count * POINT.itemsize + length} "
+            f"bytes of payload, it has {len(payload)}"
+        )
+    if (length > 0) != (kind is Kind.FRAME):
+        raise ProtocolError(f"{what}: {'has no image' if kind is Kind.FRAME else 'must have no image'}")
+    if state not in tuple(State):
+        raise ProtocolError(f"{what}: state {state} is not known: {_choices(State)}")
+    state = State(state)
+    if kind is Kind.POSE and state is State.LATER:
+        raise ProtocolError(f"{what}: must bring the pose (state 1) or say that none will come (state 2)")
+    if not abs(timestamp) <= LARGEST:
+        raise UnfitError(f"{what}: the time stamp is not finite, or beyond {LARGEST:g}", number)
+    if count and state is not State.KNOWN:
+        raise ProtocolError(f"{what}: has points and no pose: they come with it")
+    try:
+        pose = _pose(np.array(matrix).reshape(4, 4), what) if state is State.KNOWN else None
+        points = parse_points(payload[FRAME.size : FRAME.size + count * POINT.itemsize], what)
+    except UnfitError as error:
+        raise UnfitError(str(error), number) from None
+    return Frame(number, state, timestamp, pose, points, payload[FRAME.size + count * POINT.itemsize :])
+
+
+def parse_points(block: bytes, what: str) -> SparsePoints:
+    """Points of a frame. what: begins the message of the UnfitError for those that cannot be."""
+    table = np.frombuffer(block, dtype=POINT)
+    if not all((np.abs(table[name]) <= FARTHEST).all() for name in ("xyz", "pixel")):
+        raise UnfitError(f"{what}: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
+    if len(np.unique(table["id"])) != len(table):
+        raise UnfitError(f"{what}: a point stands twice: ids are unique in a frame")
+    xyz, pixels = (table[name].astype(np.float64) for name in ("xyz", "pixel"))
+    return SparsePoints(xyz, pixels, table["id"].astype(np.int64))
+
+
+def parse_correction(payload: bytes) -> Correction:
+    """Raises ProtocolError for sizes that disagree, UnfitError for poses that are none and what is named twice."""
+    poses, points = CORRECTION.unpack_from(payload)
+    middle = CORRECTION.size + poses * MOVED_POSE.itemsize
+    size = middle + points * MOVED_POINT.itemsize
+    if poses == 0 or size != len(payload):
+        raise ProtocolError(f"CORRECTION: {poses} poses and {points} points make {size} bytes, it has {len(payload)}")
+    frames = np.frombuffer(payload[CORRECTION.size : middle], dtype=MOVED_POSE)
+    moved = np.frombuffer(payload[middle:], dtype=MOVED_POINT)
+    numbers = frames["number"].astype(np.int64)
+    if (np.diff(numbers) <= 0).any():
+        raise UnfitError("CORRECTION: frames must be named once each, in their order")
+    matrices = [_pose(row["T"], f"CORRECTION of frame {row['number']}") for row in frames]
+    if not (np.abs(moved["xyz"]) <= FARTHEST).all():
+        raise UnfitError(f"CORRECTION: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
+    if len(np.unique(moved["id"])) != len(moved):
+        raise UnfitError("CORRECTION: a point stands twice")
+    return Correction(numbers, np.stack(matrices), moved["id"].astype(np.int64), moved["xyz"].astype(np.float64))
+
+
+def _pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    try:
+        pose = checked_pose(matrix, what)
+    except InputError as error:
+        raise UnfitError(str(error)) from None
+    exact = np.abs(matrix - pose).max() < ROUNDING
+    return np.array(matrix, dtype=np.float64) if exact else pose
+
+
+def _choices(of: type[IntEnum]) -> str:
+    return ", ".join(f"{each.value} {each.name}" for each in of)

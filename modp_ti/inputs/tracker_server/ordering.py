@@ -1,0 +1,160 @@
+"""Frames in their order, each once its pose is known, with the corrections between them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from fields.frames.tracked_frame import SparsePoints
+from modp_ti.inputs.tracker_server.messages import Correction, Frame, ProtocolError, State, UnfitError
+
+__all__ = ["Ordering"]
+
+# What may wait behind a frame without a pose; images wait on disk.
+MAX_WAITING = 2_000  # frames and corrections
+MAX_WAITING_BYTES = 256 << 20  # of points and poses
+MAX_WAITING_IMAGES = 4 << 30  # bytes, on disk
+# Corrections between two frames: each costs as much as all poses so far.
+MAX_CORRECTIONS = 100
+NO_POINTS = SparsePoints(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+
+
+class Ordering:
+    """Takes messages as they arrive, gives frames with poses and corrections in the order in which they began.
+
+    A frame whose pose comes later holds up all after it; one that is lost is left out.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._waiting: deque[Frame | Correction] = deque()
+        self._late: dict[int, Frame] = {}  # poses of frames that came without, to be delivered
+        self._undecided: set[int] = set()
+        self._posed: set[int] = set()
+        self._left_out: set[int] = set()
+        self._bytes = 0
+        self._images: deque[int] = deque()  # bytes of the images of frames that wait
+        self._corrections = 0  # since the last frame
+        self._last: Frame | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether a frame has come."""
+        return self._last is not None
+
+    @property
+    def undecided(self) -> int:
+        """Frames that still wait for their pose."""
+        return len(self._undecided)
+
+    def require_next(self, frame: Frame) -> None:
+        """Raises UnfitError where the frame does not come after those before it."""
+        if self._last is None:
+            return
+        if frame.number <= self._last.number:
+            raise UnfitError(f"FRAME {frame.number} after FRAME {self._last.number}: numbers must grow")
+        if frame.timestamp <= self._last.timestamp:
+            raise UnfitError(
+                f"FRAME {frame.number}: its time {frame.timestamp!r} is not after {self._last.timestamp!r}, that of "
+                f"FRAME {self._last.number}",
+                frame.number,
+            )
+
+    def add_frame(self, frame: Frame) -> None:
+        """Take a frame in; its image is of no interest here. Raises UnfitError as `require_next` does."""
+        self.require_next(frame)
+        self._corrections = 0
+        self._left_out.discard(frame.number)
+        self._images.append(len(frame.image))
+        self._last = frame = replace(frame, image=b"")
+        if frame.state is State.LATER:
+            self._undecided.add(frame.number)
+        elif frame.state is State.KNOWN:
+            self._posed.add(frame.number)
+        self._wait(frame)
+
+    def add_pose(self, pose: Frame) -> None:
+        """What became of a frame's pose. Raises ProtocolError where that is not open."""
+        if pose.number in self._left_out:
+            return
+        if pose.number not in self._undecided:
+            raise ProtocolError(
+                f"POSE {pose.number}: no frame of this number waits for its pose; CORRECTION revises one that has it"
+            )
+        self._undecided.discard(pose.number)
+        if pose.state is State.KNOWN:
+            self._posed.add(pose.number)
+        self._late[pose.number] = pose
+        self._hold(_size(pose))
+
+    def add_correction(self, correction: Correction) -> None:
+        """Raises UnfitError where it names a frame that has no pose."""
+        self._corrections += 1
+        if self._corrections > MAX_CORRECTIONS:
+            raise ProtocolError(f"more than {MAX_CORRECTIONS} CORRECTIONs without a FRAME between them: send fewer")
+        heard = np.array([number not in self._left_out for number in correction.numbers.tolist()])
+        if not heard.any():
+            return
+        numbers = correction.numbers[heard]
+        for number in numbers.tolist():
+            if number not in self._posed:
+                raise UnfitError(f"CORRECTION of frame {number}, which has no pose so far")
+        self._wait(replace(correction, numbers=numbers, T_camera_world=correction.T_camera_world[heard]))
+
+    def leave_out(self, number: int) -> None:
+        """A frame that is of no use, or its pose: what else is said of it is not heard. Not one that had a pose."""
+        if number in self._posed:
+            return
+        self._left_out.add(number)
+        if number in self._undecided:
+            self._undecided.discard(number)
+            self._late[number] = Frame(number, State.LOST, 0.0, None, NO_POINTS, b"")
+
+    def ready(self) -> Iterator[Frame | Correction]:
+        """What can be delivered by now: frames with their poses, and corrections of frames before them."""
+        while self._waiting:
+            item = self._waiting[0]
+            if isinstance(item, Frame) and item.state is State.LATER:
+                if item.number not in self._late:
+                    return
+                late = self._late.pop(item.number)
+                self._bytes -= _size(late)
+                item = replace(late, timestamp=item.timestamp)
+            else:
+                self._bytes -= _size(item)
+            self._waiting.popleft()
+            if isinstance(item, Frame):
+                self._images.popleft()
+            if isinstance(item, Frame) and item.state is State.LOST:
+                self.lost += 1
+            else:
+                yield item
+
+    def close(self) -> None:
+        """No pose will come any more: frames without count as lost."""
+        for item in self._waiting:
+            if isinstance(item, Frame) and item.number in self._undecided:
+                self._late[item.number] = replace(item, state=State.LOST)
+        self._undecided.clear()
+
+    def _wait(self, item: Frame | Correction) -> None:
+        self._waiting.append(item)
+        self._hold(_size(item))
+
+    def _hold(self, size: int) -> None:
+        self._bytes += size
+        images = sum(self._images)
+        if len(self._waiting) > MAX_WAITING or self._bytes > MAX_WAITING_BYTES or images > MAX_WAITING_IMAGES:
+            size = self._bytes + images >> 20
+            raise ProtocolError(
+                f"{len(self._waiting)} frames and corrections ({size} MiB) wait for the pose of FRAME "
+                f"{min(self._undecided, default=0)}: send its POSE, state 2 where it has none"
+            )
+
+
+def _size(item: Frame | Correction) -> int:
+    """Bytes that it holds in memory, about."""
+    return 48 * len(item.points) if isinstance(item, Frame) else 136 * len(item.numbers) + 32 * len(item.ids)

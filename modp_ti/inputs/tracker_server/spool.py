@@ -1,0 +1,173 @@
+"""What came through the server, kept on disk as it came, so that frames can be looked at again."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.image_header import read_image_header
+from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.tracker_server.messages import POINT, Encoding, Frame, Hello, UnfitError, parse_points
+
+__all__ = ["Spool", "SpoolFullError"]
+
+# What must stay free on the disk [bytes].
+KEPT_FREE = 1 << 30
+
+
+class SpoolFullError(Exception):
+    """The disk has no room for another frame. The text says so in a line."""
+
+
+class Spool(ImageSource):
+    """The images that have arrived, in a temporary folder of its own until `close`.
+
+    A frame is named by its number at the sender.
+    """
+
+    def __init__(self, hello: Hello) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-server-")
+        super().__init__(Path(self._folder.name))
+        self.intrinsics = hello.intrinsics
+        self._names: list[str] = []
+        self._encoding = hello.encoding
+        self._position: dict[str, int] = {}
+        self._timestamps: list[float] = []
+        self._last: tuple[str, NDArray[np.uint8]] | None = None
+
+    def add(self, frame: Frame) -> str:
+        """Keep the frame's image; its name. Raises UnfitError for an image that is not what HELLO said.
+
+        Raises SpoolFullError where the disk has no room.
+        """
+        self._require_image(frame)
+        name = self.name(frame.number)
+        self._write(name, frame.image)
+        try:
+            self._decoded(name)
+        except InputError as error:
+            (self.path / name).unlink(missing_ok=True)
+            raise UnfitError(f"FRAME {frame.number}: {error}", frame.number) from None
+        self._position[name] = len(self._names)
+        self._names.append(name)
+        self._timestamps.append(frame.timestamp)
+        return name
+
+    def name(self, number: int) -> str:
+        """What the frame of this number is called."""
+        return f"{number:06d}{self._encoding.suffix}"
+
+    def _require_image(self, frame: Frame) -> None:
+        """The size is read off the header: no decoder is asked to make an image of another one."""
+        assert self.intrinsics is not None
+        camera = self.intrinsics.camera
+        what = f"FRAME {frame.number}"
+        if self._encoding.channels is not None:
+            wanted = camera.width * camera.height * self._encoding.channels
+            if len(frame.image) != wanted:
+                raise UnfitError(f"{what}: its image has {len(frame.image)} bytes, HELLO says {wanted}", frame.number)
+            return
+        start = b"\xff\xd8" if self._encoding is Encoding.JPEG else b"\x89PNG"
+        header = read_image_header(io.BytesIO(frame.image)) if frame.image.startswith(start) else None
+        if header is None:
+            raise UnfitError(f"{what}: its image is no {self._encoding.name}", frame.number)
+        if not header.complete:
+            raise UnfitError(f"{what}: its {self._encoding.name} image is cut off", frame.number)
+        if (header.width, header.height) != (camera.width, camera.height):
+            raise UnfitError(
+                f"{what}: its image is {header.width}x{header.height}, HELLO says {camera.width}x{camera.height}",
+                frame.number,
+            )
+
+    @property
+    def names(self) -> Sequence[str]:
+        return self._names
+
+    def position(self, name: str) -> int:
+        return self._position[name]
+
+    def timestamp(self, name: str) -> float:
+        return self._timestamps[self._position[name]]
+
+    def find(self, name: str) -> str | None:
+        return name if name in self._position else None
+
+    def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
+        return self._names[start:stop:step]
+
+    def size(self, name: str) -> tuple[int, int]:
+        assert self.intrinsics is not None
+        return self.intrinsics.camera.width, self.intrinsics.camera.height
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """See `ImageSource`. Raises InputError for an image that does not decode."""
+        return np.ascontiguousarray(self._decoded(name)[..., :3])
+
+    def valid(self, name: str) -> NDArray[np.bool_] | None:
+        """Which pixels (H, W) the image's own alpha leaves; None where all."""
+        if self._encoding not in (Encoding.PNG, Encoding.RGBA8):
+            return None
+        image = self._decoded(name)
+        return None if image.shape[2] == 3 else image[..., 3] > 0
+
+    def _decoded(self, name: str) -> NDArray[np.uint8]:
+        """(H, W, 3 or 4) uint8, RGB first. The last one is kept: it is checked first and then delivered."""
+        if self._last is None or self._last[0] != name:
+            self._last = name, self._decode(name)
+        return self._last[1]
+
+    def _decode(self, name: str) -> NDArray[np.uint8]:
+        width, height = self.size(name)
+        data = np.frombuffer((self.path / name).read_bytes(), np.uint8)
+        if self._encoding.channels is not None:
+            image = data.reshape(height, width, self._encoding.channels)
+            return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
+        import cv2
+
+        log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:  # silent: the one line that the user gets is ours
+            # As in ImageFolder for JPEG; a PNG keeps its alpha.
+            png = self._encoding is Encoding.PNG
+            flags = cv2.IMREAD_UNCHANGED if png else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+            image = cv2.imdecode(data, flags)
+        except cv2.error:
+            image = None
+        finally:
+            cv2.utils.logging.setLogLevel(log_level)
+        if image is None or image.dtype != np.uint8:
+            raise InputError(f"{name}: its {self._encoding.name} image is damaged or not of 8 bits a channel")
+        if image.ndim == 2:
+            return np.repeat(image[..., None], 3, axis=2)
+        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+
+    def keep_points(self, name: str, points: SparsePoints) -> None:
+        """Keep the points of a frame as they were delivered. Raises SpoolFullError where the disk has no room."""
+        table = np.zeros(len(points), dtype=POINT)
+        table["id"], table["xyz"], table["pixel"] = points.ids, points.xyz, points.pixels
+        self._write(name + ".points", table.tobytes())
+
+    def points(self, name: str) -> SparsePoints:
+        """The points that were kept."""
+        return parse_points((self.path / (name + ".points")).read_bytes(), name)
+
+    def _write(self, name: str, data: bytes) -> None:
+        try:
+            if shutil.disk_usage(self.path).free < KEPT_FREE + len(data):
+                raise SpoolFullError(
+                    f"{self.path.parent}: less than 1 GiB is free for the frames that arrive; set TMPDIR"
+                )
+            (self.path / name).write_bytes(data)
+        except OSError as error:
+            raise SpoolFullError(f"{self.path.parent}: a frame cannot be kept: {error.strerror}; set TMPDIR") from None
+
+    def close(self) -> None:
+        """Delete the folder."""
+        self._folder.cleanup()

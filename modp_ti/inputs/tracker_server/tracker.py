@@ -1,0 +1,314 @@
+"""Tracker `socket`: another program tracks, and sends its frames, poses, points and corrections through a socket."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from queue import Full, Queue
+from threading import Event, Thread
+
+import numpy as np
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import SocketSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.protocol import Progress, Tracker
+from modp_ti.inputs.replay import is_held_out, points_inside, unmasked
+from modp_ti.inputs.sources import FrameReader, Undistorter
+from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, SenderGoneError
+from modp_ti.inputs.tracker_server.history import Delivered, History
+from modp_ti.inputs.tracker_server.listening import listen, open_to_others
+from modp_ti.inputs.tracker_server.lobby import Lobby
+from modp_ti.inputs.tracker_server.messages import (
+    Correction,
+    Frame,
+    Hello,
+    Kind,
+    ProtocolError,
+    UnfitError,
+    parse_correction,
+    parse_frame,
+    parse_hello,
+)
+from modp_ti.inputs.tracker_server.ordering import Ordering
+from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError
+
+__all__ = ["TrackerServer", "open_tracker_server"]
+
+# Seconds that the server takes a breath after a connection that came to nothing, for each of them up to the most: who
+# connects in a loop must not keep a processor busy.
+BREATH, LONGEST_BREATH = 0.01, 0.5
+# Messages that may be of no use before that is the end: so many, and so many more for each frame.
+FEW_UNFIT, UNFIT_SHARE = 3, 0.1
+
+
+def open_tracker_server(
+    source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None
+) -> TrackerServer:
+    """Listen where the configuration says; frames come once a sender is there.
+
+    Raises InputError for an address where this cannot be, and for settings that choose among files.
+    """
+    if source.start or source.stop is not None or source.step != 1:
+        raise InputError("tracker.kind: socket takes every frame that is sent: take source.start, stop and step out")
+    if source.path is not None:
+        raise InputError("tracker.kind: socket gets its images through the socket: take source.path out")
+    return TrackerServer(source, tracker, progress)
+
+
+class TrackerServer(Tracker):
+    """A live `Tracker` that listens from the start, in a thread that reads, checks and decodes what is sent.
+
+    Up to `source.prefetch` frames (one at least) wait decoded for the mapper; then nothing more is read, and the
+    sender's writes wait. Connections that come to nothing before a frame was sent are dropped, counted in one note,
+    and the server stays open; one that says nothing keeps nobody out;
+    from the first frame on, whatever ends the connection ends the stream, and the run goes on with what it has. What
+    was sent is kept in a temporary folder until `close`.
+    """
+
+    def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
+        self._source = source
+        self._patience = tracker.patience
+        self._path = tracker.path
+        self._listener, self.address = listen(tracker.address, tracker.path)
+        self._notes = [f"frames come from {self.address}"]
+        if open_to_others(self._listener):
+            self._notes.append(f"{self.address} is open to the network: whoever reaches it can send frames")
+        self._progress = progress
+        self._spool: Spool | None = None
+        self._reader: FrameReader | None = None
+        self._undistorter: Undistorter | None = None
+        self._history = History()
+        self._indices: dict[int, int] = {}  # of the frames that went to the mapper, by their numbers
+        self._dropped, self._dropped_note = 0, ""
+        self._name = ""
+        self._unfit: list[str] = []  # what was wrong with messages that were left out
+        self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
+        self._closed = Event()
+        self._ended = False
+        self._say_waiting(0)
+        # A daemon, so that a process whose owner forgot to close ends all the same.
+        self._thread = Thread(target=self._serve, name="server", daemon=True)
+        self._thread.start()
+
+    # ---- what the mapper takes, in its thread ----------------------------------------------------------------
+
+    @property
+    def notes(self) -> list[str]:
+        return self._notes
+
+    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+        """Frames and corrections as they arrive, once. Raises InputError where the run's own settings do not fit."""
+        while not self._ended:
+            event = self._events.get()
+            self._say_waiting(1)
+            if event is None or isinstance(event, InputError):
+                self._ended = True
+                if event is not None:
+                    raise event
+            elif isinstance(event, TrackedFrame):
+                self._history.add(Delivered(event.name, event.timestamp, event.T_camera_world), event.points)
+                yield event
+            else:
+                self._history.correct(event)
+                yield event
+
+    def __iter__(self) -> Iterator[TrackedFrame]:
+        """The frames delivered so far, with the poses and points that they have by now; then those that arrive."""
+        for index, frame in enumerate(self._history.frames[:]):
+            assert self._spool is not None, "it holds the frames"
+            points = self._history.placed(self._spool.points(frame.name))
+            yield self._tracked(index, frame, points)
+        for event in self.events():
+            if isinstance(event, TrackedFrame):
+                yield event
+
+    def close(self) -> None:
+        """Stop listening, let the sender go and delete what was kept."""
+        self._closed.set()
+        self._thread.join()
+        if self._spool is not None:
+            self._spool.close()
+
+    def _say_waiting(self, done: int) -> None:
+        if self._progress is not None:
+            self._progress(f"waiting for a tracker at {self.address}", done, 1)
+            self._progress = self._progress if done == 0 else None
+
+    def _tracked(self, index: int, frame: Delivered, points: SparsePoints) -> TrackedFrame:
+        assert self._reader is not None and self._undistorter is not None, "HELLO came before"
+        picture = self._reader.read(frame.name, self._undistorter)
+        return TrackedFrame(
+            index=index,
+            timestamp=frame.timestamp,
+            name=frame.name,
+            image=picture.image,
+            camera=self._undistorter.camera,
+            T_camera_world=frame.T_camera_world,
+            points=unmasked(points, picture.mask),
+            mask=picture.mask,
+            vignette=picture.vignette,
+            held_out=is_held_out(index, self._source),
+        )
+
+    # ---- the server's thread -----------------------------------------------------------------------------------
+
+    def _serve(self) -> None:
+        end: InputError | None = None
+        lobby = Lobby(self._listener, self._patience)
+        try:
+            while not self._closed.is_set():
+                sock = lobby.next(GLANCE)
+                if lobby.dropped:
+                    self._count_dropped("it said nothing", lobby.dropped)
+                    lobby.dropped = 0
+                if sock is not None and self._talk(Connection(sock, self._patience, self._closed)):
+                    break
+        except InputError as error:
+            end = error
+        except Exception as error:  # a fault of ours must end the run and not leave it waiting
+            end = InputError(f"{self.address}: the server failed: {type(error).__name__}: {error}")
+        finally:
+            lobby.close()
+            self._listener.close()
+            if self._path is not None:
+                self._path.unlink(missing_ok=True)
+            self._put(end)
+
+    def _talk(self, connection: Connection) -> bool:
+        """Serve one connection to its end; whether that ends the stream too."""
+        ordering = Ordering()
+        hello: Hello | None = None
+        problem = None
+        try:
+            while True:
+                header, payload = connection.receive(hello)
+                if header.kind is Kind.END:
+                    break
+                if header.kind is Kind.HELLO:
+                    hello = parse_hello(payload)
+                    self._prepare(hello)
+                    self._name = hello.name
+                    connection.say(Kind.WELCOME)
+                else:
+                    try:
+                        self._take(header.kind, payload, ordering)
+                    except UnfitError as error:
+                        self._leave_out(error, ordering)
+                    self._deliver(ordering)
+        except SenderGoneError as error:
+            problem = f"the sender {error}"
+            connection.refuse(problem)
+        except ProtocolError as error:
+            problem = str(error)
+            connection.refuse(problem)
+        except SpoolFullError as error:
+            connection.refuse(f"the run takes no more: {error}")
+            if not ordering.begun:
+                raise InputError(str(error)) from None
+            problem = str(error)
+        except InputError as error:
+            connection.refuse(f"the run stops: {error}")
+            raise
+        if problem is not None and not ordering.begun:
+            self._count_dropped(problem, 1)
+            self._closed.wait(min(BREATH * self._dropped, LONGEST_BREATH))
+            return False
+        if problem is not None:
+            self._notes.append(f"the stream ended early: {problem}; the run went on with the frames before")
+        ordering.close()
+        try:
+            self._deliver(ordering)
+        except SpoolFullError as error:
+            self._notes.append(f"the last frames are missing: {error}")
+        if self._unfit:
+            messages = "1 message was" if len(self._unfit) == 1 else f"{len(self._unfit)} messages were"
+            self._notes.append(f"{messages} left out: {'' if len(self._unfit) == 1 else 'the last: '}{self._unfit[-1]}")
+        if ordering.lost:
+            self._notes.append(f"{ordering.lost} of {len(self._spool or ())} frames came without a pose: skipped")
+        if problem is None:
+            connection.say(Kind.DONE, struct.pack("<I", len(self._indices)))
+            connection.close()
+        return True
+
+    def _leave_out(self, error: UnfitError, ordering: Ordering) -> None:
+        """Go on without a message. Raises ProtocolError before the first frame, and where they are too many."""
+        self._unfit.append(str(error))
+        if not ordering.begun or len(self._unfit) > FEW_UNFIT + UNFIT_SHARE * len(self._spool or ()):
+            self._unfit.pop()
+            raise ProtocolError(str(error))
+        if error.number is not None:
+            ordering.leave_out(error.number)
+
+    def _count_dropped(self, problem: str, count: int) -> None:
+        """One note for all connections that came to nothing, however many there are."""
+        self._dropped += count
+        many = "a connection" if self._dropped == 1 else f"{self._dropped} connections"
+        were = "was" if self._dropped == 1 else "were"
+        last = "" if self._dropped == 1 else "the last: "
+        note = f"{many} to {self.address} {were} dropped before the first frame: {last}{problem}"
+        self._notes = [*(other for other in self._notes if other != self._dropped_note), note]
+        self._dropped_note = note
+
+    def _prepare(self, hello: Hello) -> None:
+        """Make ready for the images of this camera. Raises InputError for settings that do not fit them."""
+        if self._spool is not None:
+            self._spool.close()  # of a connection that sent no frame
+        undistorter = hello.intrinsics.undistorter(self._source.scale)
+        spool = Spool(hello)
+        self._reader = FrameReader(spool, self._source)
+        self._undistorter, self._spool = undistorter, spool
+
+    def _take(self, kind: Kind, payload: bytes, ordering: Ordering) -> None:
+        """Raises ProtocolError for what is malformed or at the wrong place, before it has had any effect.
+
+        Raises UnfitError for what is of no use, and nothing else.
+        """
+        if kind is Kind.CORRECTION:
+            ordering.add_correction(parse_correction(payload))
+            return
+        frame = parse_frame(payload, kind)
+        if kind is Kind.POSE:
+            ordering.add_pose(frame)
+            return
+        assert self._spool is not None and self._reader is not None and self._undistorter is not None
+        ordering.require_next(frame)
+        name = self._spool.add(frame)
+        self._reader.require_fitting([(name, self._undistorter)])
+        ordering.add_frame(frame)
+        if len(self._spool) == 1 and self._name:
+            self._notes.append(f"the tracker there is {self._name}")
+
+    def _deliver(self, ordering: Ordering) -> None:
+        """Hand on what is ready, waiting for the mapper where it has enough."""
+        for item in ordering.ready():
+            if self._closed.is_set():
+                return
+            self._put(self._revised(item) if isinstance(item, Correction) else self._arrived(item))
+
+    def _arrived(self, frame: Frame) -> TrackedFrame:
+        assert self._spool is not None and self._undistorter is not None and frame.T_camera_world is not None
+        index = len(self._indices)
+        self._indices[frame.number] = index
+        pixels = self._undistorter.points(frame.points.pixels)
+        pose = frame.T_camera_world
+        points = points_inside(frame.points.xyz, pixels, frame.points.ids, self._undistorter, pose)
+        name = self._spool.name(frame.number)
+        tracked = self._tracked(index, Delivered(name, frame.timestamp, pose), points)
+        self._spool.keep_points(name, tracked.points)
+        _ = tracked.pyramid  # kept by the frame, for the mapper
+        return tracked
+
+    def _revised(self, correction: Correction) -> PoseCorrection:
+        index = np.array([self._indices[number] for number in correction.numbers.tolist()], dtype=np.int64)
+        return PoseCorrection(index, correction.T_camera_world, correction.ids, correction.xyz)
+
+    def _put(self, event: TrackedFrame | PoseCorrection | InputError | None) -> None:
+        while not self._closed.is_set():
+            try:
+                self._events.put(event, timeout=GLANCE)
+            except Full:
+                continue
+            return

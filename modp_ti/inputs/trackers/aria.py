@@ -1,0 +1,164 @@
+"""Tracker `aria`: poses, calibration and points that Project Aria's machine perception services (MPS) wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import AriaSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.multiview.triangulation import triangulated_frames
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out
+from modp_ti.inputs.sources import ImageSource, open_source
+from modp_ti.inputs.sources.protocol import require_intrinsics
+from modp_ti.inputs.trackers.aria_mps import (
+    CameraMounts,
+    DeviceTrajectory,
+    read_calibration,
+    read_closed_loop,
+    read_observations,
+    read_open_loop,
+    read_points,
+)
+from modp_ti.inputs.trackers.given_poses import checked_reader, missing_frames_note, selected_frames, spread_points
+from modp_ti.inputs.trackers.trajectory import inverse_poses, rows_at_frames
+
+__all__ = ["open_aria"]
+
+CLOSED_LOOP, OPEN_LOOP = "closed_loop_trajectory.csv", "open_loop_trajectory.csv"
+CALIBRATION = "online_calibration.jsonl"
+POINTS = ("semidense_points.csv.gz", "semidense_points.csv", "global_points.csv.gz", "global_points.csv")
+OBSERVATIONS = ("semidense_observations.csv.gz", "semidense_observations.csv")
+
+# The tracking cameras take ten pictures a second: one of them lies this near in time [s] to every frame between.
+SEEN_WITHIN = 0.11
+
+
+def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress | None = None) -> ReplayedTracker:
+    """The images that have a device pose within `tracker.max_difference` of their time, in the source's order.
+
+    tracker.path: MPS's folder, or its `slam` or `trajectory` folder, or one of the two trajectories. The closed loop is
+    taken before the open one. T_world_camera = T_world_device T_device_camera, the latter from the online calibration
+    nearest in time. Points certain enough are shown to the frames that they project into; with observations only
+    those that the tracking cameras saw around the frame's time. Without points, or with the open loop, whose world is
+    not theirs, features are tracked and triangulated. Raises InputError for what is missing and cannot be done
+    without, for malformed files, and for images that do not fit the camera or the times.
+    """
+    place = source.require_path()
+    folder, file = _trajectory_file(tracker.path, place)
+    device = read_open_loop(file) if file.name == OPEN_LOOP else read_closed_loop(file)
+    calibration = folder / CALIBRATION
+    mounts = read_calibration(calibration, tracker.camera) if calibration.is_file() else None
+    images = open_source(source)
+    missing = []
+    if mounts is None:
+        mounts, missing = _recorded_mount(images, calibration, tracker.camera)
+    selected = selected_frames(images, source)
+    rows = rows_at_frames(images, selected, file, device.times, tracker)
+    names = sorted(rows, key=images.position)
+    T_world_camera = np.stack(
+        [device.T_world_device[rows[name]] @ mounts.at(device.times[rows[name]]) for name in names]
+    )
+    undistorter = require_intrinsics(images).undistorter(source.scale)
+    reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
+    frames = [PosedImage(name, undistorter, T) for name, T in zip(names, inverse_poses(T_world_camera), strict=True)]
+    notes = [*missing_frames_note(selected, rows, file), *_notes(device, mounts, file), *missing]
+
+    cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
+    if file.name == OPEN_LOOP or cloud is None:
+        if file.name != OPEN_LOOP:
+            notes.append(
+                f"{folder / POINTS[0]} is missing: it would have brought the points; features of the images are "
+                "tracked and triangulated instead"
+            )
+        solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
+        return ReplayedTracker(reader, triangulated_frames(images, frames, solves, progress), source, notes)
+    numbers, xyz, total = read_points(cloud, device.world, tracker.max_inv_dist_std, tracker.max_dist_std)
+    notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
+    times = device.times[[rows[name] for name in names]]
+    frames, note = _with_points(folder, frames, times, numbers, xyz, tracker.max_points)
+    return ReplayedTracker(reader, frames, source, [*notes, *note])
+
+
+def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
+    """MPS's folder and the trajectory in it."""
+    if given is not None and given.is_file():
+        if given.name not in (CLOSED_LOOP, OPEN_LOOP):
+            raise InputError(f"{given}: tracker.path must be MPS's folder, {CLOSED_LOOP} or {OPEN_LOOP}")
+        return given.parent, given
+    if given is not None and not given.is_dir():
+        raise InputError(f"{given}: no such folder (tracker.path); it should hold what MPS wrote")
+    home = images if images.is_dir() else images.parent
+    roots = [given] if given is not None else [home, home.parent, images.parent / f"mps_{images.stem}_vrs"]
+    folders = [folder for root in roots for folder in (root, root / "slam", root / "trajectory")]
+    for name in (CLOSED_LOOP, OPEN_LOOP):
+        for folder in folders:
+            if (folder / name).is_file():
+                return folder, folder / name
+    raise InputError(
+        f"{roots[0]}: holds neither {CLOSED_LOOP} nor {OPEN_LOOP}, which would have brought the poses: set "
+        "tracker.path to MPS's folder"
+    )
+
+
+def _recorded_mount(images: ImageSource, file: Path, label: str) -> tuple[CameraMounts, list[str]]:
+    """Where a VRS recording says that its camera sits, in place of the calibration over time, and a remark on that."""
+    mount = images.T_device_camera
+    lost = f"{file} is missing: it would have brought where the camera {label} sits on the device (T_device_camera)"
+    if mount is None:
+        raise InputError(f"{lost}, without which device poses are no camera poses")
+    return CameraMounts(images.path, np.zeros(1), mount[None]), [f"{lost} over time; the recording's own is taken"]
+
+
+def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[str]:
+    notes = []
+    if file.name == OPEN_LOOP:
+        notes.append(
+            f"{file.name} is odometry, which drifts; MPS's points are of another world and not used: features of the "
+            "images are tracked and triangulated"
+        )
+    if device.left_out:
+        notes.append(f"{device.left_out} poses of {file.name} are of another world than most (its graph): left out")
+    gap = max(device.times[0] - mounts.times[-1], mounts.times[0] - device.times[-1])
+    if mounts.path.name == CALIBRATION and gap > 0:
+        notes.append(
+            f"{mounts.path.name} is of another time than {file.name} ({gap:.1f} s apart): is it of one recording?"
+        )
+    return notes
+
+
+def _with_points(
+    folder: Path,
+    frames: list[PosedImage],
+    times: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    xyz: NDArray[np.float64],
+    limit: int,
+) -> tuple[list[PosedImage], list[str]]:
+    """The frames, taken at these device times (F,), with the points that they see, and remarks on that."""
+    file = next((folder / name for name in OBSERVATIONS if (folder / name).is_file()), None)
+    if file is None:
+        seen = [np.arange(len(xyz))] * len(frames)
+        note = (
+            f"{folder / OBSERVATIONS[0]} is missing: it would have said which points were seen at which time; every "
+            "point is shown that projects into the frame and that no nearer one hides"
+        )
+    else:
+        instants, groups = read_observations(file, numbers, times.min() - SEEN_WITHIN, times.max() + SEEN_WITHIN)
+        seen = []
+        for time in times:
+            a, b = np.searchsorted(instants, (time - SEEN_WITHIN, time + SEEN_WITHIN))
+            seen.append(np.unique(np.concatenate([np.zeros(0, np.int64), *groups[a:b]])))
+        note = f"points seen within {SEEN_WITHIN} s by the tracking cameras, at the pixels that they project to"
+    result = []
+    for frame, mine in zip(frames, seen, strict=True):
+        result.append(frame.with_points(spread_points(xyz[mine], numbers[mine], frame, limit)))
+    if not any(len(frame.points) for frame in result):
+        raise InputError(
+            f"{folder}: none of the {len(xyz)} points projects into any frame: is source.intrinsics right?"
+        )
+    return result, [note]

@@ -1,0 +1,204 @@
+"""What Project Aria's machine perception services (MPS) write: trajectories, calibration, points and observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files import LARGEST, parse_json, text_lines
+from modp_ti.files.csv_columns import read_csv_blocks
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.trackers.trajectory import poses_of_quaternions, require_rising
+
+__all__ = [
+    "CameraMounts",
+    "DeviceTrajectory",
+    "read_calibration",
+    "read_closed_loop",
+    "read_observations",
+    "read_open_loop",
+    "read_points",
+]
+
+MICROSECONDS = 1e-6
+
+
+@dataclass(frozen=True)
+class DeviceTrajectory:
+    """times: (N,) seconds of the device's clock, rising. T_world_device: (N, 4, 4). world: name of their world."""
+
+    path: Path
+    times: NDArray[np.float64]
+    T_world_device: NDArray[np.float64]
+    world: str
+    left_out: int
+
+
+@dataclass(frozen=True)
+class CameraMounts:
+    """Where a camera sits on the device, as estimated over time. times: (N,) seconds. T_device_camera: (N, 4, 4)."""
+
+    path: Path
+    times: NDArray[np.float64]
+    T_device_camera: NDArray[np.float64]
+
+    def at(self, time: float) -> NDArray[np.float64]:
+        """The estimate nearest in time."""
+        return self.T_device_camera[int(np.abs(self.times - time).argmin())]
+
+
+def read_closed_loop(path: Path) -> DeviceTrajectory:
+    """closed_loop_trajectory.csv. Of several worlds (`graph_uid`) the one with most poses is taken, others counted.
+
+    Raises InputError with file and line for what is malformed, as do the readers below.
+    """
+    return _trajectory(path, "graph_uid", "world_device")
+
+
+def read_open_loop(path: Path) -> DeviceTrajectory:
+    """open_loop_trajectory.csv, of the odometry: it drifts. Of several sessions the longest is taken."""
+    return _trajectory(path, "session_uid", "odometry_device")
+
+
+def _trajectory(path: Path, world: str, frame: str) -> DeviceTrajectory:
+    names = [f"{axis}_{frame}" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
+    columns = {"tracking_timestamp_us": "i8", world: "U64", **dict.fromkeys(names, "f8")}
+    blocks = list(read_csv_blocks(path, columns))
+    table = np.concatenate([rows for _, rows in blocks]) if blocks else np.zeros(0, dtype=list(columns.items()))
+    if len(table) == 0:
+        raise InputError(f"{path}: holds no pose")
+    worlds, count = np.unique(table[world], return_counts=True)
+    main = worlds[count.argmax()]
+    rows = np.flatnonzero(table[world] == main)
+    table = table[rows]
+
+    def where(row: int) -> str:
+        return f"{path}:{rows[row] + 2}"
+
+    times = table["tracking_timestamp_us"] * MICROSECONDS
+    require_rising(times, where)
+    values = np.stack([table[name] for name in names], axis=1)
+    poses = poses_of_quaternions(values[:, :3], values[:, 3:], where)
+    return DeviceTrajectory(path, times, poses, str(main), int(count.sum() - count.max()))
+
+
+def read_calibration(path: Path, label: str) -> CameraMounts:
+    """`T_device_camera` of the camera of this label from online_calibration.jsonl."""
+    times, translations, quaternions, lines = [], [], [], []
+    try:
+        for number, line in enumerate(text_lines(path), start=1):
+            if not line.strip():
+                continue
+            time, translation, quaternion = _mount(line, label, path, number)
+            times.append(time)
+            translations.append(translation)
+            quaternions.append(quaternion)
+            lines.append(number)
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: holds bytes that are no text") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if not times:
+        raise InputError(f"{path}: holds no calibration")
+
+    def where(row: int) -> str:
+        return f"{path}:{lines[row]}"
+
+    require_rising(np.array(times), where)
+    return CameraMounts(
+        path, np.array(times), poses_of_quaternions(np.array(translations), np.array(quaternions), where)
+    )
+
+
+def _mount(line: str, label: str, path: Path, number: int) -> tuple[float, list[float], list[float]]:
+    """Time, translation and quaternion (x, y, z, w) of the camera in one line."""
+    data, what = parse_json(line, str(path), number), f"{path}:{number}"
+    cameras = data.get("CameraCalibrations") if isinstance(data, Mapping) else None
+    if not isinstance(cameras, list):
+        raise InputError(f"{what}: holds no `CameraCalibrations`")
+    labels = [camera.get("Label") if isinstance(camera, Mapping) else None for camera in cameras]
+    if label not in labels:
+        known = ", ".join(str(each)[:40] for each in labels[:20])
+        raise InputError(f"{what}: holds no camera {label}, only {known} (tracker.camera)")
+    try:
+        mount = cameras[labels.index(label)]["T_Device_Camera"]
+        real, imaginary = mount["UnitQuaternion"]
+        time = float(data["tracking_timestamp_us"]) * MICROSECONDS
+        translation, quaternion = _numbers(mount["Translation"], 3), [*_numbers(imaginary, 3), float(real)]
+        if not (np.abs([time, *translation, *quaternion]) <= LARGEST).all():
+            raise ValueError
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
+        raise InputError(
+            f"{what}: `tracking_timestamp_us` and T_Device_Camera of {label} must be numbers: Translation [x, y, z], "
+            "UnitQuaternion [w, [x, y, z]]"
+        ) from None
+    return time, translation, quaternion
+
+
+def _numbers(values: Any, count: int) -> list[float]:
+    numbers = [float(value) for value in values]
+    if len(numbers) != count:
+        raise ValueError
+    return numbers
+
+
+def read_points(
+    path: Path, world: str, max_inv_dist_std: float, max_dist_std: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
+    """Numbers (N,) and positions (N, 3) of the points that are certain enough, and how many there were.
+
+    path: semidense_points.csv.gz or the older global_points.csv.gz. Points of another world are left out. Raises
+    InputError where none is left.
+    """
+    columns = {
+        "uid": "i8",
+        "graph_uid": "U64",
+        **dict.fromkeys(("px_world", "py_world", "pz_world", "inv_dist_std", "dist_std"), "f8"),
+    }
+    uid, xyz, total = [np.zeros(0, np.int64)], [np.zeros((0, 3))], 0
+    for _, rows in read_csv_blocks(path, columns):
+        total += len(rows)
+        kept = rows[
+            (rows["graph_uid"] == world)
+            & (rows["inv_dist_std"] <= max_inv_dist_std)
+            & (rows["dist_std"] <= max_dist_std)
+        ]
+        uid.append(kept["uid"].copy())  # a column alone holds the whole table
+        xyz.append(np.stack([kept[name] for name in ("px_world", "py_world", "pz_world")], axis=1))
+    numbers, first = np.unique(np.concatenate(uid), return_index=True)
+    if len(numbers) == 0:
+        raise InputError(
+            f"{path}: none of its {total} points is of the trajectory's world and certain enough: raise "
+            "tracker.max_inv_dist_std and tracker.max_dist_std"
+        )
+    return numbers, np.concatenate(xyz)[first], total
+
+
+def read_observations(
+    path: Path, numbers: NDArray[np.int64], first: float, last: float
+) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """Times (T,) [seconds], rising, at which the device's tracking cameras saw points, and which of them each time.
+
+    numbers: (N,) rising; of other points nothing is kept. first, last: seconds, of other times nothing is kept. Points
+    come as their places in `numbers`.
+    """
+    columns = {"uid": "i8", "frame_tracking_timestamp_us": "i8"}
+    times, points = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for _, rows in read_csv_blocks(path, columns):
+        time, uid = rows["frame_tracking_timestamp_us"], rows["uid"]
+        place = np.minimum(np.searchsorted(numbers, uid), len(numbers) - 1)
+        kept = (numbers[place] == uid) & (time >= first / MICROSECONDS) & (time <= last / MICROSECONDS)
+        times.append(time[kept])
+        points.append(place[kept])
+    time, point = np.concatenate(times), np.concatenate(points)
+    if len(time) == 0:
+        raise InputError(f"{path}: none of its observations is of a point that is used, at the time of the frames")
+    order = np.lexsort((point, time))
+    time, point = time[order], point[order]
+    instants, start = np.unique(time, return_index=True)
+    return instants * MICROSECONDS, [np.unique(each) for each in np.split(point, start[1:])]

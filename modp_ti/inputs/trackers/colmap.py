@@ -1,0 +1,146 @@
+"""Tracker `colmap`: poses and points of a COLMAP model, binary or text, read with pycolmap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import ColmapSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.replay import (
+    PosedImage,
+    ReplayedTracker,
+    checked_pose,
+    points_inside,
+    require_fitting_sizes,
+)
+from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.sources.distortion import colmap_intrinsics
+from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.trackers.colmap_files import read_colmap_model
+
+if TYPE_CHECKING:
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+__all__ = ["open_colmap"]
+
+
+def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTracker:
+    """The images that the model has poses for, in natural order, with the points that each observes.
+
+    Raises InputError for a folder or model that is missing, damaged or of a camera model that is not
+    supported, where no image of the model is in the folder, and for images that do not fit their cameras.
+    """
+    place = source.require_path()
+    images = open_source(source)
+    selected = set(images.selected(source.start, source.stop, source.step))
+    folder = _model_folder(place, tracker.path)
+    model = read_colmap_model(folder)
+    if not model.images:
+        raise InputError(f"{folder}: the COLMAP model holds no image")
+
+    posed: dict[str, pycolmap.Image] = {}
+    absent: list[str] = []
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        name = images.find(image.name)
+        if name is None:
+            absent.append(image.name)
+        elif name in posed:
+            raise InputError(f"{folder}: images {posed[name].name} and {image.name} are both {images.path / name}")
+        else:
+            posed[name] = image
+    if not posed:
+        raise InputError(_no_match(images, folder, absent))
+
+    names = [name for name in images.names if name in posed and name in selected]
+    if not names:
+        raise InputError(
+            f"{folder}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
+        )
+    undistorters = {i: _undistorter(camera, source.scale, folder) for i, camera in model.cameras.items()}
+    cameras = [(name, undistorters[posed[name].camera_id]) for name in names]
+    require_fitting_sizes(images, cameras, str(folder))
+    reader = FrameReader(images, source)
+    reader.require_fitting(cameras)
+
+    positions = {i: np.asarray(point.xyz, dtype=np.float64) for i, point in model.points3D.items()}
+    frames = []
+    for name in names:
+        image = posed[name]
+        undistorter = undistorters[image.camera_id]
+        T_camera_world = np.eye(4)
+        T_camera_world[:3] = image.cam_from_world().matrix()
+        T_camera_world = checked_pose(T_camera_world, f"{folder}: image {image.name}")
+        points = _observed_points(image, positions, undistorter, T_camera_world, folder)
+        frames.append(PosedImage(name, undistorter, T_camera_world, points))
+
+    notes = []
+    if absent:
+        notes.append(f"{len(absent)} images of {folder} are not in {images.path}: skipped")
+    without_pose = len(selected) - len(names)
+    if without_pose:
+        notes.append(f"{without_pose} of {len(selected)} images have no pose in {folder}: skipped")
+    return ReplayedTracker(reader, frames, source, notes)
+
+
+def _model_folder(images: Path, given: Path | None) -> Path:
+    """The folder that holds cameras, images and points3D."""
+    roots = [given] if given is not None else [images.parent / "sparse", images / "sparse"]
+    for root in roots:
+        for folder in (root, root / "0") if given is not None else (root / "0", root):
+            if any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+                return folder
+    if given is None:
+        raise InputError(f"no COLMAP model in {images.parent / 'sparse'} or its folder 0: set tracker.path")
+    if not given.exists():
+        raise InputError(f"{given}: no such folder (tracker.path); it should hold a COLMAP model")
+    raise InputError(f"{given}: holds no COLMAP model (cameras, images and points3D as .bin or .txt)")
+
+
+def _no_match(images: ImageSource, folder: Path, absent: Sequence[str]) -> str:
+    if not absent:
+        return f"{folder}: no image of the COLMAP model has a pose"
+    return (
+        f"none of the {len(absent)} images of {folder} is in {images.path}: "
+        f"the model names {absent[0]}, the folder holds {images.names[0]}; check source.path"
+    )
+
+
+def _undistorter(camera: pycolmap.Camera, scale: float, folder: Path) -> Undistorter:
+    model = camera.model.name
+    intrinsics = colmap_intrinsics(model, camera.params)
+    if intrinsics is None:
+        raise InputError(f"{folder}: camera model {model} is not supported; run `colmap image_undistorter` first")
+    fx, fy, cx, cy, distortion = intrinsics
+    if not (np.isfinite(camera.params).all() and fx > 0 and fy > 0 and camera.width > 0 and camera.height > 0):
+        raise InputError(f"{folder}: camera {camera.camera_id} has impossible intrinsics: {camera.params_to_string()}")
+    pinhole = PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height))
+    return Undistorter(*require_plausible(pinhole, distortion, f"{folder}: camera {camera.camera_id}"), scale)
+
+
+def _observed_points(
+    image: pycolmap.Image,
+    positions: dict[int, NDArray[np.float64]],
+    undistorter: Undistorter,
+    T_camera_world: NDArray[np.float64],
+    folder: Path,
+) -> SparsePoints:
+    observed = image.get_observation_points2D()
+    if not observed:
+        return SparsePoints()
+    ids = np.array([point.point3D_id for point in observed], dtype=np.int64)
+    if not all(int(i) in positions for i in ids):
+        raise InputError(f"{folder}: points3D is incomplete: image {image.name} observes points that it lacks")
+    # A track may hold two observations in one image: the first one stands for the point.
+    ids, first = np.unique(ids, return_index=True)
+    pixels = undistorter.points(np.array([point.xy for point in observed])[first])
+    return points_inside(np.array([positions[int(i)] for i in ids]), pixels, ids, undistorter, T_camera_world)

@@ -1,0 +1,135 @@
+"""Frames of which a file gives the poses alone: the source knows their camera, a file or triangulation their points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import GivenPosesSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out, require_fitting_sizes
+from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.inputs.sources.protocol import require_intrinsics
+from modp_ti.inputs.trackers.point_cloud import visible_points
+from modp_ti.inputs.trackers.point_file import read_point_file
+
+__all__ = [
+    "checked_reader",
+    "found_file",
+    "missing_frames_note",
+    "replay_poses",
+    "selected_frames",
+    "spread_points",
+]
+
+
+def selected_frames(images: ImageSource, source: SourceSettings) -> list[str]:
+    """The images that source.start/stop/step select, in their order."""
+    return list(images.selected(source.start, source.stop, source.step))
+
+
+def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
+    """The file that tracker.path names, or the first of the guesses that is there.
+
+    A folder in tracker.path is searched for the guesses' names. Raises InputError where there is none.
+    """
+    if given is None:
+        candidates = list(guesses)
+    elif given.is_dir():
+        candidates = [given / guess.name for guess in guesses]
+    else:
+        candidates = [given]
+    for file in candidates:
+        if file.is_file():
+            return file
+    if given is not None and not given.exists():
+        raise InputError(f"{given}: no such file (tracker.path); it should be {what}")
+    names = ", ".join(dict.fromkeys(file.name for file in candidates))
+    folders = " or ".join(dict.fromkeys(str(file.parent) for file in candidates))
+    raise InputError(f"no {names} in {folders}: set tracker.path to {what}")
+
+
+def checked_reader(
+    images: ImageSource, source: SourceSettings, names: Sequence[str], undistorter: Undistorter, intrinsics: str
+) -> FrameReader:
+    """What reads the frames. Raises InputError where an image, a mask or the vignette does not fit the camera.
+
+    intrinsics: where the camera comes from, for the message.
+    """
+    cameras = [(name, undistorter) for name in names]
+    require_fitting_sizes(images, cameras, intrinsics)
+    reader = FrameReader(images, source)
+    reader.require_fitting(cameras)
+    return reader
+
+
+def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], origin: Path) -> list[str]:
+    """A remark on how many of the selected images have no pose; none where all have."""
+    missing = [name for name in selected if name not in posed]
+    if not missing:
+        return []
+    return [
+        f"{len(missing)} of {len(selected)} images have no pose in {origin.name}: skipped (the first: {missing[0]})"
+    ]
+
+
+def replay_poses(
+    images: ImageSource,
+    source: SourceSettings,
+    tracker: GivenPosesSettings,
+    poses: Mapping[str, NDArray[np.float64]],
+    notes: Sequence[str],
+    progress: Progress | None,
+) -> ReplayedTracker:
+    """A tracker over the images that have a pose `T_camera_world`, in the source's order.
+
+    Points are those of `tracker.points` that project into each image; without such a file features are tracked and
+    triangulated here with the poses, before the first frame is delivered, and the poses adjusted with them where
+    `tracker.adjust` says so. Raises InputError for a camera that nobody
+    knows, images that do not fit it, and a point file that is none.
+    """
+    undistorter = require_intrinsics(images).undistorter(source.scale)
+    names = sorted(poses, key=images.position)
+    reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
+    frames = [PosedImage(name, undistorter, poses[name]) for name in names]
+    if tracker.points is not None:
+        xyz = read_point_file(tracker.points)
+        numbers = np.arange(len(xyz))
+        frames = [frame.with_points(spread_points(xyz, numbers, frame, tracker.max_points)) for frame in frames]
+        if not any(len(frame.points) for frame in frames):
+            raise InputError(
+                f"{tracker.points}: none of its {len(xyz)} points is seen by any of the {len(frames)} frames: "
+                "points and poses must be of one world, poses camera to world (tracker.points)"
+            )
+    else:
+        solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
+        if tracker.adjusts:
+            frames, note = adjusted_frames(images, frames, solves, progress)
+            notes = [*notes, note]
+        else:
+            frames = triangulated_frames(images, frames, solves, progress)
+    return ReplayedTracker(reader, frames, source, notes)
+
+
+def spread_points(xyz: NDArray[np.float64], numbers: NDArray[np.int64], frame: PosedImage, limit: int) -> SparsePoints:
+    """The points (N, 3), called by their numbers (N,), that the frame sees by projection, `limit` of them at most.
+
+    Which ones are left out is drawn once for all frames, so that frames of the same place keep the same points.
+    """
+    points = visible_points(xyz, frame.undistorter, frame.T_camera_world)
+    ids = numbers[points.ids]
+    if len(points) <= limit:
+        return SparsePoints(points.xyz, points.pixels, ids)
+    # A bijection on 64-bit numbers (splitmix64) gives every number its place in one random order.
+    order = ids.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+    order = (order ^ (order >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    order = (order ^ (order >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    kept = np.sort(np.argsort(order ^ (order >> np.uint64(31)), kind="stable")[:limit])
+    return SparsePoints(points.xyz[kept], points.pixels[kept], ids[kept])

@@ -1,0 +1,175 @@
+"""Tracker `modp`: the files of the paper's release, a JSON of poses and a file of points for each frame."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import ModpSettings
+from modp_ti.files import LARGEST, open_file, read_json
+from modp_ti.files.errors import InputError
+from modp_ti.files.number_rows import read_number_rows
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
+from modp_ti.inputs.sources import Undistorter, open_source
+from modp_ti.inputs.sources.protocol import require_intrinsics
+from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
+
+__all__ = ["open_modp"]
+
+POSES = "trajectory.json"
+# With ORB-SLAM3 as its tracker the release writes other names.
+POSES_ORB = "trajectory_orb.json"
+CLOUDS = {POSES: "point_cloud", POSES_ORB: "orb_point_clouds"}
+
+
+# What np.save writes before the numbers; its length stands in two bytes, or in four.
+NPY_START = 4096
+NPY_HEADER = re.compile(
+    rb"\x93NUMPY[\1-\3]\0(?:..|....)\{\s*'descr':\s*'[<>|=]?[a-zA-Z]\d{1,3}',\s*'fortran_order':\s*(?:True|False),"
+    rb"\s*'shape':\s*\((?:\d{1,12},? ?){0,4}\),?\s*\}\s*\n",
+    re.DOTALL,
+)
+
+
+def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
+    """The images that the JSON has poses for, in the source's order, each with the points of its own file.
+
+    Points are told apart by their coordinates: one place is one point, in whichever frames' files it stands; pixels are
+    projections. Raises InputError for files that are missing or malformed, poses that are no rigid motion, a point file
+    with the wrong columns or NaN, no points at all, and images that do not fit `source.intrinsics`.
+    """
+    place = source.require_path()
+    folders = (place, place.parent)
+    guesses = [folder / name for name in (POSES, POSES_ORB) for folder in folders]
+    file = found_file(tracker.path, guesses, f"the release's {POSES} or {POSES_ORB}")
+    cameras = _cameras(file)
+    folder = file.parent / CLOUDS.get(file.name, CLOUDS[POSES])
+    clouds = _cloud_files(folder)
+    images = open_source(source)
+    selected = selected_frames(images, source)
+    entries: dict[str, int] = {}
+    absent = []
+    for number, (image, _) in enumerate(cameras):
+        name = images.find(image)
+        if name is None:
+            absent.append(image)
+        elif name in entries:
+            raise InputError(f"{file}: cameras {entries[name]} and {number} both have the image {name}")
+        else:
+            entries[name] = number
+    if not entries:
+        raise InputError(
+            f"{file}: none of its {len(absent)} cameras has an image in {images.path}: the first is {absent[0]}, "
+            f"there is {images.names[0]}; check source.path"
+        )
+    names = [name for name in selected if name in entries]
+    if not names:
+        raise InputError(f"{file}: has no pose for any of the frames that source.start/stop/step select")
+
+    undistorter = require_intrinsics(images).undistorter(source.scale)
+    reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
+    numbers = [entries[name] for name in names]
+    xyz = [_read_cloud(clouds[number]) if number in clouds else np.zeros((0, 3)) for number in numbers]
+    if not any(len(each) for each in xyz):
+        raise InputError(f"{folder}: holds no point for any of the {len(names)} frames")
+    # One number for one place, in whichever files it stands.
+    _, ids = np.unique(np.concatenate(xyz), axis=0, return_inverse=True)
+    ids = ids.reshape(-1).astype(np.int64)
+    frames, first = [], 0
+    for name, number, cloud in zip(names, numbers, xyz, strict=True):
+        T = cameras[number][1]
+        mine = np.unique(ids[first : first + len(cloud)], return_index=True)
+        frames.append(PosedImage(name, undistorter, T, _projected(cloud[mine[1]], mine[0], undistorter, T)))
+        first += len(cloud)
+
+    notes = []
+    if absent:
+        notes.append(f"{len(absent)} cameras of {file.name} have no image in {images.path}: skipped")
+    notes += missing_frames_note(selected, entries, file)
+    without = sum(number not in clouds for number in numbers)
+    if without:
+        notes.append(f"{without} frames have no file of points in {folder}: they bring none")
+    return ReplayedTracker(reader, frames, source, notes)
+
+
+def _projected(
+    xyz: NDArray[np.float64], ids: NDArray[np.int64], undistorter: Undistorter, T_camera_world: NDArray[np.float64]
+) -> SparsePoints:
+    """The points before the camera and inside the image, at their projections."""
+    depth = xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
+    pixels = np.full((len(xyz), 2), np.nan)
+    before = depth > 1e-9
+    pixels[before] = undistorter.camera.project(xyz[before] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
+    return points_inside(xyz, pixels, ids, undistorter, T_camera_world)
+
+
+def _cameras(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
+    """Image and `T_camera_world` of each entry."""
+    data = read_json(file, "tracker.path")
+    entries = data.get("cameras") if isinstance(data, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{file}: holds no list of `cameras`; it is not a trajectory of the release")
+    return [_camera(file, number, entry) for number, entry in enumerate(entries)]
+
+
+def _camera(file: Path, number: int, entry: Any) -> tuple[str, NDArray[np.float64]]:
+    image = entry.get("image") if isinstance(entry, dict) else None
+    if not isinstance(image, str):
+        raise InputError(f"{file}: camera {number} has no `image`")
+    try:
+        matrix = np.array(entry.get("T_camera_world"), dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape != (4, 4):
+        raise InputError(f"{file}: camera {number} ({image}): `T_camera_world` must be 4 rows of 4 numbers")
+    return image, checked_pose(matrix, f"{file}: camera {number} ({image})")
+
+
+def _cloud_files(folder: Path) -> dict[int, Path]:
+    """The file of points of each camera's number."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder: it would have brought the points of each frame, point_cloud_0.txt")
+    clouds: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        number = re.search(r"([0-9]+)$", path.stem)
+        if path.suffix.lower() in (".txt", ".npy") and number is not None:
+            if int(number[1]) in clouds:
+                raise InputError(f"{path}: {clouds[int(number[1])].name} is of the same frame; take one of them out")
+            clouds[int(number[1])] = path
+    if not clouds:
+        raise InputError(f"{folder}: holds no point_cloud_<number>.txt or .npy")
+    return clouds
+
+
+def _read_cloud(path: Path) -> NDArray[np.float64]:
+    """World points (N, 3); a text file without a line has none."""
+    if path.suffix.lower() == ".txt":
+        try:
+            with open_file(path) as file:
+                if not file.read(1):
+                    return np.zeros((0, 3))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
+    try:
+        with open_file(path) as file:
+            start = file.read(NPY_START)
+        if NPY_HEADER.match(start) is None:  # np.load takes archives and pickles too, and code for a header
+            raise ValueError
+        xyz = np.load(path, allow_pickle=False, mmap_mode="r")  # mapped: its header is held against the file's size
+    except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TypeError):
+        raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
+    if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
+        raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
+    with np.errstate(all="ignore"):  # a NaN that signals says so when it becomes a float64
+        xyz = np.array(xyz[:, :3], dtype=np.float64)
+    bad = np.flatnonzero(~(np.abs(xyz) <= LARGEST).all(axis=1))
+    if len(bad):
+        raise InputError(f"{path}: point {bad[0]} holds NaN or infinite numbers, or such beyond {LARGEST:g}")
+    return xyz

@@ -1,0 +1,257 @@
+"""stella_vslam's map file in MessagePack: cameras, keyframes with what they observe, landmarks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files import LARGEST, open_file
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import Distortion, Intrinsics
+from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.trackers.trajectory import poses_of_quaternions
+
+__all__ = ["StellaKeyframe", "StellaMap", "read_stella_map"]
+
+# Bounds on what a file may ask for before its content is there: the reader sets an array's memory aside when it meets
+# its length, nested ones too.
+MAX_ARRAY = 50_000  # keypoints of a keyframe are the longest arrays
+MAX_TEXT = 4096
+MAX_ITEMS = 20_000_000  # keyframes or landmarks
+MAX_BUFFER = 1 << 26  # bytes of one value
+READ_SIZE = 1 << 20
+
+WANTED = ("ts", "cam", "rot_cw", "trans_cw", "undist_keypts", "lm_ids")
+
+
+@dataclass(frozen=True)
+class StellaKeyframe:
+    """number: its id. time: seconds. T_camera_world: (4, 4).
+
+    landmarks: (N,) int64 ids of what it observes. pixels: (N, 2), where, in the image without distortion, pixel centres
+    at +0.5.
+    """
+
+    number: int
+    time: float
+    camera: str
+    T_camera_world: NDArray[np.float64]
+    landmarks: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StellaMap:
+    """keyframes: in the order of time. landmarks: position (3,) of each id."""
+
+    path: Path
+    cameras: dict[str, Intrinsics]
+    keyframes: list[StellaKeyframe]
+    landmarks: dict[int, NDArray[np.float64]]
+
+
+class _DamagedError(Exception):
+    """The file holds what no stella_vslam writes; the message says what."""
+
+
+def read_stella_map(path: Path) -> StellaMap:
+    """The map of a `.msg` file. Raises InputError for one that is missing, cut off, damaged, or without keyframes.
+
+    Descriptors and the graph between keyframes are skipped, not held.
+    """
+    try:
+        with open_file(path) as file:
+            if file.read(16).startswith(b"SQLite format 3"):
+                raise InputError(
+                    f"{path}: an SQLite map; let stella_vslam write MessagePack: MapFormat: msgpack in its "
+                    "configuration, and --map-db-out map.msg"
+                )
+            file.seek(0)
+            _unpacker(file).skip()  # makes nothing: every length in the file is backed by as much content
+            file.seek(0)
+            return _read(path, file)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file (tracker.path)") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except msgpack.OutOfData:
+        raise InputError(f"{path}: the file is cut off; copy it again or let stella_vslam write it again") from None
+    except _DamagedError as error:
+        raise InputError(f"{path}: {error}; the file is damaged or of another version of stella_vslam") from None
+    except (ValueError, msgpack.UnpackException) as error:
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        raise InputError(f"{path}: not a map of stella_vslam in MessagePack ({reason})") from None
+
+
+def _unpacker(file: BinaryIO) -> msgpack.Unpacker:
+    return msgpack.Unpacker(
+        file,
+        read_size=READ_SIZE,
+        max_buffer_size=MAX_BUFFER,
+        max_array_len=MAX_ARRAY,
+        max_map_len=MAX_ITEMS,
+        max_str_len=MAX_TEXT,
+        max_bin_len=0,
+        max_ext_len=0,
+        raw=False,
+    )
+
+
+def _read(path: Path, file: BinaryIO) -> StellaMap:
+    unpacker = _unpacker(file)
+    cameras: dict[str, Intrinsics] = {}
+    keyframes: list[StellaKeyframe] = []
+    landmarks: dict[int, NDArray[np.float64]] = {}
+    sections = set()
+    for section in _keys(unpacker, "the map"):
+        sections.add(section)
+        if section == "cameras":
+            cameras = {name: _camera(name, unpacker.unpack()) for name in _keys(unpacker, "cameras")}
+        elif section == "keyframes":
+            keyframes = [_keyframe(unpacker, number) for number in _keys(unpacker, "keyframes")]
+        elif section == "landmarks":
+            landmarks = {_number(key, "landmark"): _landmark(unpacker, key) for key in _keys(unpacker, "landmarks")}
+        else:
+            unpacker.skip()
+    missing = [section for section in ("cameras", "keyframes", "landmarks") if section not in sections]
+    if missing:
+        raise _DamagedError(f"the map holds no `{missing[0]}`")
+    if not keyframes:
+        raise InputError(f"{path}: the map holds no keyframe: stella_vslam did not initialise")
+    if not landmarks:
+        raise InputError(f"{path}: the map holds no landmark: nothing can be mapped from it")
+    keyframes.sort(key=lambda keyframe: keyframe.time)
+    for keyframe in keyframes:
+        lost = next((i for i in keyframe.landmarks.tolist() if i not in landmarks), None)
+        if lost is not None:
+            raise _DamagedError(f"keyframe {keyframe.number} observes landmark {lost}, which the map lacks")
+        if keyframe.camera not in cameras:
+            raise _DamagedError(f"keyframe {keyframe.number} is of camera {keyframe.camera!r}, which the map lacks")
+    for one, other in pairwise(keyframes):
+        if one.time == other.time:
+            raise _DamagedError(f"keyframes {one.number} and {other.number} are of one time ({one.time:.6f} s)")
+    return StellaMap(path, cameras, keyframes, landmarks)
+
+
+def _keys(unpacker: msgpack.Unpacker, what: str) -> Iterator[str]:
+    """The keys of the map that comes next; whoever iterates takes each value out before asking for the next key."""
+    try:
+        count = unpacker.read_map_header()
+    except (ValueError, msgpack.UnpackException) as error:
+        if isinstance(error, msgpack.OutOfData):
+            raise
+        raise _DamagedError(f"{what}: a table of names is expected") from None
+    for _ in range(count):
+        key = unpacker.unpack()
+        if not isinstance(key, str):
+            raise _DamagedError(f"{what}: a name is expected, not {key!r:.40}")
+        yield key
+
+
+def _number(key: str, what: str) -> int:
+    if not (key.isascii() and key.isdigit() and len(key) < 19):
+        raise _DamagedError(f"a {what} is called {key[:40]!r} instead of by a number")
+    return int(key)
+
+
+def _floats(value: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
+    """Finite numbers of this shape; -1 as its first is any."""
+    try:
+        array = np.array(value, dtype=np.float64).reshape(shape)
+    except (TypeError, ValueError, OverflowError):
+        raise _DamagedError(f"{what} must be {' x '.join(str(n) for n in shape)} numbers") from None
+    if not (np.abs(array) <= LARGEST).all():
+        raise _DamagedError(f"{what} holds NaN or infinite numbers, or such beyond {LARGEST:g}")
+    return array
+
+
+def _camera(name: str, values: Any) -> Intrinsics:
+    what = f"camera {name!r}"
+    if not isinstance(values, Mapping):
+        raise _DamagedError(f"{what} is no table")
+    model = values.get("model_type")
+    if model not in ("Perspective", "Fisheye"):
+        raise _DamagedError(f"{what} is of model {model!r}; Perspective and Fisheye can be used")
+
+    def number(key: str) -> float:
+        value = values.get(key, 0.0 if key[0] in "kp" else None)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise _DamagedError(f"{what}: `{key}` must be a number")
+        return float(value)
+
+    try:
+        # stella_vslam counts pixel centres from 0, as OpenCV does.
+        camera = PinholeCamera(
+            number("fx"),
+            number("fy"),
+            number("cx") + 0.5,
+            number("cy") + 0.5,
+            int(number("cols")),
+            int(number("rows")),
+        )
+    except ValueError as error:
+        raise _DamagedError(f"{what}: {error}") from None
+    if model == "Fisheye":
+        lens = Distortion(tuple(number(key) for key in ("k1", "k2", "k3", "k4")), fisheye=True)
+    else:
+        radial = tuple(number(key) for key in ("k1", "k2", "k3"))
+        lens = Distortion(radial, tangential=(number("p1"), number("p2")))
+    try:
+        return Intrinsics(*require_plausible(camera, lens, what))
+    except InputError as error:
+        raise _DamagedError(str(error)) from None
+
+
+def _keyframe(unpacker: msgpack.Unpacker, key: str) -> StellaKeyframe:
+    number = _number(key, "keyframe")
+    what = f"keyframe {number}"
+    values: dict[str, Any] = {}
+    for name in _keys(unpacker, what):
+        if name in WANTED:
+            values[name] = unpacker.unpack()
+        else:
+            unpacker.skip()
+    missing = [name for name in WANTED if name not in values]
+    if missing:
+        raise _DamagedError(f"{what} has no `{missing[0]}`")
+    time = _floats(values["ts"], (), f"{what}: `ts`")
+    rotation = _floats(values["rot_cw"], (1, 4), f"{what}: `rot_cw`")
+    translation = _floats(values["trans_cw"], (1, 3), f"{what}: `trans_cw`")
+    try:
+        T_camera_world = poses_of_quaternions(translation, rotation, lambda _: what)[0]
+    except InputError as error:
+        raise _DamagedError(str(error).partition(";")[0]) from None
+
+    ids, keypoints = values["lm_ids"], values["undist_keypts"]
+    if not (isinstance(ids, list) and isinstance(keypoints, list) and len(ids) == len(keypoints)):
+        raise _DamagedError(f"{what}: `lm_ids` and `undist_keypts` must be lists of one length")
+    if not all(type(i) is int and -1 <= i < 1 << 62 for i in ids):
+        raise _DamagedError(f"{what}: `lm_ids` must be whole numbers, -1 for none")
+    numbers = np.array(ids, dtype=np.int64)
+    seen = np.flatnonzero(numbers >= 0)
+    places = [keypoints[i].get("pt") if isinstance(keypoints[i], Mapping) else None for i in seen]
+    pixels = _floats(places, (len(seen), 2), f"{what}: the places of its keypoints") + 0.5
+    # One landmark at two keypoints: the first stands for it.
+    landmarks, first = np.unique(numbers[seen], return_index=True)
+    return StellaKeyframe(number, float(time), str(values["cam"]), T_camera_world, landmarks, pixels[first])
+
+
+def _landmark(unpacker: msgpack.Unpacker, key: str) -> NDArray[np.float64]:
+    position = None
+    for name in _keys(unpacker, f"landmark {key}"):
+        if name == "pos_w":
+            position = _floats(unpacker.unpack(), (3,), f"landmark {key}: `pos_w`")
+        else:
+            unpacker.skip()
+    if position is None:
+        raise _DamagedError(f"landmark {key} has no `pos_w`")
+    return position

@@ -1,0 +1,109 @@
+"""Tracker `stella_vslam`: its map in MessagePack, and the trajectory of all frames beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import StellaVslamSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, points_inside
+from modp_ti.inputs.sources import ImageSource, Intrinsics, Undistorter, open_source
+from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
+from modp_ti.inputs.trackers.point_cloud import visible_points
+from modp_ti.inputs.trackers.stella_map import StellaKeyframe, StellaMap, read_stella_map
+from modp_ti.inputs.trackers.trajectory import Trajectory, read_trajectory_file, rows_at_frames
+
+__all__ = ["open_stella_vslam"]
+
+TRAJECTORY = "frame_trajectory.txt"
+# A frame between keyframes is shown what this many of them on either side of it observe.
+NEIGHBOURS = 2
+# A keyframe is the frame whose time differs by less than this [s]; both were written with 15 digits.
+SAME_TIME = 1e-4
+
+
+def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> ReplayedTracker:
+    """The images that stella_vslam has poses for, in the source's order, with the landmarks that each sees.
+
+    A keyframe sees what it observed, where it observed it. A frame between keyframes sees the landmarks that two
+    keyframes before and two after it observe, where they project to: nothing in stella_vslam's files says more. Without
+    frame_trajectory.txt beside the map there are keyframes alone. Raises InputError for a map or trajectory that is
+    missing or malformed, and images that do not fit the map's camera or times.
+    """
+    place = source.require_path()
+    file = found_file(tracker.path, [place.parent / "map.msg", place / "map.msg"], "a map of stella_vslam (map.msg)")
+    world = read_stella_map(file)
+    beside = file.with_name(TRAJECTORY)
+    trajectory = read_trajectory_file(beside) if beside.is_file() else None
+    keyframes_alone = trajectory is None
+    images = open_source(source)
+    selected = selected_frames(images, source)
+    keyframe_times = np.array([keyframe.time for keyframe in world.keyframes])
+    if trajectory is None:
+        trajectory = Trajectory(file, keyframe_times, np.stack([each.T_camera_world for each in world.keyframes]))
+    rows = rows_at_frames(images, selected, trajectory.path, trajectory.times, tracker)
+
+    intrinsics, said_by = _intrinsics(images, world, source)
+    undistorter = intrinsics.undistorter(source.scale)
+    names = sorted(rows, key=images.position)
+    reader = checked_reader(images, source, names, undistorter, said_by)
+
+    frames, between = [], 0
+    for name in names:
+        time = trajectory.times[rows[name]]
+        nearest = int(np.abs(keyframe_times - time).argmin())
+        if abs(keyframe_times[nearest] - time) <= SAME_TIME:
+            keyframe = world.keyframes[nearest]
+            # The map's own pose: of the same optimisation as its landmarks.
+            T = keyframe.T_camera_world
+            points = _observed(keyframe, world, undistorter)
+        else:
+            T = trajectory.T_camera_world[rows[name]]
+            after = int(np.searchsorted(keyframe_times, time))
+            points = _projected(world.keyframes[max(0, after - NEIGHBOURS) : after + NEIGHBOURS], world, undistorter, T)
+            between += 1
+        frames.append(PosedImage(name, undistorter, T, points))
+
+    notes = [*missing_frames_note(selected, rows, trajectory.path)]
+    if keyframes_alone:
+        notes.append(f"{beside} is missing: it would have brought the poses of the frames between the keyframes")
+    if between:
+        notes.append(
+            f"{between} frames between keyframes: the landmarks of the {NEIGHBOURS} keyframes on either side, at the "
+            "pixels that they project to"
+        )
+    return ReplayedTracker(reader, frames, source, notes)
+
+
+def _intrinsics(images: ImageSource, world: StellaMap, source: SourceSettings) -> tuple[Intrinsics, str]:
+    """The camera, and who says so: the user before the map before the source."""
+    if source.intrinsics.given and images.intrinsics is not None:
+        return images.intrinsics, "source.intrinsics"
+    cameras = {keyframe.camera for keyframe in world.keyframes}
+    if len(cameras) > 1:
+        raise InputError(f"{world.path}: keyframes of {len(cameras)} cameras; one is supported")
+    return world.cameras[cameras.pop()], str(world.path)
+
+
+def _observed(keyframe: StellaKeyframe, world: StellaMap, undistorter: Undistorter) -> SparsePoints:
+    xyz = _positions(keyframe.landmarks, world)
+    camera = undistorter.camera
+    pixels = keyframe.pixels * np.divide((camera.width, camera.height), (undistorter.raw.width, undistorter.raw.height))
+    return points_inside(xyz, pixels, keyframe.landmarks, undistorter, keyframe.T_camera_world)
+
+
+def _projected(
+    keyframes: Sequence[StellaKeyframe], world: StellaMap, undistorter: Undistorter, T_camera_world: NDArray[np.float64]
+) -> SparsePoints:
+    ids = np.unique(np.concatenate([keyframe.landmarks for keyframe in keyframes]))
+    points = visible_points(_positions(ids, world), undistorter, T_camera_world)
+    return SparsePoints(points.xyz, points.pixels, ids[points.ids])
+
+
+def _positions(ids: NDArray[np.int64], world: StellaMap) -> NDArray[np.float64]:
+    return np.array([world.landmarks[i] for i in ids.tolist()], dtype=np.float64).reshape(-1, 3)

@@ -1,0 +1,193 @@
+"""Tracker `transforms`: a transforms.json of instant-ngp or nerfstudio."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import TransformsSettings
+from modp_ti.files import is_file, read_json
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.multiview.triangulation import triangulated_frames
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import (
+    PosedImage,
+    ReplayedTracker,
+    checked_pose,
+    is_held_out,
+    require_fitting_sizes,
+)
+from modp_ti.inputs.sources import Distortion, FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
+
+__all__ = ["open_transforms"]
+
+# OpenGL camera axes (x right, y up, z back) in OpenCV ones; its own inverse.
+OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+
+
+def open_transforms(
+    source: SourceSettings, tracker: TransformsSettings, progress: Progress | None = None
+) -> ReplayedTracker:
+    """The frames of the file whose images are in the folder, in natural order of the images.
+
+    Points come from `ply_file_path` where the file names one, otherwise they are triangulated here with the
+    poses, before the first frame is delivered. Raises InputError for a file that is missing or malformed,
+    poses that are none, no image at all, and images that do not fit the intrinsics.
+    """
+    place = source.require_path()
+    images = open_source(source)
+    selected = set(images.selected(source.start, source.stop, source.step))
+    file = _transforms_file(place, tracker.path)
+    data = _read_json(file)
+
+    entries: dict[str, Mapping[str, Any]] = {}
+    absent: list[str] = []
+    for number, entry in enumerate(data["frames"]):
+        path = entry.get("file_path") if isinstance(entry, dict) else None
+        if not isinstance(path, str):
+            raise InputError(f"{file}: frame {number} has no `file_path`")
+        name = images.find(path)
+        if name is None:
+            absent.append(path)
+        elif name in entries:
+            raise InputError(f"{file}: two frames name the image {name} (the second is {path})")
+        else:
+            entries[name] = entry
+    if not entries:
+        raise InputError(
+            f"{file}: none of its {len(absent)} frames has an image in {images.path}: "
+            f"the first is {absent[0]}, the folder holds {images.names[0]}; check source.path"
+        )
+    names = [name for name in images.names if name in entries and name in selected]
+    if not names:
+        raise InputError(
+            f"{file}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
+        )
+
+    undistorters: dict[tuple[PinholeCamera, Distortion], Undistorter] = {}
+    frames = []
+    for name in names:
+        raw, distortion = _intrinsics({**data, **entries[name]}, images, name, file)
+        undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, source.scale))
+        frames.append(PosedImage(name, undistorter, _pose(entries[name], file)))
+    require_fitting_sizes(images, [(frame.name, frame.undistorter) for frame in frames], str(file))
+    reader = FrameReader(images, source)
+    reader.require_fitting([(frame.name, frame.undistorter) for frame in frames])
+
+    notes = []
+    if absent:
+        notes.append(f"{len(absent)} frames of {file.name} have no image file: skipped")
+    without_pose = len(selected) - len(names)
+    if without_pose:
+        notes.append(f"{without_pose} of {len(selected)} images have no pose in {file.name}: skipped")
+
+    cloud = data.get("ply_file_path")
+    if isinstance(cloud, str) and is_file(file.parent / cloud):
+        xyz = read_ply_points(file.parent / cloud)
+        frames = [f.with_points(visible_points(xyz, f.undistorter, f.T_camera_world)) for f in frames]
+    else:
+        if isinstance(cloud, str):
+            notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
+        solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
+        frames = triangulated_frames(images, frames, solves, progress)
+    return ReplayedTracker(reader, frames, source, notes)
+
+
+def _transforms_file(images: Path, given: Path | None) -> Path:
+    if given is None:
+        guesses = [images.parent / "transforms.json", images / "transforms.json"]
+        for guess in guesses:
+            if guess.exists():
+                return guess
+        raise InputError(f"no transforms.json in {images.parent} or {images}: set tracker.path")
+    file = given / "transforms.json" if given.is_dir() else given
+    if not file.exists():
+        raise InputError(f"{file}: no such file (tracker.path)")
+    return file
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    data = read_json(file, "tracker.path")
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
+        raise InputError(f"{file}: holds no list of `frames`; it is not a transforms.json")
+    return data
+
+
+def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:
+    """T_camera_world in OpenCV axes."""
+    what = f"{file}: frame {entry['file_path']}"
+    try:
+        matrix = np.array(entry.get("transform_matrix"), dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        raise InputError(f"{what}: `transform_matrix` must be 4 rows of 4 numbers") from None
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise InputError(f"{what}: `transform_matrix` must be 4 rows of 4 numbers, camera to world")
+    T_world_camera = checked_pose(matrix, what) @ OPENCV_OPENGL
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3] = T_world_camera[:3, :3].T
+    T_camera_world[:3, 3] = -T_world_camera[:3, :3].T @ T_world_camera[:3, 3]
+    return T_camera_world
+
+
+def _intrinsics(
+    values: Mapping[str, Any], images: ImageSource, name: str, file: Path
+) -> tuple[PinholeCamera, Distortion]:
+    """Camera of the stored image; `values` are the file's keys with those of the frame over them."""
+
+    def number(key: str) -> float | None:
+        value = values.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            shown = json.dumps(value)[:60]
+            raise InputError(f"{file}: `{key}` must be a number, not {shown} (frame {values['file_path']})")
+        return float(value)
+
+    width, height = number("w"), number("h")
+    if width is None or height is None:
+        stored = images.size(name)
+        width, height = float(width or stored[0]), float(height or stored[1])
+    if width < 1 or height < 1 or width != int(width) or height != int(height):
+        raise InputError(f"{file}: `w` and `h` must be whole numbers of pixels, not {width:g} and {height:g}")
+
+    def focal(key: str, angle_key: str, size: float) -> float | None:
+        given, angle = number(key), number(angle_key)
+        if given is None and angle is not None and 0 < angle < math.pi:
+            given = 0.5 * size / math.tan(0.5 * angle)
+        return given
+
+    fx, fy = focal("fl_x", "camera_angle_x", width), focal("fl_y", "camera_angle_y", height)
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None or fx <= 0 or fy <= 0:
+        raise InputError(f"{file}: no focal length for {values['file_path']}: give `fl_x` or `camera_angle_x`")
+    cx, cy = number("cx"), number("cy")
+    camera = PinholeCamera(
+        fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy, int(width), int(height)
+    )
+
+    what = f"{file}: frame {values['file_path']}"
+    k1, k2, k3, k4, p1, p2 = (number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = str(values.get("camera_model", "OPENCV")).upper()
+    if values.get("is_fisheye") is True:
+        model = "OPENCV_FISHEYE"
+    if model in FISHEYE_MODELS:
+        return require_plausible(camera, Distortion((k1, k2, k3, k4), fisheye=True), what)
+    if model not in PERSPECTIVE_MODELS:
+        supported = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
+        raise InputError(f"{file}: camera model {model} is not supported ({supported}); undistort the images first")
+    return require_plausible(camera, Distortion((k1, k2, k3, k4), tangential=(p1, p2)), what)

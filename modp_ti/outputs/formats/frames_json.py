@@ -1,0 +1,55 @@
+"""`frames.json`: what later commands must know of a run and no other of its files says."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from modp_ti.files import read_json
+from modp_ti.files.atomic import replace_text
+from modp_ti.files.errors import InputError
+
+__all__ = ["FramesRecord", "read_frames", "write_frames"]
+
+
+@dataclass(frozen=True)
+class FramesRecord:
+    """near: depth below which nothing was drawn. scene_depth: median depth of what the keyframes see [scene units].
+
+    keyframes, held_out: which frames are, as rising indices into the lines of trajectory.txt.
+    """
+
+    near: float
+    scene_depth: float
+    keyframes: list[int]
+    held_out: list[int]
+
+
+def write_frames(
+    path: Path, near: float, scene_depth: float, keyframes: Collection[int], held_out: Collection[int]
+) -> None:
+    """Write the record; numbers have the digits that give them back exactly."""
+    lists = {"keyframes": sorted(keyframes), "held_out": sorted(held_out)}
+    lines = [f'"{name}": {json.dumps(value)}' for name, value in lists.items()]
+    text = ",\n ".join([f'"near": {float(near)!r}', f'"scene_depth": {float(scene_depth)!r}', *lines])
+    replace_text(path, f"{{{text}}}\n")
+
+
+def read_frames(path: Path, count: int) -> FramesRecord:
+    """The record of a run of `count` frames. Raises InputError for a file that is none."""
+    try:
+        data = read_json(path, "of a finished run")
+        record = FramesRecord(
+            float(data["near"]), float(data["scene_depth"]), list(data["keyframes"]), list(data["held_out"])
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as what a run says of its frames: {error!r:.80}") from None
+    indices = [*record.keyframes, *record.held_out]
+    if not (0 < record.near < math.inf and 0 < record.scene_depth < math.inf and record.keyframes):
+        raise InputError(f"{path}: near and scene_depth must be positive, and keyframes must name some")
+    if not all(type(index) is int and 0 <= index < count for index in indices):
+        raise InputError(f"{path}: names frames beyond the {count} that trajectory.txt has")
+    return record

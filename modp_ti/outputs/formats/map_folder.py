@@ -1,0 +1,73 @@
+"""A map as a folder: what every map leaves, and how a folder's files are put in place together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from fields.map.keyframes import KeyframeStore
+from modp_ti.files.atomic import sync_folder
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.outputs.evaluation import MapVersion
+from modp_ti.outputs.formats.colmap_model import write_colmap
+from modp_ti.outputs.formats.exposure import write_exposures
+from modp_ti.outputs.formats.frames_json import write_frames
+from modp_ti.outputs.formats.splats_ply import write_splats
+from modp_ti.outputs.formats.trajectory import write_trajectory
+
+__all__ = ["appearing", "write_map"]
+
+LAST = "metrics.json"
+
+
+@contextmanager
+def appearing(output: Path) -> Iterator[Path]:
+    """An empty folder to write into; what it holds goes into `output`, over what is there, once all went well.
+
+    `metrics.json`, where there is one, goes last: a folder that has it has all the rest. Raises InputError where it
+    cannot be written.
+    """
+    folder = output.with_name(output.name + ".partial")
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        folder.mkdir(parents=True)
+        yield folder
+        output.mkdir(exist_ok=True)
+        if (folder / LAST).exists():
+            (output / LAST).unlink(missing_ok=True)
+        for item in sorted(folder.iterdir(), key=lambda item: (item.name == LAST, item.name)):
+            if item.is_dir():
+                shutil.rmtree(output / item.name, ignore_errors=True)
+            os.replace(item, output / item.name)
+        sync_folder(output)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written: {error.strerror}") from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_map(
+    folder: Path,
+    version: MapVersion,
+    frames: DeliveredFrames,
+    names: Sequence[str],
+    keyframes: KeyframeStore,
+    near: float,
+) -> None:
+    """Write `splats.ply`, `trajectory.txt`, `frames.json`, `colmap/` and, with estimated exposures, `exposure.json`.
+
+    names: of the frames in the COLMAP model. near: depth below which nothing is drawn.
+    """
+    indices = {keyframe.index for keyframe in keyframes}
+    write_splats(folder / "splats.ply", version.gaussians)
+    write_trajectory(folder / "trajectory.txt", frames.timestamp, version.trajectory)
+    write_colmap(folder / "colmap", names, frames.camera, version.trajectory, frames.points)
+    lines = [line for line, index in enumerate(frames.index) if index in indices]
+    held_out = [line for line, held in enumerate(frames.held_out) if held]
+    write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out)
+    if len(keyframes) and keyframes[0].exposure is not None:
+        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, version.exposures, indices)

@@ -1,0 +1,32 @@
+"""`points.ply`: the map as coloured points, for any program that shows point clouds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.gaussians import SH_C0
+from modp_ti.outputs.formats.open3d_io import open3d, written_aside
+from modp_ti.outputs.formats.quantised import opacities
+
+__all__ = ["write_points"]
+
+# What lets more through than it stops is haze, not surface.
+LEAST_OPACITY = 0.5
+
+
+def write_points(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> int:
+    """Write the centres of the opaque Gaussians with their constant colours as binary PLY; how many there are."""
+    o3d = open3d()
+    solid = opacities(state) >= LEAST_OPACITY
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(state["position"][solid].astype(np.float64)))
+    colours = np.clip(0.5 + SH_C0 * state["sh"][solid, 0].astype(np.float64), 0.0, 1.0)
+    cloud.colors = o3d.utility.Vector3dVector(colours)
+    with written_aside(Path(path)) as partial:
+        if not o3d.io.write_point_cloud(str(partial), cloud):
+            raise OSError(None, "Open3D could not write the points")
+    return int(solid.sum())

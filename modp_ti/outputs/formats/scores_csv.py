@@ -1,0 +1,52 @@
+"""Scores of every frame as comma-separated values, one line a frame and version of the map."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from modp_ti.files import text_lines
+from modp_ti.files.atomic import replacing
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.evaluation import FrameScore
+
+__all__ = ["read_scores", "write_scores"]
+
+COLUMNS = [field.name for field in dataclasses.fields(FrameScore)]
+
+
+def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> None:
+    """Write index, name, held_out (0 or 1), stage, psnr [dB], ssim, lpips (empty where not computed), with a header.
+
+    Numbers have the digits that give them back exactly.
+    """
+    with replacing(path, "w") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for score in scores:
+            writer.writerow(int(v) if isinstance(v, bool) else v for v in dataclasses.astuple(score))
+
+
+def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
+    """The scores of a file that `write_scores` wrote. Raises InputError, with the line, for anything else."""
+    file = Path(path)
+    try:
+        rows = list(csv.reader(text_lines(file, "utf-8")))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{file}: cannot be read as scores: {reason}") from None
+    if not rows or rows[0] != COLUMNS:
+        raise InputError(f"{file}:1: the columns must be {','.join(COLUMNS)}")
+    scores = []
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            index, name, held_out, stage, psnr, ssim, lpips = row
+            held = {"0": False, "1": True}[held_out]
+            score = FrameScore(int(index), name, held, stage, float(psnr), float(ssim), float(lpips) if lpips else None)
+        except (ValueError, KeyError):
+            raise InputError(f"{file}:{number}: not a line of scores") from None
+        scores.append(score)
+    return scores

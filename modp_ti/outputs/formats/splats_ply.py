@@ -1,0 +1,96 @@
+"""`splats.ply`: the Gaussians in the layout of 3DGS, as every splat viewer reads it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files import read_bytes
+from modp_ti.files.atomic import replacing
+from modp_ti.files.errors import InputError
+from modp_ti.files.ply import parse_ply_header
+
+__all__ = ["read_splats", "write_splats"]
+
+# The pixel footprint that the map was optimised with; a renderer must use the same to show the same picture.
+COMMENT = "rendered with 0.3 px^2 blur and mip-splatting opacity compensation (antialiased)"
+
+
+def _names(sh_count: int) -> list[str]:
+    rest = [f"f_rest_{i}" for i in range(3 * (sh_count - 1))]
+    return [
+        *"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity",
+        "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+    ]  # fmt: skip
+
+
+def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> None:
+    """Write Gaussians as `GaussianField.to_numpy` gives them. The file appears whole or not at all.
+
+    Opacity as its logit, scale as its logarithm, quaternion with w first, `f_rest` with all of red first; all values as
+    they are, so that the file read back renders bit for bit alike.
+    """
+    n, sh_count, _ = state["sh"].shape
+    table = np.concatenate(
+        [
+            state["position"],
+            np.zeros((n, 3)),
+            state["sh"][:, 0],
+            state["sh"][:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh_count - 1)),
+            state["opacity_logit"][:, None],
+            state["log_scale"],
+            state["quaternion"],
+        ],
+        axis=1,
+    ).astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}", f"element vertex {n}"]
+    header += [f"property float {name}" for name in _names(sh_count)]
+    with replacing(path) as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        file.write(table.tobytes())
+
+
+def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
+    """Gaussians of a 3DGS PLY file, as `GaussianField.load` takes them. Properties may come in any order.
+
+    Raises InputError (one line) for a file that is none, is cut short or lacks a property.
+    """
+    file = Path(path)
+    try:
+        data = read_bytes(file)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from None
+    header = parse_ply_header(data, file)
+    names, count = header.names, header.count
+    if header.form != "binary_little_endian":
+        raise InputError(f"{file}: not a binary little-endian PLY file, which 3DGS splats are")
+    if any(kind != "f4" for _, kind in header.properties):
+        raise InputError(f"{file}: all properties of 3DGS splats are float")
+    table = np.frombuffer(data, dtype="<f4", count=count * len(names), offset=header.start).reshape(count, len(names))
+    column = {name: i for i, name in enumerate(names)}
+    rest = sum(name.startswith("f_rest_") for name in names)
+    missing = [name for name in _names(1 + rest // 3) if name not in column and not name.startswith("n")]
+    if missing or rest not in (0, 9, 24, 45):
+        raise InputError(f"{file}: not 3DGS splats; {missing[0] if missing else f'{rest} f_rest'} does not fit")
+
+    def columns(*wanted: str) -> NDArray[np.float32]:
+        values = np.ascontiguousarray(table[:, [column[name] for name in wanted]])
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(bad):
+            raise InputError(f"{file}: Gaussian {bad[0]} holds NaN or infinite numbers; the file is damaged")
+        return values
+
+    sh = np.empty((count, 1 + rest // 3, 3), dtype=np.float32)
+    sh[:, 0] = columns("f_dc_0", "f_dc_1", "f_dc_2")
+    if rest:
+        sh[:, 1:] = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, rest // 3).transpose(0, 2, 1)
+    return {
+        "position": columns("x", "y", "z"),
+        "log_scale": columns("scale_0", "scale_1", "scale_2"),
+        "quaternion": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        "opacity_logit": columns("opacity")[:, 0],
+        "sh": sh,
+    }

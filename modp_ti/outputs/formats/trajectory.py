@@ -1,0 +1,97 @@
+"""Trajectories in the TUM format: `time tx ty tz qx qy qz qw` a line, camera to world, `#` comments."""
+
+from __future__ import annotations
+
+import math
+import os
+from array import array
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.files import LARGEST, text_lines
+from modp_ti.files.atomic import replace_text
+from modp_ti.files.errors import InputError
+
+__all__ = ["read_trajectory", "write_trajectory"]
+
+
+def write_trajectory(
+    path: str | os.PathLike[str], timestamps: Iterable[float], poses: Iterable[NDArray[np.float64]]
+) -> None:
+    """Writes one line a frame: timestamps in seconds, poses as `T_camera_world` (4, 4).
+
+    Every number has the digits that give it back exactly. The file appears whole or not at all. Raises
+    ValueError for a pose that is not finite or for more of one than of the other.
+    """
+    lines = ["# time tx ty tz qx qy qz qw   (seconds, camera to world)"]
+    for time, T_camera_world in zip(timestamps, poses, strict=True):
+        if not np.isfinite(T_camera_world).all():
+            raise ValueError(f"the pose at {time} s is not finite")
+        rotation = np.asarray(T_camera_world, dtype=np.float64)[:3, :3].T
+        centre = -rotation @ T_camera_world[:3, 3]
+        numbers = [float(time), *centre.tolist(), *_quaternion(rotation).tolist()]
+        lines.append(" ".join(repr(number + 0.0) for number in numbers))  # + 0.0: no minus before a zero
+    replace_text(path, "\n".join(lines) + "\n")
+
+
+def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Timestamps (N,) in seconds and `T_camera_world` (N, 4, 4) of a TUM trajectory, in the file's order.
+
+    Raises InputError, with the line, for anything else.
+    """
+    file = Path(path)
+    rows = array("d")
+    try:
+        for number, line in enumerate(text_lines(file), start=1):
+            words = line.split("#", 1)[0].replace(",", " ").split()
+            if not words:
+                continue
+            try:
+                row = [float(word) for word in words]
+            except ValueError:
+                row = []
+            if len(row) != 8 or not max(map(abs, row)) <= LARGEST or any(map(math.isnan, row)):
+                raise InputError(f"{file}:{number}: a line holds 8 numbers: time tx ty tz qx qy qz qw")
+            if not 0.5 < np.linalg.norm(row[4:]) < 1e6:
+                raise InputError(f"{file}:{number}: the quaternion is not of unit length")
+            rows.extend(row)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
+        raise InputError(f"{file}: cannot be read as a trajectory: {reason}") from None
+    table = np.frombuffer(rows).reshape(-1, 8)
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    for pose, row in zip(poses, table, strict=True):
+        rotation = _rotation(row[4:])
+        pose[:3, :3] = rotation.T
+        pose[:3, 3] = -rotation.T @ row[1:4]
+    return table[:, 0], poses
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(x, y, z, w) with w >= 0: the eigenvector of Bar-Itzhack's matrix, good for every rotation."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    K = np.array(
+        [
+            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    q = np.linalg.eigh(K)[1][:, -1]
+    return q if q[3] >= 0 else -q
+
+
+def _rotation(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrix of (x, y, z, w), normalised first."""
+    x, y, z, w = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,37 @@
+"""`.splat`: 32 bytes a Gaussian, as the first viewers on the web read it (antimatter15/splat) and most still do.
+
+    position 3 x float32 | scale 3 x float32, linear | colour and opacity 4 x uint8 | quaternion w x y z 4 x uint8
+
+A component c of the unit quaternion is round(128 c) + 128. There is no header. The most important Gaussians come first,
+since viewers show what has been loaded so far. Colour does not depend on the direction.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.gaussians import SH_C0
+from modp_ti.files.atomic import replace_file
+from modp_ti.outputs.formats.quantised import opacities, to_bits, unit_quaternions
+
+__all__ = ["write_web_splat"]
+
+RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+
+
+def write_web_splat(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
+    """Write Gaussians as `GaussianField.to_numpy` gives them. Of their colours the constant part is kept, clipped."""
+    opacity = opacities(state)
+    importance = opacity * np.exp(state["log_scale"].astype(np.float64).sum(axis=1))
+    order = np.argsort(-importance, kind="stable")
+    table = np.zeros(len(order), RECORD)
+    table["position"] = state["position"][order]
+    table["scale"] = np.exp(state["log_scale"][order])
+    table["rgba"][:, :3] = to_bits(0.5 + SH_C0 * state["sh"][order, 0], 8)
+    table["rgba"][:, 3] = to_bits(opacity[order], 8)
+    table["rotation"] = np.clip(np.round(unit_quaternions(state)[order] * 128.0) + 128.0, 0, 255)
+    replace_file(path, table.tobytes())

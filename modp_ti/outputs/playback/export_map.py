@@ -1,0 +1,113 @@
+"""What `modp-ti export` does: each format from a finished run to a file or a folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
+from modp_ti.outputs.formats.datasets import dataset_folder, rename_images, write_transforms
+from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
+from modp_ti.outputs.formats.points_ply import write_points
+from modp_ti.outputs.formats.spz import write_spz
+from modp_ti.outputs.formats.web_splat import write_web_splat
+from modp_ti.outputs.playback.film import is_video
+from modp_ti.outputs.playback.finished_run import FinishedRun
+from modp_ti.outputs.playback.flight import film, plan_flight
+from modp_ti.outputs.playback.map_renderer import start_device
+from modp_ti.outputs.playback.mapped_images import dataset_names, write_images
+from modp_ti.outputs.playback.plain_colours import with_plain_colours
+from modp_ti.outputs.playback.surface import surface_views
+from modp_ti.outputs.progress import ProgressLine
+
+__all__ = ["DEFAULT_NAMES", "export_map"]
+
+# What a format is called in OUT unless the user names a place.
+DEFAULT_NAMES = {
+    "points": "points.ply",
+    "mesh": "mesh.ply",
+    "splat": "splats.splat",
+    "spz": "splats.spz",
+    "compressed-ply": "splats.compressed.ply",
+    "colmap": "colmap-dataset",
+    "nerfstudio": "nerfstudio",
+    "video": "recorded.mp4",
+}
+SPLATS = {"spz": write_spz, "compressed-ply": write_compressed_ply}
+# Edge of the mesh's voxels in scene depths, and how far its surface reaches.
+VOXEL = 1 / 160
+FARTHEST = 4.0
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """voxel: edge of the mesh's voxels [scene units], None for VOXEL of the scene's depth. device: for rendering."""
+
+    voxel: float | None = None
+    device: str = "auto"
+
+
+def export_map(run: FinishedRun, format: str, output: Path | None, options: ExportOptions, line: ProgressLine) -> Path:
+    """Write the run in a format of DEFAULT_NAMES; where it lies. Raises InputError where that cannot be done.
+
+    output: file or new folder; None for the format's name in the run's own folder.
+    """
+    target = _target(run, format, output)
+    try:
+        if format == "points":
+            with line.working("writing points"):
+                write_points(target, run.gaussians)
+        elif format == "mesh":
+            _mesh(run, target, options, line)
+        elif format == "splat":
+            start_device(options.device)
+            write_web_splat(target, with_plain_colours(run, line))
+        elif format in SPLATS:
+            with line.working("writing splats"):
+                SPLATS[format](target, run.gaussians)
+        elif format == "video":
+            film(run, plan_flight(run, "recorded"), target, False, options.device, line)
+        else:
+            _dataset(run, target, format, line)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
+    return target
+
+
+def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
+    """Where the format goes. Raises InputError, before anything is computed, where it cannot."""
+    target = run.folder / DEFAULT_NAMES[format] if output is None else output.expanduser()
+    if not target.absolute().parent.is_dir():
+        raise InputError(f"{target.absolute().parent}: no such folder; make it first")
+    if format in ("colmap", "nerfstudio"):
+        return target
+    if target.is_dir():
+        raise InputError(f"{target}: is a folder; name a file, for example {target / DEFAULT_NAMES[format]}")
+    wanted = {"mesh": MESH_SUFFIXES, "points": (".ply",), "compressed-ply": (".ply",)}.get(format, (f".{format}",))
+    if format == "video":
+        if not is_video(target):
+            raise InputError(f"{target}: a video's name ends in .mp4 or .webm")
+    elif target.suffix.lower() not in wanted:
+        raise InputError(f"{target}: --format {format} writes a file in {', '.join(wanted)}")
+    if target.resolve() == (run.folder / "splats.ply").resolve():
+        raise InputError(f"{target}: is the map itself; name another file")
+    return target
+
+
+def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
+    voxel = options.voxel or VOXEL * run.record.scene_depth
+    grid = fused(surface_views(run, options.device, line), voxel, FARTHEST * run.record.scene_depth)
+    with line.working("extracting the surface"):
+        write_mesh(target, without_floating_parts(extracted(grid)))
+
+
+def _dataset(run: FinishedRun, target: Path, format: str, line: ProgressLine) -> None:
+    names = dataset_names(run)
+    with dataset_folder(target) as folder:
+        write_images(run, folder, line)
+        if format == "colmap":
+            rename_images(run.folder / "colmap", folder / "sparse" / "0", names)
+        else:
+            write_points(folder / "points.ply", run.gaussians)
+            write_transforms(folder, names, run.cameras, list(run.poses), run.record.held_out, "points.ply")

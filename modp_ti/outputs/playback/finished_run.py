@@ -1,0 +1,104 @@
+"""`FinishedRun`: the output folder of a run, as the commands that come after it read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import NO_DISTORTION
+from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.trackers.colmap_files import read_colmap_model
+from modp_ti.outputs.formats.frames_json import FramesRecord, read_frames
+from modp_ti.outputs.formats.splats_ply import read_splats
+from modp_ti.outputs.formats.trajectory import read_trajectory
+
+__all__ = ["FinishedRun", "open_run"]
+
+NEEDED = ("config.yaml", "splats.ply", "trajectory.txt", "colmap", "frames.json")
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A map, and the frames that it was made of: by position names, times [s], T_camera_world (4, 4) and cameras.
+
+    names: as the COLMAP model has them. record: near, scene depth, keyframes, held-out frames.
+    """
+
+    folder: Path
+    names: list[str]
+    timestamps: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    cameras: list[PinholeCamera]
+    record: FramesRecord
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @cached_property
+    def gaussians(self) -> dict[str, NDArray[np.float32]]:
+        """The map, as `GaussianField.load` takes it. Raises InputError for a damaged file or an empty map."""
+        state = read_splats(self.folder / "splats.ply")
+        if len(state["position"]) == 0:
+            raise InputError(f"{self.folder / 'splats.ply'}: the map holds no Gaussian")
+        return state
+
+    @property
+    def mapped(self) -> list[int]:
+        """Positions of the frames that were not held out."""
+        held_out = set(self.record.held_out)
+        return [index for index in range(len(self)) if index not in held_out]
+
+    def spread(self, most: int) -> list[int]:
+        """Positions of the frames that were not held out: all, or of more than `most` as many at equal steps."""
+        mapped = self.mapped
+        count = min(len(mapped), most)
+        return [mapped[i * len(mapped) // count] for i in range(count)]
+
+
+def open_run(folder: Path) -> FinishedRun:
+    """Read what a finished run left. Raises InputError where it is none, or not finished, or damaged."""
+    folder = folder.expanduser()
+    if not folder.is_dir():
+        what = "not a folder" if folder.exists() else "no such folder; a run makes it at its end"
+        raise InputError(f"{folder}: {what}: name the output folder of a finished run")
+    missing = [name for name in NEEDED if not (folder / name).exists()]
+    if len(missing) == len(NEEDED):
+        raise InputError(f"{folder}: no run has left anything here: name the output folder of a finished run")
+    if missing == ["frames.json"]:
+        raise InputError(
+            f"{folder}: an earlier version made it, without frames.json: run it again, "
+            f"modp-ti run {folder / 'config.yaml'}"
+        )
+    if missing:
+        raise InputError(f"{folder}: not the output of a finished run, {missing[0]} is missing")
+    timestamps, poses = read_trajectory(folder / "trajectory.txt")
+    names, cameras = _read_model(folder / "colmap")
+    if len(names) != len(poses) or not names:
+        raise InputError(f"{folder}: trajectory.txt has {len(poses)} frames, colmap/ {len(names)}: not of one run")
+    return FinishedRun(folder, names, timestamps, poses, cameras, read_frames(folder / "frames.json", len(poses)))
+
+
+def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
+    """Names and cameras of the images in their order."""
+    model = read_colmap_model(folder)
+    images = [model.images[number] for number in sorted(model.images)]
+    of_id = {}
+    for number, camera in model.cameras.items():
+        what = f"{folder}: camera {number}"
+        try:
+            pinhole = PinholeCamera(*map(float, camera.params), camera.width, camera.height)
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{what} is none of a run: {error}") from None
+        of_id[number], _ = require_plausible(pinhole, NO_DISTORTION, what)
+    for image in images:
+        # They name files to be read, and written in an export: none may lie elsewhere.
+        parts = PurePosixPath(image.name).parts
+        if not parts or parts[0] == "/" or ".." in parts or "\0" in image.name:
+            raise InputError(f"{folder}: image {image.name!r} is no name below the folder of images")
+    return [image.name for image in images], [of_id[image.camera_id] for image in images]

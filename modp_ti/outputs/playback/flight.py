@@ -1,0 +1,146 @@
+"""What is filmed of a finished map: the way of the camera, its lens, and how many pictures a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.exposure import read_exposures
+from modp_ti.outputs.formats.trajectory import read_trajectory
+from modp_ti.outputs.playback.camera_paths import orbit, smoothed
+from modp_ti.outputs.playback.film import depth_colours, is_video, require_writable, write_pictures, write_video
+from modp_ti.outputs.playback.finished_run import FinishedRun
+from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
+from modp_ti.outputs.progress import ProgressLine
+from pipelines.render.renderer import RenderedView
+
+__all__ = ["PATHS", "Flight", "film", "plan_flight"]
+
+PATHS = ("recorded", "smoothed", "orbit")
+# Pictures along paths that have none of their own.
+DEFAULT_FRAMES = 240
+DEFAULT_FPS = 30.0
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Poses T_camera_world (M, 4, 4), the camera at each, and pictures a second.
+
+    exposures: (A, b) (3, 4) at each, which makes A colour + b of the map's colours; None for the map's own.
+    """
+
+    poses: NDArray[np.float64]
+    cameras: list[PinholeCamera]
+    frames_per_second: float
+    exposures: list[NDArray[np.float64]] | None = None
+
+    def even(self) -> Flight:
+        """With pictures of even width and height, as videos have them: the last row and column left out."""
+        cameras = [
+            PinholeCamera(c.fx, c.fy, c.cx, c.cy, max(c.width // 2 * 2, 2), max(c.height // 2 * 2, 2))
+            for c in self.cameras
+        ]
+        return replace(self, cameras=cameras)
+
+
+def plan_flight(
+    run: FinishedRun,
+    path: str,
+    size: tuple[int, int] | None = None,
+    fov: float | None = None,
+    frames: int | None = None,
+    fps: float | None = None,
+    deviation: float = 5.0,
+    exposure: bool = False,
+) -> Flight:
+    """The flight along `path`: one of PATHS, or a trajectory file (TUM).
+
+    size: (width, height); None for the recorded one. fov: horizontal, in degrees; None for the recorded one. frames:
+    pictures, of a smoothed path or an orbit. deviation: of the smoothing, in frames. exposure: each picture as its
+    frame was exposed, of the recorded path. Raises InputError for a path or file that is none, for frames where the
+    path has its own, and for exposures where none were estimated.
+    """
+    exposures = _exposures(run, path) if exposure else None
+    times = None
+    if path == "smoothed":
+        poses = smoothed(run.poses, frames or max(DEFAULT_FRAMES, len(run)), deviation)
+    elif path == "orbit":
+        poses = orbit(run.poses[run.record.keyframes], run.record.scene_depth, frames or DEFAULT_FRAMES)
+    else:
+        if frames is not None:
+            raise InputError("--frames is for the paths `smoothed` and `orbit`: the others have poses of their own")
+        if path == "recorded":
+            times, poses = run.timestamps, run.poses
+        elif Path(path).expanduser().is_file():
+            times, poses = read_trajectory(Path(path).expanduser())
+        else:
+            raise InputError(f"--path {path}: no such file, and none of {', '.join(PATHS)}")
+    if len(poses) == 0:
+        raise InputError(f"--path {path}: holds no pose")
+    own = run.cameras if path == "recorded" else [run.cameras[run.record.keyframes[0]]] * len(poses)
+    cameras = [_lens(camera, size, fov) for camera in own]
+    return Flight(poses, cameras, fps or _rate(times), exposures)
+
+
+def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: str, line: ProgressLine) -> None:
+    """Render the flight into a video or a folder of pictures, whichever `output` names.
+
+    depth: instead of colours. Raises InputError where the output cannot be written, before anything is rendered.
+    """
+    require_writable(output)
+    flight = flight.even() if is_video(output) else flight
+    with line.working("loading the map"):
+        gaussians = run.gaussians
+        start_device(device)
+        width, height = (max(getattr(c, side) for c in flight.cameras) for side in ("width", "height"))
+        renderer = MapRenderer(gaussians, width, height, run.record.near)
+
+    def views() -> Iterator[RenderedView]:
+        exposures = flight.exposures or [None] * len(flight.poses)
+        shots = list(zip(flight.cameras, flight.poses, exposures, strict=True))
+        for camera, T, exposure in line.through("rendering", shots, len(shots)):
+            view = renderer.view(camera, T)
+            yield view if exposure is None else replace(view, colour=view.colour @ exposure[:, :3].T + exposure[:, 3])
+
+    if not is_video(output):
+        write_pictures(output, views(), depth)
+        return
+    show: Callable[[RenderedView], NDArray[np.uint8]]
+    show = (lambda v: depth_colours(v, run.record.scene_depth)) if depth else (lambda v: eight_bits(v.colour))
+    write_video(output, (show(view) for view in views()), flight.frames_per_second)
+
+
+def _exposures(run: FinishedRun, path: str) -> list[NDArray[np.float64]]:
+    """The exposure of every recorded frame. Raises InputError where they are not known, or belong to another path."""
+    if path != "recorded":
+        raise InputError(f"--exposure is of the recorded frames: --path {path} has none of its own")
+    known = read_exposures(run.folder / "exposure.json")
+    if not known:
+        raise InputError(f"{run.folder}: no exposures were estimated (mapping.exposure.enabled): leave out --exposure")
+    if missing := [index for index in range(len(run)) if index not in known]:
+        raise InputError(f"{run.folder / 'exposure.json'}: frame {missing[0]} is missing")
+    return [known[index] for index in range(len(run))]
+
+
+def _lens(camera: PinholeCamera, size: tuple[int, int] | None, fov: float | None) -> PinholeCamera:
+    """The camera with another size and field of view. Its width shows what it showed, unless `fov` is given."""
+    width, height = size or (camera.width, camera.height)
+    if fov is not None:
+        focal = 0.5 * width / np.tan(np.radians(fov) / 2)
+        return PinholeCamera(focal, focal, width / 2, height / 2, width, height)
+    s = width / camera.width
+    cy = height / 2 + s * (camera.cy - camera.height / 2)
+    return PinholeCamera(s * camera.fx, s * camera.fy, s * camera.cx, cy, width, height)
+
+
+def _rate(times: NDArray[np.float64] | None) -> float:
+    """Pictures a second of a path with these times [s], as a video player takes it."""
+    steps = np.diff(times) if times is not None else np.zeros(0)
+    steps = steps[steps > 0]
+    return float(np.clip(1.0 / np.median(steps), 1.0, 60.0)) if len(steps) else DEFAULT_FPS

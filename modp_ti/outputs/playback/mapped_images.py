@@ -1,0 +1,98 @@
+"""The images that a finished run mapped: those that it kept, or once more from the scene's source."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.config.scene_file import load_scene
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.trackers import open_tracker
+from modp_ti.outputs.formats.colmap_model import image_names, write_image
+from modp_ti.outputs.playback.finished_run import FinishedRun
+from modp_ti.outputs.progress import ProgressLine
+
+__all__ = ["dataset_names", "grey_images", "write_images"]
+
+
+def dataset_names(run: FinishedRun) -> list[str]:
+    """What the run's images are called in a data set, as PNG files, by position."""
+    return run.names if _kept(run).is_dir() else image_names(run.names, written=True)
+
+
+def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
+    """Write all images, undistorted as they were mapped, into `images` of the folder, and masks into `masks`.
+
+    A run that did not keep its images (`export.images`) has them read again from the source of its scene; the tracker
+    `klt` tracks again for that. Raises InputError where the source is gone, was live, or now gives other frames.
+    """
+    names = dataset_names(run)
+    if _kept(run).is_dir():
+        _copy(run, names, folder, line)
+        return
+    config = load_scene(run.folder / "config.yaml")
+    if config.is_live:
+        raise InputError(f"{run.folder}: its frames were live and are gone; such a run needs `export.images: true`")
+    if config.tracker.renders_frames:
+        from modp_ti.outputs.playback.map_renderer import start_device
+
+        start_device("cpu")
+    tracker = open_tracker(config, line.prepare)
+    other = InputError(
+        f"{config.source.path or run.folder}: the source no longer gives the frames that were mapped; run the scene "
+        "again, with `export.images: true` to keep them"
+    )
+    try:
+        count = 0
+        for frame in line.through("reading images", tracker, len(run)):
+            if frame.index >= len(run) or frame.name != run.names[frame.index]:
+                raise other
+            if frame.camera != run.cameras[frame.index]:
+                raise other
+            write_image(folder, names[frame.index], frame)
+            count += 1
+        if count < len(run):
+            raise other
+    finally:
+        tracker.close()
+
+
+def grey_images(run: FinishedRun, positions: Sequence[int], line: ProgressLine) -> list[NDArray[np.uint8]]:
+    """The images (H, W) of some frames, in grey, from where `write_images` has them; it raises the same."""
+    names = dataset_names(run)
+    with TemporaryDirectory() as folder:
+        place = _kept(run)
+        if not place.is_dir():
+            write_images(run, Path(folder), line)
+            place = Path(folder) / "images"
+        images = []
+        for index in positions:
+            image = cv2.imread(str(place / names[index]), cv2.IMREAD_GRAYSCALE)
+            if image is None:
+                raise InputError(f"{place / names[index]}: the run's image is missing")
+            images.append(image)
+    return images
+
+
+def _kept(run: FinishedRun) -> Path:
+    return run.folder / "colmap" / "images"
+
+
+def _copy(run: FinishedRun, names: list[str], folder: Path, line: ProgressLine) -> None:
+    masks = run.folder / "colmap" / "masks"
+    for name in line.through("copying images", names, len(names)):
+        source = _kept(run) / name
+        if not source.is_file():
+            raise InputError(f"{source}: the run's image is missing")
+        pairs = [(source, folder / "images" / name)]
+        if (masks / f"{name}.png").is_file():
+            pairs.append((masks / f"{name}.png", folder / "masks" / f"{name}.png"))
+        for old, new in pairs:
+            new.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(old, new)

@@ -1,0 +1,79 @@
+"""`with_plain_colours`: a map whose colours lie in [0, 1] and do not depend on the direction, looking as it did."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from fields.map.gaussians import SH_C0, GaussianField
+from modp_ti.outputs.playback.finished_run import FinishedRun
+from modp_ti.outputs.playback.map_renderer import MapRenderer
+from modp_ti.outputs.progress import ProgressLine
+from pipelines.optimise.adam import Adam, LearningRates
+from pipelines.optimise.gpu_losses import photometric_loss
+
+__all__ = ["with_plain_colours"]
+
+# Views of the map that its plain form is optimised to show; of more frames, as many at equal steps.
+VIEWS = 60
+STEPS = 900
+# Adam's rates at the start, positions' in scene depths, and the factor at the end.
+RATES = LearningRates(position=1e-4, log_scale=0.01, quaternion=0.002, opacity_logit=0.1, colour=0.04)
+DECAY = 0.05
+SSIM_WEIGHT = 0.2
+# Of the constant harmonic, where colours end.
+LARGEST = 0.5 / SH_C0
+
+
+def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArray[np.float32]]:
+    """The run's Gaussians (as `GaussianField.load` takes them), optimised under that constraint to render alike.
+
+    Where a Gaussian brighter than 1 lets light through, clipping makes it too dark. So all of it is fitted to the map's
+    own pictures at the frames that were mapped. Taichi runs already.
+    """
+    chosen = run.spread(VIEWS)
+    cameras = [run.cameras[index] for index in chosen]
+    maps = MapRenderer(run.gaussians, max(c.width for c in cameras), max(c.height for c in cameras), run.record.near)
+    views = []
+    for camera, T in zip(cameras, run.poses[chosen], strict=True):
+        picture = maps.picture(camera, T)
+        views.append((camera, T, np.dstack([picture, np.full(picture.shape[:2], 255, np.uint8)])))
+    gaussians, renderer = maps.renderer.gaussians, maps.renderer
+    constraint, adam, loss = PlainColours(gaussians), Adam(gaussians), photometric_loss(renderer.images)
+    constraint.impose()
+    rates = asdict(replace(RATES, position=RATES.position * run.record.scene_depth))
+    rng = np.random.default_rng(0)
+    order: list[int] = []
+    for step in line.through("fitting plain colours", range(STEPS), STEPS):
+        order = order or rng.permutation(len(views)).tolist()
+        camera, T, picture = views[order.pop()]
+        renderer.forward(camera, T, run.record.near)
+        renderer.images.set_reference(picture)
+        loss.forward()
+        loss.backward(SSIM_WEIGHT)
+        renderer.backward()
+        decayed = DECAY ** (step / STEPS)
+        adam.step(LearningRates(**{name: decayed * rate for name, rate in rates.items()}))
+        constraint.impose()
+    return gaussians.to_numpy()
+
+
+@ti.data_oriented
+class PlainColours:
+    """The constraint on the colours of `gaussians`."""
+
+    def __init__(self, gaussians: GaussianField) -> None:
+        self.gaussians = gaussians
+
+    def impose(self) -> None:
+        """Clip the constant harmonic to [0, 1] as a colour, and take away the others."""
+        if len(self.gaussians):
+            self._impose(len(self.gaussians))
+
+    @ti.kernel
+    def _impose(self, count: ti.i32):
+        for i in range(count):
+            self.gaussians.sh[i, 0] = ti.min(ti.max(self.gaussians.sh[i, 0], -LARGEST), LARGEST)
+            for k in range(1, self.gaussians.sh_count):
+                self.gaussians.sh[i, k].fill(0.0)

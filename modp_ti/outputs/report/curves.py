@@ -1,0 +1,54 @@
+"""What the curves of a report show, as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.outputs.report.record import FrameNote
+
+__all__ = ["binned", "frame_rate", "shifts_and_turns"]
+
+# Points of a curve: more would not be seen.
+MOST_POINTS = 400
+
+
+def frame_rate(frames: Sequence[FrameNote], window: int) -> NDArray[np.float64]:
+    """Frames per second (N,) over the `window` frames that end at each; NaN where there are not yet as many.
+
+    Of fewer frames than that the last one has the rate over all.
+    """
+    done = np.array([0.0, *(note.done for note in frames)])
+    window = min(window, len(frames))
+    rate = np.full(len(frames), np.nan)
+    rate[window - 1 :] = window / np.maximum(done[window:] - done[:-window], 1e-9)
+    return rate
+
+
+def binned(
+    x: NDArray[np.float64], y: NDArray[np.float64], points: int = MOST_POINTS
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means of neighbouring values, at most `points` of them; of all that are finite."""
+    finite = np.isfinite(y)
+    x, y = x[finite], y[finite]
+    parts = max(1, min(points, len(x)))
+    return (
+        np.array([part.mean() for part in np.array_split(x, parts) if len(part)]),
+        np.array([part.mean() for part in np.array_split(y, parts) if len(part)]),
+    )
+
+
+def shifts_and_turns(
+    before: Sequence[NDArray[np.float64]], after: Sequence[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How far each camera moved [scene units] and turned [degrees]; both lists hold T_camera_world (4, 4)."""
+    a, b = np.asarray(before), np.asarray(after)
+    R_a, R_b = a[:, :3, :3], b[:, :3, :3]
+    centre_a = -np.einsum("nji,nj->ni", R_a, a[:, :3, 3])
+    centre_b = -np.einsum("nji,nj->ni", R_b, b[:, :3, 3])
+    # |R - I|^2 = 8 sin^2(angle / 2): exact for small angles, where the arc cosine of the trace is not.
+    difference = np.linalg.norm(R_b @ R_a.transpose(0, 2, 1) - np.eye(3), axis=(1, 2))
+    turns = 2 * np.arcsin(np.minimum(difference / np.sqrt(8.0), 1.0))
+    return np.linalg.norm(centre_b - centre_a, axis=1), np.degrees(turns)

@@ -1,0 +1,115 @@
+"""Writes `report.html` from what a run has recorded."""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_se3
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.atomic import replace_text
+from modp_ti.outputs.evaluation import FrameScore, MapVersion, umeyama
+from modp_ti.outputs.report import facts, plots
+from modp_ti.outputs.report.pictures import FULL_SCALE, Comparison, error_colours
+from modp_ti.outputs.report.plan import floor_plan, plan_of
+from modp_ti.outputs.report.record import RunRecord
+
+__all__ = ["ReportedRun", "write_report"]
+
+
+@dataclass(frozen=True)
+class ReportedRun:
+    """All that a report is made of.
+
+    metrics: as in metrics.json. tracked: the tracker's T_camera_world (4, 4) of every frame; truth: the true ones, or
+    none. keyframes: positions among the frames. scene_depth: [scene units]. comparisons: of the last map.
+    """
+
+    config: SceneConfig
+    record: RunRecord
+    metrics: Mapping[str, Any]
+    scores: Sequence[FrameScore]
+    versions: Mapping[str, MapVersion]
+    tracked: Sequence[NDArray[np.float64]]
+    truth: Sequence[NDArray[np.float64]]
+    keyframes: Sequence[int]
+    scene_depth: float
+    comparisons: Sequence[Comparison]
+
+
+def write_report(path: Path, run: ReportedRun) -> None:
+    """Write the page; it names nothing outside of itself that a browser would load."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("modp_ti.outputs.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("page.html.j2").render(
+        run=run,
+        facts=facts,
+        name=run.config.output.name,
+        started=time.strftime("%d %B %Y, %H:%M", time.localtime(run.record.started)),
+        stage=facts.last_stage(run.metrics),
+        maps=[stage for stage in ("online", "refined", "offline") if run.metrics[stage] is not None],
+        remarks=facts.remarks(run.metrics, run.record.notes),
+        drawings={name: _svg_uri(svg) for name, svg in _drawings(run).items()},
+        scale=_scale(),
+        full_scale=FULL_SCALE,
+    )
+    replace_text(path, page)
+
+
+def _drawings(run: ReportedRun) -> dict[str, str]:
+    """The SVG of every drawing that the run has something for."""
+    last = list(run.versions.values())[-1]
+    plan = plan_of(last.trajectory)
+    floor = floor_plan(plan, last.gaussians, _centres(last.trajectory))
+    drawings = {"psnr": plots.psnr_of_frames(run.scores)}
+    if run.record.frames and run.config.mode == "online":
+        drawings["growth"] = plots.growth(run.record.frames)
+    if run.record.steps:
+        drawings["steps"] = plots.steps(run.record.steps)
+    truth = _aligned(run.truth, last.trajectory)
+    drawings["trajectory"] = plots.trajectory(plan, run.tracked, last.trajectory, run.keyframes, floor, truth)
+    if run.config.mode == "online":
+        ways = {name: version.trajectory for name, version in run.versions.items()}
+        drawings["poses"] = plots.pose_changes(run.tracked, ways, run.scene_depth)
+    return drawings
+
+
+def _aligned(
+    truth: Sequence[NDArray[np.float64]], estimate: Sequence[NDArray[np.float64]]
+) -> NDArray[np.float64] | None:
+    """True camera centres (N, 3) in the world of the estimate, by the similarity that fits best; None without."""
+    if len(truth) != len(estimate) or len(truth) < 3:
+        return None
+    there = _centres(truth)
+    s, R, t = umeyama(there, _centres(estimate))
+    return s * there @ R.T + t
+
+
+def _centres(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.array([inverse_se3(T)[:3, 3] for T in poses])
+
+
+def _svg_uri(svg: str) -> str:
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode("utf-8")).decode("ascii")
+
+
+def _scale() -> str:
+    """The colours of the error maps from none to FULL_SCALE, as a strip."""
+    strip = error_colours(np.linspace(0.0, FULL_SCALE, 128, dtype=np.float32)[None])
+    _, data = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))
+    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")

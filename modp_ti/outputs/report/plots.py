@@ -1,0 +1,227 @@
+"""The drawings of a report, each as the text of an SVG picture."""
+
+from __future__ import annotations
+
+import functools
+import io
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, ParamSpec
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.outputs.evaluation import FrameScore
+from modp_ti.outputs.report.curves import binned, frame_rate, shifts_and_turns
+from modp_ti.outputs.report.plan import Plan
+from modp_ti.outputs.report.record import FrameNote, StepNote
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["growth", "pose_changes", "psnr_of_frames", "steps", "trajectory"]
+
+Arguments = ParamSpec("Arguments")
+
+WIDTH = 9.2  # inches; the page scales it
+PANEL = 1.15  # width over height of a view from above
+# Colours that differ in print and for the colour-blind too (Okabe and Ito).
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+OF_STAGE = {"online": BLUE, "refined": ORANGE, "offline": ORANGE}
+STYLE = {
+    "svg.fonttype": "none",  # text stays text
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+    "figure.constrained_layout.use": True,
+}
+
+
+def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:
+    """The function, giving the SVG of the figure that it draws."""
+
+    @functools.wraps(draw)
+    def svg(*values: Arguments.args, **named: Arguments.kwargs) -> str:
+        # Imported here: a run must not wait for it before it begins. The note that its fonts are being listed, which
+        # it makes once on a machine, is no news for a user.
+        logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
+        import matplotlib.style
+
+        file = io.StringIO()
+        with matplotlib.style.context(["default", STYLE]):  # and not as the user has set matplotlib
+            about = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+            draw(*values, **named).savefig(file, format="svg", dpi=130, metadata=about)
+        return file.getvalue()
+
+    return svg
+
+
+def _figure(height: float) -> Figure:
+    """An empty figure. height: [inches]."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(WIDTH, height))
+
+
+@_drawn
+def psnr_of_frames(scores: Sequence[FrameScore]) -> Figure:
+    """PSNR of every frame in each version of the map; held-out frames as dots."""
+    figure = _figure(3.0)
+    axes = figure.add_subplot()
+    for stage in dict.fromkeys(score.stage for score in scores):
+        of = [score for score in scores if score.stage == stage]
+        x, y = (np.array([getattr(score, name) for score in of], float) for name in ("index", "psnr"))
+        _line(axes, x, y, f"psnr-{stage}", color=OF_STAGE[stage], label=stage)
+        held_out = np.array([score.held_out for score in of])
+        if held_out.any():
+            axes.plot(x[held_out], y[held_out], "o", ms=3.2, color=OF_STAGE[stage], label=f"{stage}, held out")
+    _label(axes, "frame", "PSNR [dB]")
+    axes.legend(ncols=4, loc="lower right", bbox_to_anchor=(1, 1))
+    return figure
+
+
+@_drawn
+def growth(frames: Sequence[FrameNote]) -> Figure:
+    """Gaussians, frames per second and PSNR of the views being optimised, over the frames as they were taken in."""
+    mapped = [note for note in frames if note.psnr is not None]
+    panels = 3 if mapped else 2
+    window = max(5, len(frames) // 20)
+    x = np.array([note.index for note in frames], float)
+    figure = _figure(1.75 * panels)
+    axes = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
+    count = np.array([note.gaussians for note in frames], float)
+    _line(axes[0], x, count, "gaussians", color=BLUE)
+    axes[0].set_ylim(bottom=0)
+    axes[0].yaxis.set_major_formatter("{x:,.0f}")
+    _label(axes[0], "", "Gaussians")
+    keyframes = [note for note in frames if note.is_keyframe]
+    if len(keyframes) < len(frames):
+        places = [note.index for note in keyframes], [note.gaussians for note in keyframes]
+        axes[0].plot(*places, ".", ms=4, color=BLUE, label="keyframes")
+        axes[0].legend(loc="upper left")
+    _line(axes[1], x, frame_rate(frames, window), "frame-rate", color=GREEN)
+    axes[1].set_yscale("log")  # frames that are no keyframes pass a hundred times faster
+    _label(axes[1], "" if mapped else "frame", f"frames per second\n(last {window})")
+    if mapped:
+        y = np.array([note.psnr for note in mapped], float)
+        _line(axes[2], np.array([note.index for note in mapped], float), y, "view-psnr", color=ORANGE)
+        _label(axes[2], "frame", "PSNR of the views\nbeing optimised [dB]")
+    return figure
+
+
+@_drawn
+def steps(notes: Sequence[StepNote]) -> Figure:
+    """PSNR over the steps of refinement or offline optimisation, with Gaussians where they change; smoothed."""
+    x = np.array([note.step for note in notes], float)
+    gaussians = [note.gaussians for note in notes if note.gaussians is not None]
+    panels = 2 if gaussians else 1
+    figure = _figure(2.1 * panels)
+    axes = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
+    _line(axes[-1], *binned(x, np.array([note.psnr for note in notes], float), 100), "step-psnr", color=ORANGE)
+    _label(axes[-1], "step", "PSNR of the views\nbeing optimised [dB]")
+    if gaussians:
+        _line(axes[0], *binned(x, np.array(gaussians, float)), "step-gaussians", color=BLUE)
+        axes[0].set_ylim(bottom=0)
+        axes[0].yaxis.set_major_formatter("{x:,.0f}")
+        _label(axes[0], "", "Gaussians")
+    return figure
+
+
+@_drawn
+def trajectory(
+    plan: Plan,
+    before: Sequence[NDArray[np.float64]],
+    after: Sequence[NDArray[np.float64]],
+    keyframes: Sequence[int],
+    floor: tuple[NDArray[np.float64], NDArray[np.float64]],
+    truth: NDArray[np.float64] | None = None,
+) -> Figure:
+    """Camera centres of T_camera_world (4, 4) from above, over the map.
+
+    keyframes: positions among the frames. floor: places (N, 2) and colours (N, 3) of Gaussians. truth: true centres
+    (M, 3) in the map's world.
+    """
+    ways = {"after": plan.on_page(_centres(after)), "before": plan.on_page(_centres(before))}
+    if truth is not None:
+        ways["truth"] = plan.on_page(truth)
+    around = np.concatenate(list(ways.values()))
+    figure = _figure(4.4)
+    whole, close = figure.subplots(1, 2)
+    if len(floor[0]):
+        size = float(np.clip(30_000 / len(floor[0]), 1.0, 14.0))
+        whole.scatter(*floor[0].T, s=size, c=floor[1], alpha=0.6, linewidths=0, rasterized=True)
+    for axes, name, (low, high) in (
+        (whole, "in the map", _extent(around, floor[0])),
+        (close, "closer", _extent(around, around[:0])),
+    ):
+        if "truth" in ways:
+            _line(axes, *ways["truth"].T, "way-truth", color=GREEN, lw=2.8, alpha=0.6, label="ground truth")
+        _line(axes, *ways["before"].T, "way-before", color=GREY, ls="--", label="tracker")
+        _line(axes, *ways["after"].T, "way-after", color=ORANGE, label="after mapping")
+        if len(keyframes):
+            axes.plot(*ways["after"][list(keyframes)].T, ".", ms=3.5, color=ORANGE, label="keyframes")
+        axes.plot(*ways["after"][0], "o", ms=7, mfc="none", color="black", label="first frame")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        axes.set_aspect("equal")
+        axes.set_title(name, fontsize=9)
+        _label(axes, "scene units", "")
+    figure.legend(*close.get_legend_handles_labels(), ncols=5, loc="outside upper center")
+    return figure
+
+
+@_drawn
+def pose_changes(
+    tracked: Sequence[NDArray[np.float64]],
+    versions: Mapping[str, Sequence[NDArray[np.float64]]],
+    scene_depth: float,
+) -> Figure:
+    """How far each frame's camera lies from where the tracker had put it; poses T_camera_world (4, 4) by version."""
+    figure = _figure(3.4)
+    above, below = figure.subplots(2, 1, sharex=True)
+    x = np.arange(len(tracked), dtype=float)
+    for stage, poses in versions.items():
+        shifts, turns = shifts_and_turns(tracked, poses)
+        percent = 100 * shifts / scene_depth
+        _line(above, x, percent, f"shift-{stage}", color=OF_STAGE[stage], label=stage)
+        _line(below, x, turns, f"turn-{stage}", color=OF_STAGE[stage])
+    _label(above, "", "shift\n[% of scene depth]")
+    _label(below, "frame", "turn [degrees]")
+    for axes in (above, below):
+        axes.set_ylim(bottom=0)
+    above.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1))
+    return figure
+
+
+def _line(axes: Axes, x: NDArray, y: NDArray, name: str, **style: object) -> None:
+    """A curve with a name in the SVG; a single value is a dot, and what is not finite a gap."""
+    finite = np.isfinite(y)
+    marker = {"marker": "o", "ms": 4} if finite.sum() < 2 else {}
+    axes.plot(x, np.where(finite, y, np.nan), gid=name, **marker, **style)
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+
+
+def _centres(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    T = np.asarray(poses)
+    return -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+
+
+def _extent(ways: NDArray[np.float64], floor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners of what is shown, of one shape: all of the ways, and the floor but for its outliers."""
+    low, high = ways.min(axis=0), ways.max(axis=0)
+    if len(floor):
+        low = np.minimum(low, np.quantile(floor, 0.02, axis=0))
+        high = np.maximum(high, np.quantile(floor, 0.98, axis=0))
+    size = np.maximum(1.1 * (high - low), 1e-3)
+    size = np.maximum(size, [PANEL * size[1], size[0] / PANEL])
+    return (low + high - size) / 2, (low + high + size) / 2

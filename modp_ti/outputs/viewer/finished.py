@@ -1,0 +1,139 @@
+"""The page of a finished map: `modp-ti view OUT`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import ViewSettings
+from modp_ti.files import read_bytes
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.image_bounds import why_undecodable
+from modp_ti.inputs.sources.listed_images import decoded
+from modp_ti.inputs.trackers.colmap_files import read_colmap_model
+from modp_ti.outputs.formats.exposure import read_exposures
+from modp_ti.outputs.playback.finished_run import FinishedRun
+from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
+from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
+from modp_ti.outputs.viewer.modes import (
+    MODES,
+    SPLATS,
+    Photograph,
+    error_picture,
+    nearest_photograph,
+    picture_of,
+    pinhole_of,
+)
+from modp_ti.outputs.viewer.page import Page, ShownFrame
+from modp_ti.outputs.viewer.splats import splats_of
+
+__all__ = ["FinishedViewer"]
+
+# Largest pictures that are rendered for a browser [px].
+PICTURE = 1280, 960
+# Tracked points that are shown; of more, as many at equal steps.
+MAX_POINTS = 20_000
+
+
+class FinishedViewer:
+    """Serves the page of a finished run until `close`. The thread that makes it renders, in `serve`.
+
+    Where the run kept its images (`export.images`), the chosen frame has its picture, and there is an error to show.
+    Raises InputError as `Page` does, and for a damaged run.
+    """
+
+    def __init__(self, run: FinishedRun, settings: ViewSettings, device: str) -> None:
+        self.run = run
+        self._chosen: Latest[int] = Latest()
+        gaussians, points = run.gaussians, _tracked_points(run)
+        self._kept = (run.folder / "colmap" / "images").is_dir()
+        self._exposures = read_exposures(run.folder / "exposure.json") if self._kept else {}
+        modes = MODES if self._kept else tuple(mode for mode in MODES if mode != "error")
+        self.page = Page(settings.host, settings.port, None, modes, self._chosen.put, len(run))
+        self.url = self.page.url
+        start_device(device)
+        largest = (max(*(getattr(c, side) for c in run.cameras), 0) for side in ("width", "height"))
+        width, height = (max(own, least) for own, least in zip(largest, PICTURE, strict=True))
+        self._renderer = MapRenderer(gaussians, width, height, run.record.near)
+        keyframes = run.record.keyframes
+        self.page.settle(run.record.scene_depth, run.poses[keyframes[0]])
+        self.page.show_keyframes(run.poses[keyframes], run.cameras[keyframes[0]])
+        self.page.show_points(points)
+        self.page.show_splats(splats_of(gaussians, self.page.units, settings.max_splats))
+        self.page.show_numbers(
+            f"**{len(run)}** frames, {len(keyframes)} keyframes  \n{len(gaussians['position']):,} Gaussians"
+        )
+        self._show_frame(0)
+        self._renderer.view(PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16), run.poses[0])  # compiles what there is to
+
+    def close(self) -> None:
+        """Serve no longer."""
+        self.page.close()
+
+    def serve(self, done: Callable[[], bool] = lambda: False) -> None:
+        """Render what browsers ask for, until `done`."""
+        while not done():
+            index = self._chosen.take(timeout=0.0)
+            if index is not None:
+                self._show_frame(index)
+            camera = self.page.requests.next(timeout=0.1)
+            mode = self.page.requests.mode
+            if camera is not None and mode != SPLATS:
+                self._render(camera, mode)
+
+    def _show_frame(self, index: int) -> None:
+        picture = self._photograph(index).rgba[..., :3] if self._kept else None
+        self.page.show_frame(ShownFrame(self.run.poses[index], self.run.cameras[index], picture))
+
+    def _render(self, browser: BrowserCamera, mode: str) -> None:
+        images = self._renderer.renderer.images
+        seen_from = pinhole_of(browser, self.page.units, images.max_width, images.max_height)
+        if seen_from is None:
+            return
+        try:
+            view = self._renderer.view(*seen_from)
+            if mode == "error":
+                mapped = np.array(self.run.mapped)
+                nearest = nearest_photograph(self.run.poses[mapped], seen_from[1], self.run.record.scene_depth)
+                photograph = self._photograph(int(mapped[nearest]))
+                seen = self._renderer.view(photograph.camera, photograph.T_camera_world)
+                picture = error_picture(view, *seen_from, photograph, seen)
+            else:
+                picture = picture_of(view, mode, self.run.record.scene_depth)
+        except ValueError:
+            return  # from amidst large Gaussians there is more to draw than there is room for
+        self.page.show_picture(browser.client, picture)
+
+    def _photograph(self, index: int) -> Photograph:
+        """The kept image of a frame. Raises InputError where it is gone."""
+        run = self.run
+        path = run.folder / "colmap" / "images" / run.names[index]
+        image = _kept_picture(path)
+        camera = run.cameras[index]
+        if image is None or image.shape[:2] != (camera.height, camera.width):
+            raise InputError(f"{path}: the run's image is missing or damaged")
+        rgba = np.dstack([image, np.full(image.shape[:2], 255, dtype=np.uint8)])
+        mask = _kept_picture(run.folder / "colmap" / "masks" / f"{run.names[index]}.png")
+        if mask is not None and mask.shape == image.shape:
+            rgba[mask.max(axis=2) == 0] = 0
+        return Photograph(rgba, camera, run.poses[index], self._exposures.get(index))
+
+
+def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
+    """A picture (H, W, 3) RGB that the run kept; None where it is missing or damaged."""
+    try:
+        data = read_bytes(path)
+    except OSError:
+        return None
+    return decoded(data) if why_undecodable(data) is None else None
+
+
+def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:
+    """Points (N, 3) of the run's COLMAP model, which has been read before."""
+    points = read_colmap_model(run.folder / "colmap").points3D
+    xyz = np.array([points[number].xyz for number in sorted(points)]).reshape(-1, 3)
+    return xyz if len(xyz) <= MAX_POINTS else xyz[np.arange(MAX_POINTS) * len(xyz) // MAX_POINTS]

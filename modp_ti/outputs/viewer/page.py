@@ -1,0 +1,326 @@
+"""The page: what viser serves to browsers, its scene and its controls."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3, quaternion_from_matrix
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Requests
+from modp_ti.outputs.viewer.modes import MODES, SPLATS
+from modp_ti.outputs.viewer.splats import Splats
+
+if TYPE_CHECKING:
+    import viser
+
+__all__ = ["Page", "ShownFrame"]
+
+TITLE = "MODP-Ti"
+# The scene's depth in the page's units: the world's may be anything, and browsers take covariances with 16 bits.
+DEPTH_ON_PAGE = 4.0
+# How far the first look is behind and above the first frame, in the page's units.
+BEHIND, ABOVE = 2.0, 1.0
+# Depths of the frustums of keyframes and of the current frame, and size of points, in the page's units.
+KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.015
+KEYFRAME_COLOUR, FRAME_COLOUR, POINT_COLOUR = (90, 140, 255), (255, 120, 30), (255, 60, 60)
+JPEG_QUALITY = 85
+KEYFRAMES, FRAME, POINTS = "Keyframes", "Current frame", "Tracked points"
+# Corners of a frustum's image, as (x, y) in {0, 1}.
+CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """A frame at its refined T_camera_world (4, 4), with its picture (H, W, 3) uint8, or None."""
+
+    T_camera_world: NDArray[np.float64]
+    camera: PinholeCamera
+    picture: NDArray[np.uint8] | None
+
+
+class Page:
+    """Serves the page at `url` until `close`.
+
+    port: where it is taken, the next free one is used; 0 for any. gate: has buttons to pause and to step; None for
+    none. modes: to choose from, the first at first. choose: called with the position of a frame when a slider over
+    `frames` frames is moved.
+
+    requests: what the browsers look at. threads: those that serve. Raises InputError where viser is not installed, or
+    `host` is no address of this machine.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        gate: Gate | None = None,
+        modes: Sequence[str] = MODES,
+        choose: Callable[[int], None] | None = None,
+        frames: int = 0,
+    ) -> None:
+        try:
+            import viser
+        except ImportError:
+            raise InputError(
+                'the viewer needs viser: pip install "modp-ti[viewer]", in a checkout '
+                '.venv/bin/pip install -c constraints.txt -e ".[viewer]"'
+            ) from None
+        _require_address(host)
+        self.requests = Requests(modes[0])
+        self._gate = gate
+        self._units: float | None = None
+        self._frame: ShownFrame | None = None
+        self._nodes: dict[str, Any] = {}
+        self._lock = threading.Lock()  # nodes are changed by the publishing thread and by viser's
+        before = set(threading.enumerate())
+        with _silent():
+            self._server = viser.ViserServer(host=host, port=port, label=TITLE, verbose=False)
+        self.threads = [thread for thread in threading.enumerate() if thread not in before]
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        # Its share button would send the page through somebody else's server.
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._server.scene.world_axes.visible = False
+        self._add_controls(modes, choose, frames)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(lambda client: self.requests.leave(client.client_id))
+
+    def close(self) -> None:
+        """Serve no longer."""
+        with _silent():
+            self._server.stop()
+
+    # ---- what is shown ---------------------------------------------------------------------------------------
+
+    @property
+    def units(self) -> float:
+        """Of the page, in a unit of the world; 1 before `settle`."""
+        return self._units or 1.0
+
+    def settle(self, scene_depth: float, T_camera_world: NDArray[np.float64]) -> None:
+        """Take the scene's depth and a first view (4, 4), from which up is known; once."""
+        if self._units is not None:
+            return
+        self._units = DEPTH_ON_PAGE / scene_depth
+        forward, up = T_camera_world[2, :3], -T_camera_world[1, :3]
+        centre = inverse_se3(T_camera_world)[:3, 3] * self.units
+        self._server.scene.set_up_direction(up)
+        eye, target = centre - BEHIND * forward + ABOVE * up, centre + DEPTH_ON_PAGE * forward
+        first = self._server.initial_camera
+        first.position, first.look_at, first.up = eye, target, up
+        for client in self._server.get_clients().values():
+            _look(client, eye, target, up)
+
+    def show_numbers(self, text: str) -> None:
+        """Markdown."""
+        self._numbers.content = text
+
+    def show_splats(self, splats: Splats) -> None:
+        """The map, in the page's units; drawn in the mode for it."""
+        note = "" if len(splats.centres) == splats.of else f"{len(splats.centres):,} of {splats.of:,} Gaussians drawn"
+        if note != self._note.content:
+            self._note.content = note
+        values = splats.centres, splats.covariances, splats.colours, splats.opacities
+        with self._lock:
+            if "splats" in self._nodes:
+                self._nodes["splats"].set_gaussians(*values)
+            else:
+                node = self._server.scene.add_gaussian_splats("/splats", *values)
+                node.visible = self.requests.mode == SPLATS
+                self._nodes["splats"] = node
+
+    def show_picture(self, client: int, picture: NDArray[np.uint8]) -> None:
+        """A picture (H, W, 3) behind the scene, for the browser that it was made for."""
+        with self._lock:
+            handle = self._server.get_clients().get(client)
+            if handle is not None and self.requests.mode != SPLATS:
+                handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
+
+    def show_frame(self, frame: ShownFrame) -> None:
+        """The current frame, as a frustum with its picture."""
+        T_world_camera = inverse_se3(frame.T_camera_world)
+        pose = {"wxyz": quaternion_from_matrix(T_world_camera[:3, :3]), "position": T_world_camera[:3, 3] * self.units}
+        with self._lock:
+            self._frame = frame
+            node = self._nodes.get(FRAME)
+            if node is None:
+                self._nodes[FRAME] = self._server.scene.add_camera_frustum(
+                    "/frame",
+                    fov=_vertical(frame.camera),
+                    aspect=frame.camera.width / frame.camera.height,
+                    scale=FRAME_SIZE,
+                    thickness=2.0,
+                    thickness_units="screen",
+                    color=FRAME_COLOUR,
+                    image=frame.picture,
+                    format="jpeg",
+                    jpeg_quality=JPEG_QUALITY,
+                    visible=self._boxes[FRAME].value,
+                    **pose,
+                )
+                return
+            node.wxyz, node.position = pose["wxyz"], pose["position"]
+            node.image = frame.picture
+
+    def show_keyframes(self, poses: NDArray[np.float64], camera: PinholeCamera) -> None:
+        """Frustums of keyframes at T_camera_world (N, 4, 4), all of one camera's shape."""
+        lines = frustum_lines(poses, camera, self.units)
+        with self._lock:
+            if KEYFRAMES in self._nodes:
+                self._nodes[KEYFRAMES].points = lines
+            else:
+                self._nodes[KEYFRAMES] = self._server.scene.add_line_segments(
+                    "/keyframes",
+                    lines,
+                    KEYFRAME_COLOUR,
+                    thickness=1.5,
+                    thickness_units="screen",
+                    visible=self._boxes[KEYFRAMES].value,
+                )
+
+    def show_points(self, xyz: NDArray[np.float64]) -> None:
+        """Tracked points (N, 3) of the world."""
+        points = (xyz * self.units).astype(np.float32)
+        with self._lock:
+            if POINTS in self._nodes:
+                self._nodes[POINTS].points = points
+            else:
+                self._nodes[POINTS] = self._server.scene.add_point_cloud(
+                    "/points",
+                    points,
+                    POINT_COLOUR,
+                    point_size=POINT_SIZE,
+                    point_shape="circle",
+                    precision="float32",
+                    visible=self._boxes[POINTS].value,
+                )
+
+    # ---- controls --------------------------------------------------------------------------------------------
+
+    def _add_controls(self, modes: Sequence[str], choose: Callable[[int], None] | None, frames: int) -> None:
+        gui = self._server.gui
+        self._numbers = gui.add_markdown("waiting for the first frame")
+        if self._gate is not None:
+            self._pause = gui.add_button("Pause", hint="hold the mapping after the frame or step that it is at")
+            self.show_paused(self._gate.paused)
+            self._pause.on_click(lambda _: self._set_paused(not self._gate.paused))
+            step = gui.add_button("Step", hint="map one frame, or take one step, and hold again")
+            step.on_click(lambda _: self._step())
+        if choose is not None:
+            slider = gui.add_slider("Frame", min=0, max=max(frames - 1, 1), step=1, initial_value=0)
+            slider.on_update(lambda _: choose(min(int(slider.value), frames - 1)))
+        mode = gui.add_dropdown("Show", tuple(modes), hint="splats: drawn by the browser; others: by our renderer")
+        mode.on_update(lambda _: self._set_mode(mode.value))
+        self._note = gui.add_markdown("")
+        self._boxes = {name: gui.add_checkbox(name, initial_value=True) for name in (KEYFRAMES, FRAME, POINTS)}
+        for box in self._boxes.values():
+            box.on_update(lambda _: self._set_visible())
+        look = gui.add_button("Look from the current frame")
+        look.on_click(lambda event: self._look_from_frame(event.client))
+
+    def show_paused(self, paused: bool) -> None:
+        """What the button for it says."""
+        self._pause.label = "Resume" if paused else "Pause"
+
+    def _set_paused(self, paused: bool) -> None:
+        self._gate.pause(paused)
+        self.show_paused(paused)
+
+    def _step(self) -> None:
+        self._gate.step()
+        self.show_paused(True)
+
+    def _set_mode(self, mode: str) -> None:
+        with self._lock:
+            self.requests.show(mode)
+            if "splats" in self._nodes:
+                self._nodes["splats"].visible = mode == SPLATS
+            if mode == SPLATS:
+                for client in self._server.get_clients().values():
+                    client.scene.set_background_image(None)
+        if self._gate is not None:
+            self._gate.wake()
+
+    def _set_visible(self) -> None:
+        with self._lock:
+            for name, box in self._boxes.items():
+                if name in self._nodes:
+                    self._nodes[name].visible = box.value
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda _: self._moved(client))
+        self._moved(client)
+
+    def _moved(self, client: viser.ClientHandle) -> None:
+        if client.client_id not in self._server.get_clients():
+            return  # a last word of one that has gone
+        c = client.camera
+        self.requests.look(BrowserCamera(client.client_id, c.wxyz, c.position, c.fov, c.image_width, c.image_height))
+        if self._gate is not None:
+            self._gate.wake()
+
+    def _look_from_frame(self, client: viser.ClientHandle | None) -> None:
+        frame = self._frame
+        if client is None or frame is None:
+            return
+        centre = inverse_se3(frame.T_camera_world)[:3, 3] * self.units
+        client.camera.fov = _vertical(frame.camera)
+        _look(client, centre, centre + DEPTH_ON_PAGE * frame.T_camera_world[2, :3], -frame.T_camera_world[1, :3])
+
+
+def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: float) -> NDArray[np.float32]:
+    """Edges (8 N, 2, 3) of the frustums of cameras at T_camera_world (N, 4, 4), in the page's units."""
+    size = np.array([camera.width, camera.height])
+    corners = camera.unproject(CORNERS * size, np.full(4, KEYFRAME_SIZE))
+    R = poses[:, :3, :3]
+    centres = -np.einsum("nji,nj->ni", R, poses[:, :3, 3]) * units
+    ends = centres[:, None] + np.einsum("nji,kj->nki", R, corners)
+    sides = np.stack([np.broadcast_to(centres[:, None], ends.shape), ends], axis=2)
+    around = np.stack([ends, np.roll(ends, -1, axis=1)], axis=2)
+    return np.concatenate([sides, around], axis=1).reshape(-1, 2, 3).astype(np.float32)
+
+
+def _vertical(camera: PinholeCamera) -> float:
+    """Vertical field of view [rad]."""
+    return float(2 * np.arctan(0.5 * camera.height / camera.fy))
+
+
+def _look(client: viser.ClientHandle, eye: NDArray, target: NDArray, up: NDArray) -> None:
+    with client.atomic():
+        client.camera.position = eye
+        client.camera.look_at = target
+        client.camera.up_direction = up
+
+
+def _require_address(host: str) -> None:
+    """Raise InputError where no port of `host` can be opened: viser would wait for ever."""
+    try:
+        family = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0][0]
+        with socket.create_server((host, 0), family=family):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"view.host {host}: no address of this machine ({error.strerror}); 127.0.0.1 is for this machine alone, "
+            "0.0.0.0 for all that reach it"
+        ) from None
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """What viser says of itself on the terminal is left out."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before

@@ -1,0 +1,58 @@
+"""Gaussians as a browser draws them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.gaussians import SH_C0
+
+__all__ = ["Splats", "splats_of"]
+
+
+@dataclass(frozen=True)
+class Splats:
+    """centres (N, 3) and covariances (N, 3, 3) in the page's units, colours (N, 3) and opacities (N, 1) uint8.
+
+    of: how many Gaussians the map has.
+    """
+
+    centres: NDArray[np.float32]
+    covariances: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    opacities: NDArray[np.uint8]
+    of: int
+
+
+def splats_of(state: Mapping[str, NDArray], units: float, limit: int) -> Splats:
+    """Of Gaussians by name (`GaussianField.to_numpy`), their colours as they are without their harmonics.
+
+    Of more than `limit`, every n-th, as much larger as it takes to cover what the others did. units: of the page, in
+    a unit of the world.
+    """
+    count = len(state["position"])
+    chosen = np.arange(count) if count <= limit else np.arange(limit) * count // limit
+    larger = np.sqrt(count / len(chosen)) if len(chosen) else 1.0
+    q = state["quaternion"][chosen].astype(np.float32)
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    R = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1),
+        ],
+        axis=1,
+    )
+    M = R * (np.exp(state["log_scale"][chosen]) * np.float32(units * larger))[:, None, :]
+    opacity = 1.0 / (1.0 + np.exp(-state["opacity_logit"][chosen]))
+    colour = np.clip(0.5 + SH_C0 * state["sh"][chosen, 0], 0.0, 1.0)
+    return Splats(
+        state["position"][chosen] * np.float32(units),
+        M @ M.transpose(0, 2, 1),
+        np.round(255.0 * colour).astype(np.uint8),
+        np.round(255.0 * opacity[:, None]).astype(np.uint8),
+        count,
+    )

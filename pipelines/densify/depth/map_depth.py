@@ -1,0 +1,61 @@
+"""Depth as the map so far shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.keyframes import Keyframe
+from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
+from pipelines.render.renderer import Renderer
+
+__all__ = ["MapDepth"]
+
+
+class MapDepth:
+    """The expected depth of the render, where the map is opaque.
+
+    Its deviation has two parts: how far the render is from the view's own tracked points, as the median of the view,
+    and how much the rendered depth varies around the pixel, where an edge may lie on either side.
+    """
+
+    MIN_OPACITY = 0.9
+    # Pixels are asked for where the map is worst, tracked points are where it is best: against a depth sensor, 39
+    # percent of the errors were within one deviation as it comes, 68 percent of the fused ones with twice that.
+    CAUTION = 2.0
+    # Side [px] of the window around a pixel in which depth may vary.
+    WINDOW = 5
+
+    def __init__(self, renderer: Renderer, near: float) -> None:
+        """near: depth below which nothing is drawn [the view's median depths]."""
+        self.renderer = renderer
+        self.near = near
+
+    def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
+        """See `DepthEstimator`. Overwrites the renderer's images."""
+        places, z = point_depths(view)
+        if len(z) == 0 or len(pixels) == 0 or len(self.renderer.gaussians) == 0:
+            return unknown_depth(len(pixels))
+        picture = self.renderer.render(view.camera, view.T_camera_world, self.near * view.median_depth)
+        log_depth = np.log(np.maximum(picture.expected_depth(self.MIN_OPACITY), 1e-12)).astype(np.float32)
+        kernel = np.ones((self.WINDOW, self.WINDOW), dtype=np.uint8)
+        # A hole nearby counts as a great variation: log_depth is far below all others there.
+        variation = cv2.dilate(log_depth, kernel) - cv2.erode(log_depth, kernel)
+        at_points = _at(log_depth, places) - np.log(z)
+        at_points = at_points[_at(picture.opacity, places) >= self.MIN_OPACITY]
+        if len(at_points) == 0:
+            return unknown_depth(len(pixels))
+        # 1.48: a normal distribution's deviation over its median absolute one.
+        common = 1.48 * np.median(np.abs(at_points))
+        deviation = self.CAUTION * np.hypot(common, 0.5 * _at(variation, pixels))
+        solid = _at(picture.opacity, pixels) >= self.MIN_OPACITY
+        return DepthEstimate(np.where(solid, np.exp(_at(log_depth, pixels)), 1.0), np.where(solid, deviation, np.inf))
+
+
+def _at(image: NDArray, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values (N,) of an image (H, W) at pixels (N, 2)."""
+    column, row = np.floor(pixels).astype(int).T
+    return image[row, column].astype(np.float64)

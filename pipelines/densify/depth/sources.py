@@ -1,0 +1,33 @@
+"""The depth estimators that the configuration names."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.densify.depth.depthcov import DepthCov
+from pipelines.densify.depth.depthcov_checkpoint import load_depthcov
+from pipelines.densify.depth.epipolar import EpipolarDepth
+from pipelines.densify.depth.estimate import DepthEstimator
+from pipelines.densify.depth.fusion import FusedDepth
+from pipelines.densify.depth.gaussian_process import GaussianProcessDepth, ImageGuidedDepth
+from pipelines.densify.depth.map_depth import MapDepth
+from pipelines.render.renderer import Renderer
+from pipelines.settings import DepthSettings
+
+__all__ = ["build_depth"]
+
+
+def build_depth(settings: DepthSettings, renderer: Renderer, near: float, rng: np.random.Generator) -> DepthEstimator:
+    """The one estimator of `settings.sources`, or the fusion of several. near: as of `MapDepth`.
+
+    Raises ValueError where DepthCov's checkpoint cannot be used.
+    """
+    makers = {
+        "constant": lambda: GaussianProcessDepth(settings, rng),
+        "image": lambda: ImageGuidedDepth(settings, rng),
+        "depthcov": lambda: DepthCov(settings, load_depthcov(settings.checkpoint), rng),
+        "epipolar": lambda: EpipolarDepth(settings.epipolar),
+        "map": lambda: MapDepth(renderer, near),
+    }
+    estimators = [makers[source]() for source in settings.sources]
+    return estimators[0] if len(estimators) == 1 else FusedDepth(estimators)

@@ -1,0 +1,141 @@
+"""Densification: where new Gaussians go, and how they begin (Section 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_se3
+from fields.map.gaussians import NO_ANCHOR, SH_C0, GaussianField
+from fields.map.keyframes import Keyframe
+from fields.map.occupancy import OccupancyVoxels
+from pipelines.densify.depth import DepthEstimator
+from pipelines.memory_budget import MemoryBudget
+from pipelines.optimise.exposure import scene_colours
+from pipelines.settings import DensifySettings
+
+__all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "tracked_seeds"]
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Places of new Gaussians: xyz (N, 3) world, size (N,) of their pixel out there, colour (N, 3) in [0, 1]."""
+
+    xyz: NDArray[np.float64]
+    size: NDArray[np.float64]
+    colour: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+    def __getitem__(self, keep: NDArray | slice) -> Seeds:
+        return Seeds(self.xyz[keep], self.size[keep], self.colour[keep])
+
+
+def _at_pixels(view: Keyframe, pixels: NDArray[np.float64], xyz: NDArray, depth: NDArray) -> Seeds:
+    """Seeds at pixels (N, 2) of a view, without those on masked pixels. Size is d / f of Eq. 1."""
+    places = np.floor(pixels).astype(int)
+    valid = view.rgba[places[:, 1], places[:, 0], 3] > 0
+    return Seeds(xyz, depth / view.camera.focal, scene_colours(view, places))[valid]
+
+
+def tracked_seeds(view: Keyframe) -> Seeds:
+    """Geometry and texture complex regions: the tracked points of the view that lie in its image (P_i)."""
+    depth = view.points.depths(view.T_camera_world)
+    keep = (depth > 0) & view.camera.contains(view.points.pixels)
+    return _at_pixels(view, view.points.pixels[keep], view.points.xyz[keep], depth[keep])
+
+
+def dissimilarity(render: NDArray[np.floating], rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """1 - SSIM (H, W) of a render (H, W, 3) and an image (H, W, 4) in grey, after a slight blur against noise.
+
+    0 where the image is masked.
+    """
+
+    def smooth(image: NDArray, side: int, sigma: float) -> NDArray[np.float32]:
+        return cv2.GaussianBlur(image, (side, side), sigma)
+
+    a = smooth(cv2.cvtColor(np.clip(render, 0, 1).astype(np.float32), cv2.COLOR_RGB2GRAY), 5, 0.5)
+    b = smooth(cv2.cvtColor(rgba[..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0, 5, 0.5)
+    mu_a, mu_b = smooth(a, 11, 1.5), smooth(b, 11, 1.5)
+    var_a, var_b = smooth(a * a, 11, 1.5) - mu_a**2, smooth(b * b, 11, 1.5) - mu_b**2
+    covariance = smooth(a * b, 11, 1.5) - mu_a * mu_b
+    c1, c2 = 0.01**2, 0.03**2
+    ssim = (2 * mu_a * mu_b + c1) * (2 * covariance + c2) / ((mu_a**2 + mu_b**2 + c1) * (var_a + var_b + c2))
+    return np.where(rgba[..., 3] > 0, 1.0 - ssim, 0.0).astype(np.float32)
+
+
+def error_pixels(
+    view: Keyframe,
+    error: NDArray[np.float32] | None,
+    settings: DensifySettings,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """High error regions: pixel centres (N, 2), drawn where 1 - SSIM is high and no point is tracked.
+
+    error: (H, W) 1 - SSIM of the map's render; None draws from all valid pixels (the warm-up).
+    """
+    height, width = view.rgba.shape[:2]
+    candidate = view.rgba[..., 3] > 0
+    if error is not None:
+        candidate &= error >= settings.dissimilarity
+    inside = view.points.pixels[view.camera.contains(view.points.pixels)].astype(int)
+    candidate[inside[:, 1], inside[:, 0]] = False
+    places = np.flatnonzero(candidate)
+    count = min(round(settings.pixels * (width * height / (640 * 480)) ** 0.75), len(places))
+    chosen = np.sort(rng.choice(places, count, replace=False))
+    return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
+
+
+def pixel_seeds(
+    view: Keyframe,
+    neighbours: Sequence[Keyframe],
+    pixels: NDArray[np.float64],
+    estimator: DepthEstimator,
+    max_deviation: float | NDArray[np.float64],
+) -> Seeds:
+    """Seeds at pixels (N, 2) whose depth the estimator knows well enough: to `max_deviation`, one or (N,)."""
+    estimate = estimator.estimate(view, neighbours, pixels)
+    sure = estimate.deviation < max_deviation
+    camera_points = view.camera.unproject(pixels[sure], estimate.depth[sure])
+    T_world_camera = inverse_se3(view.T_camera_world)
+    xyz = camera_points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return _at_pixels(view, pixels[sure], xyz, estimate.depth[sure])
+
+
+def grow(
+    gaussians: GaussianField,
+    seeds: Seeds,
+    voxels: OccupancyVoxels | None,
+    target: float,
+    settings: DensifySettings,
+    budget: MemoryBudget,
+    anchor: int = NO_ANCHOR,
+) -> int:
+    """Add isotropic Gaussians at the seeds that the voxels admit at spacing `target` [scene units]; return how many.
+
+    If the budget has no room for all of them, the first ones are taken. anchor: of the new ones, see `GaussianField`.
+    """
+    if voxels is not None:
+        seeds = seeds[~voxels.query(seeds.xyz, target)]
+    # A cell that is marked and stays empty would refuse every later Gaussian: only what has room is marked.
+    seeds = seeds[: budget.take_gaussians(seeds.xyz, target)]
+    if voxels is not None:
+        seeds = seeds[voxels.admit(seeds.xyz, target)]
+    n = len(seeds)
+    log_scale = np.log(settings.initial_scale * seeds.size) + settings.scale_offset
+    sh = np.zeros((n, gaussians.sh_count, 3))
+    sh[:, 0] = (seeds.colour - 0.5) / SH_C0
+    gaussians.append(
+        position=seeds.xyz,
+        log_scale=np.repeat(log_scale[:, None], 3, axis=1),
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        opacity_logit=np.full(n, np.log(settings.initial_opacity / (1.0 - settings.initial_opacity))),
+        sh=sh,
+        anchor=anchor,
+    )
+    return n

@@ -1,0 +1,184 @@
+"""Adam over the Gaussians that the last batch of views touched."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from fields.map.gaussians import GaussianField
+from fields.runtime.compiled_kernel import CompiledLoop
+
+__all__ = ["Adam", "LearningRates"]
+
+# Bits of 1e18 in float32: its square, a second moment, is finite still.
+BOUND = int(np.float32(1e18).view(np.int32))
+LARGEST_LOG = 80.0
+# Logit of an opacity below that of any pruning.
+TRANSPARENT = -20.0
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Step sizes; position in scene units, the others per stored parameter."""
+
+    position: float
+    log_scale: float
+    quaternion: float
+    opacity_logit: float
+    colour: float
+
+
+@ti.func
+def _bits(x):
+    """The bits of |x| as float32, which are in the order of the numbers, infinity and NaN above all.
+
+    A comparison of the numbers would be left to a compiler that is told that there is no NaN.
+    """
+    return ti.bit_cast(ti.cast(x, ti.f32), ti.i32) & 0x7FFFFFFF
+
+
+@ti.func
+def _one_over_complement(x):
+    """1 / (1 - exp(x)) for x < 0, by the series where the difference would be all rounding."""
+    series = -x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0))))
+    return 1.0 / ti.select(x > -0.05, series, 1.0 - ti.exp(x))
+
+
+@ti.data_oriented
+class Adam:
+    """Adam [Kingma 2015] with every Gaussian's own step count for the bias correction.
+
+    With a batch of B views the rates follow the square-root rule of the paper's settings: lr * sqrt(B), betas
+    1 - 0.1 B and 1 - 0.001 B, eps / sqrt(B). A Gaussian that no view saw keeps its value, moments and count, so that
+    looking elsewhere does not move it.
+
+    Two safeguards look at every Gaussian on the way. One whose gradient has a component that is no number, or whose
+    components sum to more than 1e18, keeps value, moments and count as well. One that comes out larger than it may be
+    is made transparent, so that the next pruning removes it. Both are counted, see `GaussianField.take_caught`.
+    """
+
+    def __init__(self, gaussians: GaussianField) -> None:
+        self.gaussians = gaussians
+        self.real = gaussians.real
+        self._update_all = CompiledLoop(self._step, 60)
+
+    def step(self, rates: LearningRates, batch: int = 1, sh_degree: int | None = None, largest: float = np.inf) -> None:
+        """Update and clear the gradients of every touched Gaussian.
+
+        sh_degree: harmonics above it keep value and moments; None for all that the Gaussians have. largest: standard
+        deviation that one may reach [scene units].
+        """
+        if self.gaussians.count == 0:
+            return
+        active = self.gaussians.sh_count if sh_degree is None else (sh_degree + 1) ** 2
+        root = float(np.sqrt(batch))
+        beta1, beta2 = max(1.0 - 0.1 * batch, 0.0), 1.0 - 0.001 * batch
+        values = [rates.position, rates.log_scale, rates.quaternion, rates.opacity_logit, rates.colour]
+        steps = (float(root * v) for v in values)
+        # beta^t is exp(t log beta), cheaper than a power. A beta of 0 counts as 1e-30, whose powers vanish too.
+        logs = (float(np.log(max(beta, 1e-30))) for beta in (beta1, beta2))
+        n = self.gaussians.count
+        limit = float(min(np.log(largest), LARGEST_LOG))
+        self._update_all(n, n, active, *steps, float(beta1), float(beta2), *logs, 1e-15 / root, limit)
+
+    @ti.func
+    def _update(self, value, gradient, m: ti.template(), v: ti.template(), lr, betas, corrections, eps):
+        m = betas[0] * m + (1.0 - betas[0]) * gradient
+        v = betas[1] * v + (1.0 - betas[1]) * gradient * gradient
+        return value - lr * (m * corrections[0]) / (ti.sqrt(v * corrections[1]) + eps)
+
+    @ti.kernel
+    def _step(
+        self,
+        alone: ti.template(),
+        count: ti.i32,
+        active: ti.i32,
+        lr_position: ti.f32,
+        lr_log_scale: ti.f32,
+        lr_quaternion: ti.f32,
+        lr_opacity: ti.f32,
+        lr_colour: ti.f32,
+        beta1: ti.f32,
+        beta2: ti.f32,
+        log_beta1: ti.f32,
+        log_beta2: ti.f32,
+        eps: ti.f32,
+        largest: ti.f32,
+    ):
+        ti.loop_config(serialize=alone)
+        for i in range(count):
+            sound = False
+            if self.gaussians.touched[i] != 0:
+                self.gaussians.touched[i] = 0
+                sound = self._magnitude(i, active) < BOUND
+                if not sound:
+                    ti.atomic_add(self.gaussians._caught[0], 1)
+                    self.gaussians.forget_gradient(i)
+            if sound:
+                self.gaussians.steps[i] = self.gaussians.steps[i] + 1
+                t = ti.cast(self.gaussians.steps[i], ti.f32)
+                betas = ti.Vector([beta1, beta2])
+                corrections = ti.Vector([_one_over_complement(t * log_beta1), _one_over_complement(t * log_beta2)])
+                # Whole vectors: Taichi takes its time with every line that it unrolls.
+                g = self.gaussians
+                g.position[i] = self._update(
+                    g.position[i],
+                    g.position.grad[i],
+                    g.position_m[i],
+                    g.position_v[i],
+                    lr_position,
+                    betas,
+                    corrections,
+                    eps,
+                )
+                g.log_scale[i] = self._update(
+                    g.log_scale[i],
+                    g.log_scale.grad[i],
+                    g.log_scale_m[i],
+                    g.log_scale_v[i],
+                    lr_log_scale,
+                    betas,
+                    corrections,
+                    eps,
+                )
+                g.quaternion[i] = self._update(
+                    g.quaternion[i],
+                    g.quaternion.grad[i],
+                    g.quaternion_m[i],
+                    g.quaternion_v[i],
+                    lr_quaternion,
+                    betas,
+                    corrections,
+                    eps,
+                )
+                g.opacity_logit[i] = self._update(
+                    g.opacity_logit[i],
+                    g.opacity_logit.grad[i],
+                    g.opacity_logit_m[i],
+                    g.opacity_logit_v[i],
+                    lr_opacity,
+                    betas,
+                    corrections,
+                    eps,
+                )
+                for k in range(active):
+                    # The directional part moves twenty times slower, as in 3DGS.
+                    lr = ti.select(k == 0, lr_colour, lr_colour / 20.0)
+                    g.sh[i, k] = self._update(
+                        g.sh[i, k], g.sh.grad[i, k], g.sh_m[i, k], g.sh_v[i, k], lr, betas, corrections, eps
+                    )
+                self.gaussians.forget_gradient(i)
+                if self.gaussians.log_scale[i].max() > largest:
+                    self.gaussians.log_scale[i] = ti.min(self.gaussians.log_scale[i], largest)
+                    self.gaussians.opacity_logit[i] = TRANSPARENT
+                    ti.atomic_add(self.gaussians._caught[1], 1)
+
+    @ti.func
+    def _magnitude(self, i, active):
+        """The sum of the magnitudes of a Gaussian's gradient, as bits: see `_bits`."""
+        g = self.gaussians
+        total = ti.abs(g.opacity_logit.grad[i]) + ti.abs(g.position.grad[i]).sum() + ti.abs(g.log_scale.grad[i]).sum()
+        total += ti.abs(g.quaternion.grad[i]).sum()
+        for k in range(active):
+            total += ti.abs(g.sh.grad[i, k]).sum()
+        return _bits(total)

@@ -1,0 +1,255 @@
+"""The photometric loss on a GPU: a block a tile and channel, both windows of SSIM through shared memory.
+
+The formulas are those of `pipelines/optimise/losses.py`. Sums stay on the device: the gradient reads the number of
+valid pixels there, and the host gets the values late.
+"""
+
+import numpy as np
+import taichi as ti
+import torch
+
+from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
+from fields.buffers.images import PAD, ImageBuffers
+from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.backend import on_gpu, torch_device
+from fields.runtime.compiled_kernel import CompiledKernel
+from pipelines.optimise.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
+from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
+
+__all__ = ["AsyncLossValues", "DevicePhotometricLoss", "photometric_loss"]
+
+# A tile with the border that its windows reach into.
+SIDE = TILE_WIDTH + 2 * RADIUS
+HALO = SIDE * SIDE
+BAND = SIDE * TILE_WIDTH
+ROW_BITS = TILE_WIDTH.bit_length() - 1
+# Evaluations whose values lie in one tensor and come to the host together.
+ROWS = 64
+
+NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
+assert THREADS == TILE_PIXELS == TILE_WIDTH * TILE_HEIGHT
+
+
+class _Values:
+    """The sums of `ROWS` evaluations on the device, and what of them is on its way to the host."""
+
+    def __init__(self) -> None:
+        self.sums = torch.zeros((ROWS, 4), dtype=torch.float32, device=torch_device())
+        self.written = 0
+        self._sent = 0
+        self._late: AsyncReadback | None = None
+
+    def send(self) -> None:
+        """Start the copy to the host where there is anything new."""
+        if self._sent < self.written:
+            self._late, self._sent = AsyncReadback(self.sums), self.written
+
+    def row(self, i: int) -> np.ndarray:
+        """The sums (4,) of evaluation i. Waits where they have not arrived."""
+        if i >= self._sent:
+            self.send()
+        return self._late.numpy()[i].astype(np.float64)
+
+
+class AsyncLossValues(LossValues):
+    """Values that come to the host when they are first read, or before where `DevicePhotometricLoss.send` was called.
+
+    Reading waits for the device until they have come.
+    """
+
+    def __init__(self, values: _Values, row: int) -> None:
+        object.__setattr__(self, "_source", (values, row))
+
+    def __getattr__(self, name: str) -> float:
+        # Only for what is not there yet: the three fields of LossValues.
+        if name not in ("l1", "ssim", "squared_error"):
+            raise AttributeError(name)
+        values, row = self._source
+        l1, ssim, square, count = (float(v) for v in values.row(row))
+        count = max(count, 1.0)
+        super().__init__(l1 / count, ssim / count, square / count)
+        object.__setattr__(self, "_source", None)
+        return getattr(self, name)
+
+
+@ti.data_oriented
+class DevicePhotometricLoss(PhotometricLoss):
+    """Compares `images.colour` with `images.reference` where `images.valid`, and fills `images.colour_grad`."""
+
+    lag = 1
+
+    def __init__(self, images: ImageBuffers) -> None:
+        self.images = images
+        self.weights = window_weights()
+        self._partial = torch.zeros(12 * tile_count(images.max_width, images.max_height), device=torch_device())
+        self._totals = torch.zeros(4, dtype=torch.float32, device=torch_device())
+        self._compare, self._differentiate = (
+            CompiledKernel(self._compare_tiles),
+            CompiledKernel(self._differentiate_tiles),
+        )
+        self._sum = BlockSums(4)
+        self._values = _Values()
+
+    def forward(self) -> LossValues:
+        """Evaluate the loss, leaving the SSIM map in `images.ssim`; its values come when they are read.
+
+        Masked pixels of the render are replaced by the reference, so that they add nothing to any window.
+        """
+        if self._values.written == ROWS:
+            self._values = _Values()
+        values, row = self._values, self._values.written
+        width, height = self.images.width, self.images.height
+        self._compare(width, height, self._partial)
+        self._sum(3 * tile_count(width, height), self._partial, self._totals)
+        values.sums[row] = self._totals
+        values.written += 1
+        return AsyncLossValues(values, row)
+
+    def send(self) -> None:
+        self._values.send()
+
+    def backward(self, ssim_weight: float, scale: float = 1.0) -> None:
+        """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM)."""
+        by_l1, by_ssim = scale * (1.0 - ssim_weight), -scale * ssim_weight
+        self._differentiate(self.images.width, self.images.height, float(by_l1), float(by_ssim), self._totals)
+
+    @ti.func
+    def _at(self, buffer: ti.template(), start, x, y, width, height):
+        """Value of a plane at a pixel; 0 beyond the image."""
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        value = 0.0
+        if inside:
+            value = buffer[start + (y + PAD) * self.images.stride + x + PAD]
+        return value
+
+    @ti.kernel
+    def _compare_tiles(self, width: ti.i32, height: ti.i32, partial: NUMBERS):
+        plane = ti.static(self.images.plane)
+        for i in range(width * height):
+            p = (i // width + PAD) * self.images.stride + i % width + PAD
+            if self.images.valid[p] < 1.0:
+                for c in ti.static(range(3)):
+                    r = self.images.reference[c * plane + p]
+                    d = self.images.colour[c * plane + p] - r
+                    self.images.colour[c * plane + p] = r + d * self.images.valid[p]
+
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=THREADS)
+        for i in range(3 * tiles * THREADS):
+            a = ti.simt.block.SharedArray((HALO,), ti.f32)
+            b = ti.simt.block.SharedArray((HALO,), ti.f32)
+            # The four moments after the horizontal window; then the four sums.
+            band = ti.simt.block.SharedArray((4 * BAND,), ti.f32)
+            unit, thread = i >> THREAD_BITS, i & (THREADS - 1)
+            channel, tile = unit // tiles, unit % tiles
+            start = channel * plane
+            left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
+            # The block may come from another tile, whose threads are not all done with shared memory.
+            ti.simt.block.sync()
+            for k in range((HALO - thread + THREADS - 1) >> THREAD_BITS):
+                at = thread + k * THREADS
+                x, y = left - RADIUS + at % SIDE, top - RADIUS + at // SIDE
+                a[at] = self._at(self.images.colour, start, x, y, width, height)
+                b[at] = self._at(self.images.reference, start, x, y, width, height)
+            ti.simt.block.sync()
+            for k in range((BAND - thread + THREADS - 1) >> THREAD_BITS):
+                at = thread + k * THREADS
+                source = (at >> ROW_BITS) * SIDE + (at & (TILE_WIDTH - 1))
+                mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
+                for q in ti.static(range(2 * RADIUS + 1)):
+                    va, vb = a[source + q], b[source + q]
+                    wa, wb = self.weights[q] * va, self.weights[q] * vb
+                    mu_x, mu_y = mu_x + wa, mu_y + wb
+                    squares, xy = squares + (wa * va + wb * vb), xy + wa * vb
+                band[at] = mu_x
+                band[BAND + at] = mu_y
+                band[2 * BAND + at] = squares
+                band[3 * BAND + at] = xy
+            ti.simt.block.sync()
+            mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
+            for q in ti.static(range(2 * RADIUS + 1)):
+                at = thread + q * TILE_WIDTH
+                mu_x += self.weights[q] * band[at]
+                mu_y += self.weights[q] * band[BAND + at]
+                squares += self.weights[q] * band[2 * BAND + at]
+                xy += self.weights[q] * band[3 * BAND + at]
+            l1, ssim, square, valid = 0.0, 0.0, 0.0, 0.0
+            x, y = left + (thread & (TILE_WIDTH - 1)), top + (thread >> ROW_BITS)
+            if x < width and y < height:
+                mean_square = mu_x * mu_x + mu_y * mu_y
+                variances, covariance = squares - mean_square, xy - mu_x * mu_y
+                # S = (A1 A2) / (B1 B2)
+                A1, B1 = 2.0 * mu_x * mu_y + C1, mean_square + C1
+                A2, B2 = 2.0 * covariance + C2, variances + C2
+                inv = 1.0 / (B1 * B2)
+                S = A1 * A2 * inv
+                p = (y + PAD) * self.images.stride + x + PAD
+                valid = self.images.valid[p]
+                d_mu = 2.0 * inv * (mu_y * (A2 - A1) - mu_x * S * (B2 - B1))
+                self.images.ssim_partial[3 * start + p] = d_mu * valid
+                self.images.ssim_partial[3 * start + plane + p] = -S * B1 * inv * valid
+                self.images.ssim_partial[3 * start + 2 * plane + p] = 2.0 * A1 * inv * valid
+                self.images.ssim[start + p] = S
+                centre = ((thread >> ROW_BITS) + RADIUS) * SIDE + (thread & (TILE_WIDTH - 1)) + RADIUS
+                d = a[centre] - b[centre]
+                l1, ssim, square = ti.abs(d), S * valid, d * d
+            ti.simt.block.sync()
+            band[thread] = l1
+            band[THREADS + thread] = ssim
+            band[2 * THREADS + thread] = square
+            band[3 * THREADS + thread] = valid
+            sum_over_block(band, thread, 4)
+            if thread < 4:
+                partial[unit * 4 + thread] = band[thread * THREADS]
+
+    @ti.kernel
+    def _differentiate_tiles(
+        self, width: ti.i32, height: ti.i32, l1_scale: ti.f32, ssim_scale: ti.f32, totals: NUMBERS
+    ):
+        plane = ti.static(self.images.plane)
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=THREADS)
+        for i in range(3 * tiles * THREADS):
+            halo = ti.simt.block.SharedArray((3 * HALO,), ti.f32)
+            band = ti.simt.block.SharedArray((3 * BAND,), ti.f32)
+            unit, thread = i >> THREAD_BITS, i & (THREADS - 1)
+            channel, tile = unit // tiles, unit % tiles
+            start = channel * plane
+            left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
+            ti.simt.block.sync()
+            for k in range((HALO - thread + THREADS - 1) >> THREAD_BITS):
+                at = thread + k * THREADS
+                x, y = left - RADIUS + at % SIDE, top - RADIUS + at // SIDE
+                for q in ti.static(range(3)):
+                    source = 3 * start + q * plane
+                    halo[q * HALO + at] = self._at(self.images.ssim_partial, source, x, y, width, height)
+            ti.simt.block.sync()
+            for k in range((BAND - thread + THREADS - 1) >> THREAD_BITS):
+                at = thread + k * THREADS
+                source = (at >> ROW_BITS) * SIDE + (at & (TILE_WIDTH - 1))
+                for q in ti.static(range(3)):
+                    total = 0.0
+                    for j in ti.static(range(2 * RADIUS + 1)):
+                        total += self.weights[j] * halo[q * HALO + source + j]
+                    band[q * BAND + at] = total
+            ti.simt.block.sync()
+            smooth = ti.Vector.zero(ti.f32, 3)
+            for q in ti.static(range(3)):
+                for j in ti.static(range(2 * RADIUS + 1)):
+                    smooth[q] += self.weights[j] * band[q * BAND + thread + j * TILE_WIDTH]
+            x, y = left + (thread & (TILE_WIDTH - 1)), top + (thread >> ROW_BITS)
+            if x < width and y < height:
+                p = (y + PAD) * self.images.stride + x + PAD
+                per_pixel = 1.0 / ti.max(totals[3], 1.0)
+                a, b = self.images.colour[start + p], self.images.reference[start + p]
+                sign = ti.select(a > b, 1.0, ti.select(a < b, -1.0, 0.0))
+                by_ssim = smooth[0] + 2.0 * a * smooth[1] + b * smooth[2]
+                gradient = per_pixel * (l1_scale * sign + ssim_scale * by_ssim)
+                self.images.colour_grad[start + p] = gradient * self.images.valid[p]
+
+
+def photometric_loss(images: ImageBuffers) -> PhotometricLoss:
+    """The loss in the form of the device that Taichi runs on."""
+    return DevicePhotometricLoss(images) if on_gpu() else PhotometricLoss(images)

@@ -1,0 +1,149 @@
+"""One optimisation step: a batch of views rendered, compared, differentiated; Gaussians and poses updated."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.runtime.async_readback import AsyncReadback
+from pipelines.optimise.adam import Adam, LearningRates
+from pipelines.optimise.exposure import ExposureRefinement
+from pipelines.optimise.gpu_losses import photometric_loss
+from pipelines.optimise.losses import AspectPenalty, LossValues
+from pipelines.optimise.pose_refinement import PoseRefinement
+from pipelines.optimise.safeguards import EXPLODED, Safeguards
+from pipelines.render.renderer import Renderer
+from pipelines.settings import MappingSettings
+
+__all__ = ["MapOptimiser"]
+
+
+class MapOptimiser:
+    """Renders with `renderer`, and keeps Gaussians and keyframes in step with their images."""
+
+    def __init__(self, gaussians: GaussianField, renderer: Renderer, settings: MappingSettings) -> None:
+        self.gaussians = gaussians
+        self.renderer = renderer
+        self.settings = settings
+        self.loss = photometric_loss(renderer.images)
+        self.aspect = AspectPenalty(gaussians)
+        self.adam = Adam(gaussians)
+        self.safeguards = Safeguards()
+        self.poses = PoseRefinement(self.safeguards)
+        self.exposure = ExposureRefinement(settings.exposure, self.safeguards)
+        # What steps have found that has not been taken in: values of their views, and by index of the keyframe how it
+        # is to move. On the CPU empty between steps.
+        self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
+        self._moves: dict[int, list[Callable[[], None]]] = {}
+        self._psnr = float("nan")
+
+    def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
+        """The settings' learning rates, positions in scene units."""
+        o = self.settings.optimise
+        return LearningRates(
+            position=o.position_rate * scene_depth * position_factor,
+            log_scale=o.scale_rate * scale_factor,
+            quaternion=o.rotation_rate,
+            opacity_logit=o.opacity_rate,
+            colour=o.colour_rate,
+        )
+
+    def compare(self, view: Keyframe, scene_depth: float, level: int = 0, exact: bool = True) -> LossValues:
+        """Render a keyframe, develop it, and evaluate the loss against its image of a pyramid level.
+
+        exact: see `Renderer.forward`.
+        """
+        image = view.image(level)
+        self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth, exact)
+        self.renderer.develop(view.exposure, view.vignette)
+        self.renderer.images.set_reference(image.rgba)
+        return self.loss.forward()
+
+    def step(
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int = 0
+    ) -> float:
+        """Adam steps on the mean loss of the views (indices into `store`), in batches; return their mean PSNR.
+
+        The keyframes' errors are brought up to date, and their poses but the first are stepped at `pose_rate` [px];
+        so are their exposures where they are estimated. On a GPU, which is not waited for, errors and PSNR are those of
+        the step before (NaN at first), and a keyframe moves before it is rendered next; `settle` brings all up to date.
+        """
+        size = self.settings.optimise.batch
+        seen: list[tuple[Keyframe, LossValues]] = []
+        for first in range(0, len(views), size):
+            seen += self._step(store, views[first : first + size], rates, pose_rate, level)
+        self.loss.send()
+        self._unread.append(seen)
+        while len(self._unread) > self.loss.lag:
+            self._read(self._unread.popleft())
+        return self._psnr
+
+    def settle(self) -> float:
+        """Take in all that the steps so far have found; return the mean PSNR of the last one's views."""
+        while self._unread:
+            self._read(self._unread.popleft())
+        self._move()
+        return self._psnr
+
+    def caught(self) -> Safeguards:
+        """What the safeguards have caught so far. Waits for the device."""
+        steps, exploded = self.gaussians.take_caught()
+        self.safeguards.gaussian_steps += steps
+        self.safeguards.exploded_gaussians += exploded
+        return self.safeguards
+
+    def _read(self, seen: list[tuple[Keyframe, LossValues]]) -> None:
+        """Take in the values of a step's views."""
+        sound = [(view, values) for view, values in seen if np.isfinite(values.l1)]
+        self.safeguards.views += len(seen) - len(sound)
+        for view, values in sound:
+            view.error = values.l1
+        if sound:
+            self._psnr = float(np.mean([values.psnr for _, values in sound]))
+
+    def _move(self, view: Keyframe | None = None) -> None:
+        """Step pose and exposure of a keyframe by the gradients of the last batch that it was in; None for all."""
+        for key in list(self._moves) if view is None else [view.index]:
+            for move in self._moves.pop(key, ()):
+                move()
+
+    def _step(
+        self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int
+    ) -> list[tuple[Keyframe, LossValues]]:
+        o = self.settings.optimise
+        seen: list[tuple[Keyframe, LossValues]] = []
+        pose_gradients: dict[int, list[AsyncReadback]] = {}
+        exposure_gradients: dict[int, list[AsyncReadback]] = {}
+        for j in views:
+            view = store[j]
+            self._move(view)
+            values = self.compare(view, store.scene_depth, level, exact=False)
+            self.loss.backward(o.ssim_weight, 1.0 / len(views))
+            self.renderer.backward()
+            seen.append((view, values))
+            if pose_rate > 0 and j > 0:
+                pose_gradients.setdefault(j, []).append(self.renderer.async_camera_gradient())
+            if view.exposure is not None and j > 0:
+                exposure_gradients.setdefault(j, []).append(self.renderer.async_exposure_gradient())
+        self.aspect.backward(o.aspect_weight, store.scene_depth)
+        self.adam.step(rates, len(views), largest=EXPLODED * store.scene_depth)
+        for j, gradients in pose_gradients.items():
+            move = partial(self._move_pose, store[j], gradients, pose_rate)
+            self._moves.setdefault(store[j].index, []).append(move)
+        for j, gradients in exposure_gradients.items():
+            move = partial(self._move_exposure, store[j], gradients, views.count(j) / len(views))
+            self._moves.setdefault(store[j].index, []).append(move)
+        if self.loss.lag == 0:
+            self._move()
+        return seen
+
+    def _move_pose(self, view: Keyframe, gradients: list[AsyncReadback], rate: float) -> None:
+        self.poses.step(view, sum(g.numpy().astype(np.float64) for g in gradients), rate)
+
+    def _move_exposure(self, view: Keyframe, gradients: list[AsyncReadback], weight: float) -> None:
+        self.exposure.step(view, sum(g.numpy().astype(np.float64) for g in gradients), weight)

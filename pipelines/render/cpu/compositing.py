@@ -1,0 +1,265 @@
+"""Compositing: colour, depth and opacity of the sorted ellipses, forward and backward, one tile a task.
+
+Front to back, with T the transmittance before a Gaussian (Eq. 3 of 3DGS):
+    alpha = min(0.99, opacity * exp(power)),  power = -(a dx^2 + c dy^2) / 2 - b dx dy
+    C += alpha T c,   D += alpha T z,   T *= 1 - alpha,   and at the end   C += T background.
+
+The inner loop runs over the consecutive pixels of a tile's rows, branch-free, so that it becomes SIMD code (a
+Gaussian outside, pixels inside: the transpose of the form for GPUs). Only rows that the ellipse reaches are visited.
+"""
+
+import taichi as ti
+
+from fields.buffers.images import PAD, ImageBuffers
+from fields.buffers.projected import ProjectedGaussians
+from fields.buffers.tiles import GROUP, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TilePairs
+from fields.buffers.view import ViewField
+from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
+from fields.runtime.parallel import HANDED_OUT
+from pipelines.render.cpu.fast_exp2 import LOG2E, fast_exp2
+from pipelines.render.cpu.projection import ALPHA_MIN
+
+__all__ = ["ALPHA_MAX", "OPAQUE", "Compositing"]
+
+ALPHA_MAX = 0.99
+# A tile takes no further Gaussian once less than this passes at all of its pixels: below what 8 bits or the tests see.
+OPAQUE = 1e-5
+# Transmittance ends here: far below what counts, and above where numbers are denormal and processors slow.
+LEAST_TRANSMITTANCE = 1e-20
+ROW_BITS = TILE_WIDTH.bit_length() - 1
+# A thread takes eight tiles at a time.
+SPREAD = HANDED_OUT // 8
+
+
+@ti.data_oriented
+class Compositing:
+    """Composites `projected` by the lists in `pairs` into `images`, and takes gradients the other way."""
+
+    def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: TilePairs, images: ImageBuffers) -> None:
+        self.view = view
+        self.projected = projected
+        self.pairs = pairs
+        self.images = images
+        self.real = images.real
+        self._composite, self._add_up = CompiledKernel(self._forward), CompiledLoop(self._gather, 80)
+        self._differentiate = {False: CompiledKernel(self._backward), True: CompiledKernel(self._backward_with_depth)}
+
+    def forward(self) -> None:
+        """Fill `images.colour`, `.depth` and `.opacity`."""
+        self._composite(self.view.width, self.view.height)
+
+    def backward(self, with_depth: bool = False) -> None:
+        """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
+        self._differentiate[with_depth](self.view.width, self.view.height)
+        self._add_up(self.projected.count, self.projected.count)
+
+    @ti.kernel
+    def _forward(self, width: ti.i32, height: ti.i32):
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        for spread in range(tiles * SPREAD):
+            if spread % SPREAD == 0:
+                self._forward_tile(spread // SPREAD, width, height)
+
+    @ti.func
+    def _forward_tile(self, tile, width, height):
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        base = tile * TILE_PIXELS
+        for p in range(TILE_PIXELS):
+            self.images.transmittance[base + p] = 1.0
+            self.images.red[base + p] = 0.0
+            self.images.green[base + p] = 0.0
+            self.images.blue[base + p] = 0.0
+            self.images.z[base + p] = 0.0
+        # Pixel centres relative to the mean, without the half pixel.
+        left = ti.cast(tile % tiles_x * TILE_WIDTH, self.real) + 0.5
+        top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
+        first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
+        reached = 0
+        not_opaque = ti.cast(1.0, self.real)
+        for group in range((count + GROUP - 1) // GROUP):
+            # An empty range rather than a `while` or `break`: with those Taichi fetches every field's root anew at
+            # each pixel, and LLVM gives the inner loop up.
+            start = first + group * GROUP
+            end = ti.select(not_opaque > 0.0, ti.min(start + GROUP, first + count), start)
+            self._stage(tile, start, end, left, top)
+            for k in range(start, end):
+                rows, ellipse = self.pairs.rows[k], self.pairs.staged[tile * GROUP + k - start]
+                x0, y0, a, b, c = ellipse[0], ellipse[1], ellipse[2], ellipse[3], ellipse[4]
+                opacity, z = ellipse[5], ellipse[9]
+                colour = ti.Vector([ellipse[6], ellipse[7], ellipse[8]])
+                for p in range((rows & 0xFFFF) << ROW_BITS, (rows >> 16) << ROW_BITS):
+                    dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
+                    dy = y0 + ti.cast(p >> ROW_BITS, self.real)
+                    power = (a * dx + b * dy) * dx + c * dy * dy
+                    alpha = opacity * fast_exp2(power, self.real)
+                    alpha = ti.select(alpha < ALPHA_MAX, alpha, ALPHA_MAX)
+                    alpha = ti.select(alpha >= ALPHA_MIN, alpha, 0.0)
+                    T = self.images.transmittance[base + p]
+                    weight = alpha * T
+                    self.images.red[base + p] = self.images.red[base + p] + weight * colour[0]
+                    self.images.green[base + p] = self.images.green[base + p] + weight * colour[1]
+                    self.images.blue[base + p] = self.images.blue[base + p] + weight * colour[2]
+                    self.images.z[base + p] = self.images.z[base + p] + weight * z
+                    T -= weight
+                    self.images.transmittance[base + p] = ti.select(T > LEAST_TRANSMITTANCE, T, LEAST_TRANSMITTANCE)
+            reached = ti.select(end > start, end - first, reached)
+            # Counted: LLVM makes vector code of a sum, not of a maximum of floats.
+            not_opaque = ti.cast(0.0, self.real)
+            for p in range(TILE_PIXELS):
+                not_opaque += ti.select(self.images.transmittance[base + p] > OPAQUE, 1.0, 0.0)
+        self.pairs.reached[tile] = reached
+
+        stride, plane = ti.static(self.images.stride, self.images.plane)
+        columns = ti.min(TILE_WIDTH, width - tile % tiles_x * TILE_WIDTH)
+        background = self.images.background[None]
+        for row in range(ti.min(TILE_HEIGHT, height - tile // tiles_x * TILE_HEIGHT)):
+            source = base + row * TILE_WIDTH
+            target = (tile // tiles_x * TILE_HEIGHT + row + PAD) * stride + tile % tiles_x * TILE_WIDTH + PAD
+            for x in range(columns):
+                T = self.images.transmittance[source + x]
+                self.images.colour[target + x] = self.images.red[source + x] + T * background[0]
+                self.images.colour[target + plane + x] = self.images.green[source + x] + T * background[1]
+                self.images.colour[target + 2 * plane + x] = self.images.blue[source + x] + T * background[2]
+                self.images.depth[target + x] = self.images.z[source + x]
+                self.images.opacity[target + x] = 1.0 - T
+
+    @ti.func
+    def _stage(self, tile, start, end, left, top):
+        """Copy what is needed of the Gaussians of a group of pairs to where it stays in the cache.
+
+        Neighbours in a tile's list lie far apart in memory. Here all of a group are waited for together; one after the
+        other, in the loop over pairs, they cost a sixth of the time.
+        """
+        for k in range(start, end):
+            s = self.pairs.slot[k]
+            mean, conic, colour = self.projected.mean[s], self.projected.conic[s], self.projected.colour[s]
+            self.pairs.staged[tile * GROUP + k - start] = ti.Vector(
+                [
+                    left - mean[0], top - mean[1],
+                    -0.5 * LOG2E * conic[0], -LOG2E * conic[1], -0.5 * LOG2E * conic[2],
+                    self.projected.opacity[s], colour[0], colour[1], colour[2], self.projected.depth[s],
+                ]
+            )  # fmt: skip
+
+    @ti.kernel
+    def _backward(self, width: ti.i32, height: ti.i32):
+        self._backward_tiles(width, height, False)
+
+    @ti.kernel
+    def _backward_with_depth(self, width: ti.i32, height: ti.i32):
+        self._backward_tiles(width, height, True)
+
+    @ti.func
+    def _backward_tiles(self, width, height, with_depth: ti.template()):
+        # Front to back again, as the forward pass went, so that the same Gaussians are masked and left out. What lies
+        # behind a Gaussian enters as one number a pixel: `behind` = <gradient, all that is still to be composited>.
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        for spread in range(tiles * SPREAD):
+            if spread % SPREAD == 0:
+                self._backward_tile(spread // SPREAD, width, height, with_depth)
+
+    @ti.func
+    def _backward_tile(self, tile, width, height, with_depth: ti.template()):
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        base = tile * TILE_PIXELS
+        for p in range(TILE_PIXELS):
+            self.images.transmittance[base + p] = 1.0
+            self.images.behind[base + p] = 0.0
+            self.images.red_grad[base + p] = 0.0
+            self.images.green_grad[base + p] = 0.0
+            self.images.blue_grad[base + p] = 0.0
+            if ti.static(with_depth):
+                self.images.z_grad[base + p] = 0.0
+        stride, plane = ti.static(self.images.stride, self.images.plane)
+        columns = ti.min(TILE_WIDTH, width - tile % tiles_x * TILE_WIDTH)
+        for row in range(ti.min(TILE_HEIGHT, height - tile // tiles_x * TILE_HEIGHT)):
+            target = base + row * TILE_WIDTH
+            source = (tile // tiles_x * TILE_HEIGHT + row + PAD) * stride + tile % tiles_x * TILE_WIDTH + PAD
+            for x in range(columns):
+                red_grad = self.images.colour_grad[source + x]
+                green_grad = self.images.colour_grad[source + plane + x]
+                blue_grad = self.images.colour_grad[source + 2 * plane + x]
+                behind = (
+                    red_grad * self.images.colour[source + x]
+                    + green_grad * self.images.colour[source + plane + x]
+                    + blue_grad * self.images.colour[source + 2 * plane + x]
+                    - self.images.opacity_grad[source + x] * (1.0 - self.images.opacity[source + x])
+                )
+                if ti.static(with_depth):
+                    z_grad = self.images.depth_grad[source + x]
+                    self.images.z_grad[target + x] = z_grad
+                    behind = behind + z_grad * self.images.depth[source + x]
+                self.images.red_grad[target + x] = red_grad
+                self.images.green_grad[target + x] = green_grad
+                self.images.blue_grad[target + x] = blue_grad
+                self.images.behind[target + x] = behind
+
+        left = ti.cast(tile % tiles_x * TILE_WIDTH, self.real) + 0.5
+        top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
+        first, reached = self.pairs.first[tile], self.pairs.reached[tile]
+        for group in range((reached + GROUP - 1) // GROUP):
+            start = first + group * GROUP
+            end = ti.min(start + GROUP, first + reached)
+            self._stage(tile, start, end, left, top)
+            for k in range(start, end):
+                rows, ellipse = self.pairs.rows[k], self.pairs.staged[tile * GROUP + k - start]
+                x0, y0, a, b, c = ellipse[0], ellipse[1], ellipse[2], ellipse[3], ellipse[4]
+                opacity, z = ellipse[5], ellipse[9]
+                colour = ti.Vector([ellipse[6], ellipse[7], ellipse[8]])
+                zero = ti.cast(0.0, self.real)
+                g_red, g_green, g_blue, g_z, g_power = zero, zero, zero, zero, zero
+                g_x, g_y, g_xx, g_xy, g_yy = zero, zero, zero, zero, zero
+                for p in range((rows & 0xFFFF) << ROW_BITS, (rows >> 16) << ROW_BITS):
+                    dx = x0 + ti.cast(p & (TILE_WIDTH - 1), self.real)
+                    dy = y0 + ti.cast(p >> ROW_BITS, self.real)
+                    power = (a * dx + b * dy) * dx + c * dy * dy
+                    unclamped = opacity * fast_exp2(power, self.real)
+                    alpha = ti.select(unclamped < ALPHA_MAX, unclamped, ALPHA_MAX)
+                    alpha = ti.select(alpha >= ALPHA_MIN, alpha, 0.0)
+                    T = self.images.transmittance[base + p]
+                    weight = alpha * T
+                    red_grad = self.images.red_grad[base + p]
+                    green_grad = self.images.green_grad[base + p]
+                    blue_grad = self.images.blue_grad[base + p]
+                    shade = colour[0] * red_grad + colour[1] * green_grad + colour[2] * blue_grad
+                    if ti.static(with_depth):
+                        shade = shade + z * self.images.z_grad[base + p]
+                        g_z += weight * self.images.z_grad[base + p]
+                    contribution = weight * shade
+                    behind = self.images.behind[base + p] - contribution
+                    self.images.behind[base + p] = behind
+                    T -= weight
+                    self.images.transmittance[base + p] = ti.select(T > LEAST_TRANSMITTANCE, T, LEAST_TRANSMITTANCE)
+                    # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
+                    power_grad = contribution - behind * alpha / (1.0 - alpha)
+                    power_grad = ti.select(unclamped > ALPHA_MAX, 0.0, power_grad)
+                    g_red += weight * red_grad
+                    g_green += weight * green_grad
+                    g_blue += weight * blue_grad
+                    g_power += power_grad
+                    ux, uy = power_grad * dx, power_grad * dy
+                    g_x += ux
+                    g_y += uy
+                    g_xx += ux * dx
+                    g_xy += ux * dy
+                    g_yy += uy * dy
+                self.pairs.gradient[k] = ti.Vector([g_red, g_green, g_blue, g_z, g_power, g_x, g_y, g_xx, g_xy, g_yy])
+        for k in range(first + reached, first + self.pairs.tile_count[tile]):
+            self.pairs.gradient[k].fill(0.0)
+
+    @ti.kernel
+    def _gather(self, alone: ti.template(), slots: ti.i32):
+        """Sum every slot's pairs, in their order, into the gradients of what was composited."""
+        ti.loop_config(serialize=alone)
+        for s in range(slots):
+            total = ti.Vector.zero(self.real, 10)
+            for e in range(self.projected.first_pair[s], self.projected.end_pair[s]):
+                total += self.pairs.gradient[self.pairs.position[e]]
+            conic = self.projected.conic[s]
+            self.projected.colour.grad[s] = ti.Vector([total[0], total[1], total[2]])
+            self.projected.depth.grad[s] = total[3]
+            self.projected.opacity.grad[s] = total[4] / ti.max(self.projected.opacity[s], 1e-12)
+            self.projected.mean.grad[s] = ti.Vector(
+                [conic[0] * total[5] + conic[1] * total[6], conic[1] * total[5] + conic[2] * total[6]]
+            )
+            self.projected.conic.grad[s] = ti.Vector([-0.5 * total[7], -total[8], -0.5 * total[9]])

@@ -1,0 +1,162 @@
+"""The photometric model: from the colours of the scene to those of a photograph, (A colour + b) * vignette, and back.
+
+A (3, 3) and b (3,) are a frame's exposure, the vignette is the share of the light that reaches each pixel. With the
+loss's gradient g by the photograph and h = vignette * g, the gradients are
+    d colour = A^T h,   d A = sum over the pixels of h colour^T,   d b = sum of h.
+"""
+
+import cv2
+import numpy as np
+import taichi as ti
+import torch
+
+from fields.buffers.images import PAD, ImageBuffers
+from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.backend import refuse_too_many_fields
+from fields.runtime.parallel import HANDED_OUT
+
+__all__ = ["IDENTITY", "PhotometricModel"]
+
+IDENTITY = np.eye(3, 4)
+IDENTITY.flags.writeable = False
+# A thread takes eight rows at a time.
+SPREAD = HANDED_OUT // 8
+
+
+@ti.data_oriented
+class PhotometricModel:
+    """Develops `images.colour` in place, and takes `images.colour_grad` the other way.
+
+    Where there is neither exposure nor vignette nothing is done, and no memory taken.
+    """
+
+    def __init__(self, images: ImageBuffers) -> None:
+        self.images = images
+        self.real = images.real
+        self._active = False
+        self._made = False
+        self._exposure = np.array(IDENTITY)
+        self._sums = np.zeros((images.max_height, 12))
+        self._loaded: tuple[int, int, int] | None = None  # which vignette the buffer holds, at which size
+        self._resized: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray]] = {}
+
+    def forward(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
+        """Develop the picture rendered last. None stands for the identity.
+
+        exposure: (3, 4), A beside b. vignette: (H, W, 3) of the camera's full size; it is resized to the picture.
+        """
+        self._active = exposure is not None or vignette is not None
+        if not self._active:
+            return
+        self._make_buffers()
+        self._load(vignette)
+        self._exposure = np.ascontiguousarray(IDENTITY if exposure is None else exposure, dtype=np.float64)
+        self._develop()
+
+    def backward(self) -> None:
+        """From the gradient by the developed picture to that by the render, which comes back into `images.colour`."""
+        if self._active:
+            self._undevelop()
+
+    def exposure_gradient(self) -> np.ndarray:
+        """d loss / d (A, b) (3, 4) of the picture that was developed last, after `backward`."""
+        # Row by row in a fixed order, so that two runs agree bit for bit.
+        return self._sums[: self.images.height].sum(axis=0).reshape(3, 4)
+
+    def async_exposure_gradient(self) -> AsyncReadback:
+        """The same; on the CPU there is nothing to wait for."""
+        return AsyncReadback(torch.from_numpy(self.exposure_gradient()))
+
+    def _develop(self) -> None:
+        self._forward(self.images.width, self.images.height, self._exposure)
+
+    def _undevelop(self) -> None:
+        self._backward(self.images.width, self.images.height, self._exposure, self._sums)
+
+    def _make_buffers(self) -> None:
+        if self._made:
+            return
+        self._made = True
+        self.rendered, self.vignette = ti.field(self.real), ti.field(self.real)
+        builder = ti.FieldsBuilder()
+        builder.dense(ti.i, 3 * self.images.plane).place(self.rendered, self.vignette)
+        builder.finalize()
+        refuse_too_many_fields(self.vignette)
+
+    def _load(self, vignette: np.ndarray | None) -> None:
+        """Have the vignette, at the picture's size, in the buffer."""
+        width, height = self.images.width, self.images.height
+        key = (id(vignette), width, height)
+        if key == self._loaded:
+            return
+        self._loaded = key
+        if vignette is None:
+            self.vignette.fill(1.0)
+            return
+        if key not in self._resized:
+            image = np.ascontiguousarray(vignette, dtype=np.float32)
+            if image.shape[:2] != (height, width):
+                image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            # With the original, which must live as long as its id is a key.
+            self._resized[key] = vignette, image
+        self._set_vignette(width, height, self._resized[key][1])
+
+    @ti.kernel
+    def _set_vignette(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.f32, ndim=3)):
+        for y in range(height):
+            row = (y + PAD) * self.images.stride + PAD
+            for x in range(width):
+                for c in ti.static(range(3)):
+                    self.vignette[c * self.images.plane + row + x] = image[y, x, c]
+
+    @ti.kernel
+    def _forward(self, width: ti.i32, height: ti.i32, exposure: ti.types.ndarray(dtype=ti.f64, ndim=2)):
+        for spread in range(height * SPREAD):
+            if spread % SPREAD == 0:
+                self._forward_row(spread // SPREAD, width, exposure)
+
+    @ti.func
+    def _forward_row(self, y, width, exposure: ti.template()):
+        plane = ti.static(self.images.plane)
+        row = (y + PAD) * self.images.stride + PAD
+        E = ti.Matrix([[ti.cast(exposure[i, j], self.real) for j in range(4)] for i in range(3)])
+        # A first access of each tree out here makes Taichi fetch its root once, not at every pixel.
+        self.rendered[row], self.images.colour[row] = self.rendered[row], self.images.colour[row]
+        for x in range(row, row + width):
+            red, green, blue = self.images.colour[x], self.images.colour[plane + x], self.images.colour[2 * plane + x]
+            self.rendered[x], self.rendered[plane + x], self.rendered[2 * plane + x] = red, green, blue
+            for c in ti.static(range(3)):
+                developed = E[c, 0] * red + E[c, 1] * green + E[c, 2] * blue + E[c, 3]
+                self.images.colour[c * plane + x] = developed * self.vignette[c * plane + x]
+
+    @ti.kernel
+    def _backward(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        exposure: ti.types.ndarray(dtype=ti.f64, ndim=2),
+        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    ):
+        for spread in range(height * SPREAD):
+            if spread % SPREAD == 0:
+                self._backward_row(spread // SPREAD, width, exposure, sums)
+
+    @ti.func
+    def _backward_row(self, y, width, exposure: ti.template(), sums: ti.template()):
+        plane = ti.static(self.images.plane)
+        row = (y + PAD) * self.images.stride + PAD
+        E = ti.Matrix([[ti.cast(exposure[i, j], self.real) for j in range(4)] for i in range(3)])
+        self.rendered[row], self.images.colour[row] = self.rendered[row], self.images.colour[row]
+        total = ti.Matrix.zero(self.real, 3, 4)
+        for x in range(row, row + width):
+            red, green, blue = self.rendered[x], self.rendered[plane + x], self.rendered[2 * plane + x]
+            h = ti.Vector([self.images.colour_grad[c * plane + x] * self.vignette[c * plane + x] for c in range(3)])
+            for c in ti.static(range(3)):
+                total[c, 0] += h[c] * red
+                total[c, 1] += h[c] * green
+                total[c, 2] += h[c] * blue
+                total[c, 3] += h[c]
+                self.images.colour_grad[c * plane + x] = E[0, c] * h[0] + E[1, c] * h[1] + E[2, c] * h[2]
+                self.images.colour[c * plane + x] = self.rendered[c * plane + x]
+        for i, j in ti.static(ti.ndrange(3, 4)):
+            sums[y, 4 * i + j] = total[i, j]

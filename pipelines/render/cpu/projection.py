@@ -1,0 +1,268 @@
+"""Projection: which Gaussians a view sees, in which order, and their ellipses and colours in the image.
+
+EWA splatting [Zwicker 2001] with the opacity compensation of Mip-Splatting [Yu 2024]; the gradient, camera
+tangent included, comes from Taichi's automatic differentiation.
+"""
+
+import numpy as np
+import taichi as ti
+import torch
+
+from fields.buffers.projected import ProjectedGaussians
+from fields.buffers.view import ViewField
+from fields.geometry.se3 import ti_rotation_from_quaternion
+from fields.geometry.vec3 import cross, dot, rotate, rotate_back
+from fields.map.gaussians import SH_C0, GaussianField
+from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.compiled_kernel import CompiledLoop
+from fields.runtime.parallel import HANDED_OUT
+from pipelines.render.spherical_harmonics import evaluate_sh
+
+__all__ = ["ALPHA_MIN", "BLUR", "Projection"]
+
+# Variance of the pixel's own footprint [px^2], added to every ellipse.
+BLUR = 0.3
+# A contribution below this is not drawn, here and in every other splatting renderer.
+ALPHA_MIN = 1.0 / 255.0
+# Compensation is floored here: below, a Gaussian is far thinner than a pixel and its gradient would be infinite.
+MIN_DETERMINANT_RATIO = 1e-6
+CHUNK = 512
+# A thread takes two chunks at a time.
+SPREAD = HANDED_OUT // 2
+
+
+@ti.data_oriented
+class Projection:
+    """Culls, orders and projects the Gaussians of `gaussians` for the view in `view` into `projected`."""
+
+    def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
+        self.gaussians = gaussians
+        self.view = view
+        self.projected = projected
+        self._keys = np.zeros(1, dtype=np.uint64)
+        self._depths = np.zeros(1, dtype=np.float32)
+        self._chunk_counts = np.zeros(1, dtype=np.int32)
+        self._cull, self._compact = CompiledLoop(self._cull_chunks, 35), CompiledLoop(self._compact_chunks, 10)
+        self._set_order = CompiledLoop(self._set_sorted, 3)
+        self._sum_tangents = CompiledLoop(self._sum_tangents_of_chunks, 8)
+        self._prepare_differentiable()
+
+    def _prepare_differentiable(self) -> None:
+        self._project, self._project_back = CompiledLoop(self.project, 30), CompiledLoop(self.project, 80, reverse=True)
+        self._shade, self._shade_back = CompiledLoop(self.shade, 4), CompiledLoop(self.shade, 6, reverse=True)
+        self._clear = CompiledLoop(self._clear_tangent_gradients, 4)
+
+    def forward(self) -> int:
+        """Fill `projected` for the current view; return how many Gaussians it sees."""
+        self.projected.count = count = self._visible()
+        if count:
+            # Keys are unique (depth above, slot below), so any sort of them is stable in the Gaussians' order.
+            self._keys[:count].sort()
+            self._set_order(count, count, self._keys)
+            self._project(count)
+            self._shade(count)
+        else:
+            self.projected.seen[None] = 0
+        return count
+
+    def backward(self) -> None:
+        """From the gradients in `projected` to those of the Gaussians and of the slots' camera tangents."""
+        if self.projected.count:
+            self._clear(self.projected.count)
+            self._shade_back(self.projected.count)
+            self._project_back(self.projected.count)
+
+    def camera_gradient(self) -> np.ndarray:
+        """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order."""
+        count = self.projected.count
+        chunks = -(-count // CHUNK)
+        partial = np.zeros((chunks, 6), dtype=np.float64)
+        if count:
+            self._sum_tangents(count, count, partial)
+        return partial.sum(axis=0)
+
+    def async_camera_gradient(self) -> AsyncReadback:
+        """The same; on the CPU there is nothing to wait for."""
+        return AsyncReadback(torch.from_numpy(self.camera_gradient()))
+
+    # ---- which, and in which order ---------------------------------------------------------------------------
+
+    def _visible(self) -> int:
+        """Give every Gaussian that the view may see a slot and a key to sort by; return how many."""
+        n = self.gaussians.count
+        if n == 0:
+            return 0
+        if len(self._depths) < n:
+            size = 1 << (n - 1).bit_length()
+            self._depths = np.zeros(size, dtype=np.float32)
+            self._keys = np.zeros(size, dtype=np.uint64)
+            self._chunk_counts = np.zeros(-(-size // CHUNK), dtype=np.int32)
+        chunks = -(-n // CHUNK)
+        self._cull(n, n, self._depths, self._chunk_counts)
+        ends = np.cumsum(self._chunk_counts[:chunks])
+        self._chunk_counts[1:chunks] = ends[:-1]
+        self._chunk_counts[0] = 0
+        self._compact(n, n, self._depths, self._chunk_counts, self._keys)
+        return int(ends[-1])
+
+    @ti.kernel
+    def _cull_chunks(self, alone: ti.template(), n: ti.i32, depths: ti.types.ndarray(), counts: ti.types.ndarray()):
+        ti.loop_config(serialize=alone)
+        for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
+            if i % SPREAD == 0:
+                self._cull_chunk(i // SPREAD, n, depths, counts)
+
+    @ti.func
+    def _cull_chunk(self, chunk, n, depths: ti.template(), counts: ti.template()):
+        camera, stretch = self._camera()
+        seen = 0
+        for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
+            depth = self._seen_at(i, camera, stretch)
+            depths[i] = depth
+            seen += ti.cast(depth > 0.0, ti.i32)
+        counts[chunk] = seen
+
+    @ti.func
+    def _camera(self):
+        """The view's T_camera_world (3, 4), and the largest stretch of its linearised projection."""
+        rotation, translation = self.view.rotation[None], self.view.translation[None]
+        focal, limits = self.view.focal[None], self.view.limits[None]
+        camera = ti.Matrix.zero(self.projected.real, 3, 4)
+        for r in ti.static(range(3)):
+            for c in ti.static(range(3)):
+                camera[r, c] = rotation[r, c]
+            camera[r, 3] = translation[r]
+        # |rows of J| <= f / z * sqrt(1 + limit^2).
+        bound = ti.max(ti.max(-limits[0], limits[1]), ti.max(-limits[2], limits[3]))
+        return camera, ti.max(focal[0], focal[1]) * ti.sqrt(1.0 + bound * bound)
+
+    @ti.func
+    def _seen_at(self, i, camera, stretch):
+        """Depth (float32) of Gaussian i where the view may see it, else 0. camera, stretch: from `_camera`."""
+        focal, centre, size = self.view.focal[None], self.view.centre[None], self.view.size[None]
+        position = self.gaussians.position[i]
+        p = camera @ ti.Vector([position[0], position[1], position[2], ti.cast(1.0, self.projected.real)])
+        visible = 0
+        if p.z > self.view.near[None]:
+            opacity = 1.0 / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
+            if opacity > ALPHA_MIN:
+                sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch / p.z
+                radius = ti.sqrt(2.0 * ti.log(opacity / ALPHA_MIN) * (sigma * sigma + BLUR))
+                x = focal[0] * p.x / p.z + centre[0]
+                y = focal[1] * p.y / p.z + centre[1]
+                if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
+                    visible = 1
+        return ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
+
+    @ti.kernel
+    def _compact_chunks(
+        self,
+        alone: ti.template(),
+        n: ti.i32,
+        depths: ti.types.ndarray(),
+        first: ti.types.ndarray(),
+        keys: ti.types.ndarray(),
+    ):
+        ti.loop_config(serialize=alone)
+        for i in range(((n + CHUNK - 1) // CHUNK) * SPREAD):
+            if i % SPREAD == 0:
+                self._compact_chunk(i // SPREAD, n, depths, first, keys)
+
+    @ti.func
+    def _compact_chunk(self, chunk, n, depths: ti.template(), first: ti.template(), keys: ti.template()):
+        slot = first[chunk]
+        for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
+            if depths[i] > 0.0:
+                # The bits of a positive float rise with it.
+                bits = ti.cast(ti.bit_cast(depths[i], ti.u32), ti.u64)
+                keys[slot] = (bits << 32) | ti.cast(slot, ti.u64)
+                self.projected.gaussian[slot] = i
+                self.projected.tangent[slot].fill(0.0)
+                slot += 1
+
+    @ti.kernel
+    def _set_sorted(self, alone: ti.template(), count: ti.i32, keys: ti.types.ndarray()):
+        self.projected.seen[None] = count
+        ti.loop_config(serialize=alone)
+        for k in range(count):
+            self.projected.order[k] = ti.cast(keys[k] & ti.u64(0xFFFFFFFF), ti.i32)
+
+    # ---- the differentiable part -----------------------------------------------------------------------------
+
+    @ti.kernel
+    def project(self, alone: ti.template()):
+        """Ellipse, depth and compensated opacity of every slot."""
+        ti.loop_config(serialize=alone)
+        for s in range(self.projected.seen[None]):
+            i = self.projected.gaussian[s]
+            xi = self.projected.tangent[s]
+            rho, omega = ti.Vector([xi[0], xi[1], xi[2]]), ti.Vector([xi[3], xi[4], xi[5]])
+            W = self.view.rotation[None]
+            focal, limits = self.view.focal[None], self.view.limits[None]
+
+            # exp(xi) to first order: exact in value and derivative at xi = 0.
+            tracked = rotate(W, self.gaussians.position[i]) + self.view.translation[None]
+            p = tracked + cross(omega, tracked) + rho
+            inv_z = 1.0 / p[2]
+            tx, ty = p[0] * inv_z, p[1] * inv_z
+            # Rows of the Jacobian of the pixel position, linearised inside the frustum's margin.
+            jx = -ti.min(ti.max(tx, limits[0]), limits[1])
+            jy = -ti.min(ti.max(ty, limits[2]), limits[3])
+            row_x = ti.Vector([1.0, 0.0, jx]) * (focal[0] * inv_z)
+            row_y = ti.Vector([0.0, 1.0, jy]) * (focal[1] * inv_z)
+            # u, v: rows of J exp(omega) W R S, since row . (a + omega x a) = (row + row x omega) . a
+            R = ti_rotation_from_quaternion(self.gaussians.quaternion[i])
+            scale = ti.exp(self.gaussians.log_scale[i])
+            u = rotate_back(R, rotate_back(W, row_x + cross(row_x, omega))) * scale
+            v = rotate_back(R, rotate_back(W, row_y + cross(row_y, omega))) * scale
+
+            sharp_xx, sharp_xy, sharp_yy = dot(u, u), dot(u, v), dot(v, v)
+            minors = cross(u, v)
+            # Cauchy-Binet: no cancellation for needles, where xx * yy - xy^2 would leave only rounding.
+            sharp_determinant = dot(minors, minors)
+            determinant = sharp_determinant + BLUR * (sharp_xx + sharp_yy) + BLUR * BLUR
+            compensation = ti.sqrt(ti.max(sharp_determinant / determinant, MIN_DETERMINANT_RATIO))
+
+            self.projected.mean[s] = ti.Vector([focal[0] * tx, focal[1] * ty]) + self.view.centre[None]
+            self.projected.conic[s] = ti.Vector([sharp_yy + BLUR, -sharp_xy, sharp_xx + BLUR]) / determinant
+            self.projected.depth[s] = p[2]
+            self.projected.opacity[s] = compensation / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
+
+    @ti.kernel
+    def shade(self, alone: ti.template()):
+        """Colour of every slot from its spherical harmonics and the direction it is seen in."""
+        ti.loop_config(serialize=alone)
+        for s in range(self.projected.seen[None]):
+            i = self.projected.gaussian[s]
+            if ti.static(self.gaussians.sh_degree == 0):
+                self.projected.colour[s] = ti.max(0.5 + SH_C0 * self.gaussians.sh[i, 0], 0.0)
+            else:
+                xi = self.projected.tangent[s]
+                # Turning a camera does not move its centre, so that only rho changes the direction: W'(p + rho).
+                tracked = rotate(self.view.rotation[None], self.gaussians.position[i]) + self.view.translation[None]
+                ray = rotate_back(self.view.rotation[None], tracked + ti.Vector([xi[0], xi[1], xi[2]]))
+                direction = ray / ti.sqrt(dot(ray, ray))
+                colour = evaluate_sh(ti.static(self.gaussians.sh_degree), self.gaussians.sh, i, direction)
+                self.projected.colour[s] = ti.max(0.5 + colour, 0.0)
+
+    @ti.kernel
+    def _clear_tangent_gradients(self, alone: ti.template()):
+        ti.loop_config(serialize=alone)
+        for s in range(self.projected.seen[None]):
+            self.projected.tangent.grad[s].fill(0.0)
+            self.gaussians.touched[self.projected.gaussian[s]] = 1
+
+    @ti.kernel
+    def _sum_tangents_of_chunks(self, alone: ti.template(), count: ti.i32, partial: ti.types.ndarray()):
+        ti.loop_config(serialize=alone)
+        for i in range(((count + CHUNK - 1) // CHUNK) * SPREAD):
+            if i % SPREAD == 0:
+                self._sum_tangents_chunk(i // SPREAD, count, partial)
+
+    @ti.func
+    def _sum_tangents_chunk(self, chunk, count, partial: ti.template()):
+        total = ti.Vector.zero(self.projected.real, 6)
+        for s in range(chunk * CHUNK, ti.min(count, (chunk + 1) * CHUNK)):
+            total += self.projected.tangent.grad[s]
+        for c in ti.static(range(6)):
+            partial[chunk, c] = total[c]

@@ -1,0 +1,155 @@
+"""Binning on a GPU: pairs are emitted slot by slot, nearest first; a stable sort by tile keeps their order."""
+
+from collections import deque
+
+import taichi as ti
+import torch
+
+from fields.buffers.device_pairs import NO_TILE, TILE_HEIGHT, TILE_WIDTH, DevicePairs
+from fields.buffers.projected import ProjectedGaussians
+from fields.buffers.view import ViewField
+from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.backend import torch_device
+from fields.runtime.compiled_kernel import CompiledKernel
+from pipelines.render.cpu.binning import Binning
+
+__all__ = ["DeviceBinning"]
+
+# Room for pairs: so many times the largest total of so many views before. A view that has more loses its farthest ones.
+MARGIN, MEMORY = 1.5, 64
+# Views after which a total is looked at: it has arrived by then, and always the same view's makes room.
+PATIENCE = 2
+
+
+@ti.data_oriented
+class DeviceBinning(Binning):
+    """Fills `pairs` from `projected` for the view in `view`."""
+
+    tile_width, tile_height = TILE_WIDTH, TILE_HEIGHT
+
+    def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs) -> None:
+        self.view = view
+        self.projected = projected
+        self.pairs = pairs
+        self._count_tiles, self._emit_pairs = CompiledKernel(self._count_all), CompiledKernel(self._emit)
+        self._arrange_pairs = CompiledKernel(self._arrange)
+        self._totals: deque[AsyncReadback] = deque()
+        self._known: deque[int] = deque(maxlen=MEMORY)
+        self._counts = torch.empty(0, dtype=torch.int32, device=torch_device())
+
+    def forward(self, exact: bool = True) -> None:
+        """Bin the projected Gaussians of the current view.
+
+        exact: wait for the number of pairs, and make room for all. Otherwise the room follows the views before, and
+        what is beyond it is left out. Raises ValueError where there are more pairs than can ever be held.
+        """
+        tiles_x = -(-self.view.width // TILE_WIDTH)
+        tiles_y = -(-self.view.height // TILE_HEIGHT)
+        n, pairs = self.projected.count, self.pairs
+        if n == 0:
+            self._clear(tiles_x * tiles_y)
+            return
+        if len(self._counts) < n:
+            self._counts = torch.empty(1 << (n - 1).bit_length(), dtype=torch.int32, device=torch_device())
+        counts = self._counts[:n]
+        self._count_tiles(tiles_x, tiles_y, counts)
+        ends = torch.cumsum(counts, 0)
+        self._make_room(ends, exact)
+        no_tile = NO_TILE[pairs.key.dtype]
+        used = pairs.key[: pairs.room]
+        self._emit_pairs(pairs.room, no_tile, tiles_x, tiles_y, ends, used, pairs.emitted_slot)
+        key, pairs.origin = torch.sort(used, stable=True)
+        self._arrange_pairs(tiles_x * tiles_y, tiles_x, key, pairs.origin, pairs.emitted_slot, pairs.slot, pairs.rows)
+
+    def _make_room(self, ends: torch.Tensor, exact: bool) -> None:
+        self._totals.append(AsyncReadback(ends[-1:]))
+        # The first view has none before it.
+        exact = exact or not self._known
+        while self._totals and (exact or len(self._totals) > PATIENCE):
+            self._known.append(int(self._totals.popleft().numpy()[0]))
+        if exact and self._known[-1] > self.pairs.max_pairs:
+            raise ValueError(
+                f"{self._known[-1]} tile pairs exceed the room for {self.pairs.max_pairs}; the map is degenerate"
+            )
+        self.pairs.make_room(max(int(MARGIN * max(self._known)), 1))
+
+    @ti.kernel
+    def _clear(self, tiles: ti.i32):
+        for t in range(tiles):
+            self.pairs.first[t] = 0
+            self.pairs.tile_count[t] = 0
+            self.pairs.total[None] = 0
+
+    @ti.kernel
+    def _count_all(self, tiles_x: ti.i32, tiles_y: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+        for s in range(counts.shape[0]):
+            n = 0
+            if s < self.projected.seen[None]:
+                e = self._ellipse(s)
+                if e[4] > 0.0:
+                    rows = self._tile_rows(s, e, tiles_y)
+                    for tile_y in range(rows[0], rows[1]):
+                        columns = self._tile_columns(s, e, tile_y, tiles_x)
+                        n += ti.max(columns[1] - columns[0], 0)
+            counts[s] = n
+
+    @ti.kernel
+    def _emit(
+        self,
+        room: ti.i32,
+        no_tile: ti.i32,
+        tiles_x: ti.i32,
+        tiles_y: ti.i32,
+        ends: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        key: ti.types.ndarray(ndim=1),
+        slot: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    ):
+        for s in range(self.projected.seen[None]):
+            place = ti.i64(0)
+            if s > 0:
+                place = ends[s - 1]
+            pair = ti.cast(ti.min(place, ti.cast(room, ti.i64)), ti.i32)
+            self.projected.first_pair[s] = pair
+            e = self._ellipse(s)
+            if e[4] > 0.0 and pair < room:
+                rows = self._tile_rows(s, e, tiles_y)
+                for tile_y in range(rows[0], rows[1]):
+                    columns = self._tile_columns(s, e, tile_y, tiles_x)
+                    for tile_x in range(columns[0], ti.min(columns[1], columns[0] + room - pair)):
+                        key[pair] = tile_y * tiles_x + tile_x
+                        slot[pair] = s
+                        pair += 1
+        for pair in range(room):
+            if pair >= ends[ends.shape[0] - 1]:
+                key[pair] = no_tile
+        # What fits in 32 bits: at most a step beyond the room.
+        self.pairs.total[None] = ti.cast(ti.min(ends[ends.shape[0] - 1], ti.cast(room, ti.i64) + 1), ti.i32)
+
+    @ti.kernel
+    def _arrange(
+        self,
+        tiles: ti.i32,
+        tiles_x: ti.i32,
+        key: ti.types.ndarray(ndim=1),
+        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        emitted_slot: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        slot: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        rows: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    ):
+        for t in range(tiles):
+            self.pairs.first[t] = 0
+            self.pairs.tile_count[t] = 0
+        n = key.shape[0]
+        for k in range(n):
+            tile = ti.cast(key[k], ti.i32)
+            if tile < tiles:
+                s = emitted_slot[origin[k]]
+                slot[k] = s
+                # Here and not where pairs are emitted: every pair is a thread's, however many a Gaussian has.
+                rows[k] = self._pixel_rows(s, self._ellipse(s), tile % tiles_x, tile // tiles_x)
+                if k == 0 or ti.cast(key[ti.max(k - 1, 0)], ti.i32) != tile:
+                    self.pairs.first[tile] = k
+                if k + 1 == n or ti.cast(key[ti.min(k + 1, n - 1)], ti.i32) != tile:
+                    self.pairs.tile_count[tile] = k + 1
+        for t in range(tiles):
+            self.pairs.tile_count[t] = self.pairs.tile_count[t] - self.pairs.first[t]

@@ -1,0 +1,356 @@
+"""Compositing on a GPU: a block of threads a tile, a thread a pixel, the tile's Gaussians through shared memory.
+
+The formulas are those of `pipelines/render/cpu/compositing.py`, but a pixel closes by itself once it is opaque, not
+with its tile. The backward pass goes front to back as well, and adds without atomics, in three phases for every 16
+Gaussians:
+    A  a thread a pixel walks them and leaves weight and d loss / d power of each in shared memory,
+    B  a thread a (Gaussian, column of pixels) makes its ten sums over the rows that the ellipse reaches,
+    C  a thread a (Gaussian, sum) adds the columns.
+Against a reduction over the warps for every Gaussian (some fifty shuffles a pixel) this costs about eight accesses to
+shared memory, and the order of the sums is fixed.
+"""
+
+import taichi as ti
+import torch
+
+from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, DevicePairs
+from fields.buffers.images import PAD, ImageBuffers
+from fields.buffers.projected import ProjectedGaussians
+from fields.buffers.view import ViewField
+from fields.runtime.compiled_kernel import CompiledKernel
+from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
+from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.gpu.reductions import THREADS, max_over_block
+
+__all__ = ["DeviceCompositing"]
+
+# Gaussians that pass through shared memory together, forward and backward.
+BATCH = TILE_PIXELS
+STEP = 16
+# Numbers of a Gaussian there: mean (2), conic (3), opacity, colour (3), depth.
+WIDTH = 10
+TILE_BITS = TILE_PIXELS.bit_length() - 1
+ROW_BITS = TILE_WIDTH.bit_length() - 1
+# Places from a Gaussian's pixels to the next one's, and from a sum's columns to the next: the two Gaussians, or the 32
+# sums, of the threads of a warp then meet different banks of shared memory.
+PLANE = TILE_PIXELS + TILE_WIDTH
+COLUMNS = TILE_WIDTH + 1
+SUMS = 10
+
+assert THREADS == TILE_PIXELS == BATCH
+
+INDICES = ti.types.ndarray(dtype=ti.i32, ndim=1)
+
+
+@ti.data_oriented
+class DeviceCompositing:
+    """Composites `projected` by the lists in `pairs` into `images`, and takes gradients the other way."""
+
+    def __init__(
+        self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs, images: ImageBuffers
+    ) -> None:
+        self.view = view
+        self.projected = projected
+        self.pairs = pairs
+        self.images = images
+        self._composite, self._add_up = CompiledKernel(self._forward), CompiledKernel(self._gather)
+        self._differentiate = {False: CompiledKernel(self._backward), True: CompiledKernel(self._backward_with_depth)}
+        self._no_indices = torch.zeros(1, dtype=torch.int32, device=pairs.device)
+
+    def forward(self) -> None:
+        """Fill `images.colour`, `.depth` and `.opacity`."""
+        pairs, any_pairs = self.pairs, self.pairs.capacity > 0
+        slot, rows = (pairs.slot, pairs.rows) if any_pairs else (self._no_indices, self._no_indices)
+        self._composite(self.view.width, self.view.height, slot, rows)
+
+    def backward(self, with_depth: bool = False) -> None:
+        """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
+        pairs = self.pairs
+        if self.projected.count:
+            width, height = self.view.width, self.view.height
+            differentiate = self._differentiate[with_depth]
+            differentiate(width, height, pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
+            self._add_up(pairs.room, pairs.gradient)
+
+    @ti.func
+    def _load(self, store: ti.template(), place, s):
+        """Put what compositing reads of slot s into shared memory."""
+        mean, conic = self.projected.mean[s], self.projected.conic[s]
+        colour = self.projected.colour[s]
+        store[place] = mean[0]
+        store[place + 1] = mean[1]
+        store[place + 2] = -0.5 * conic[0]
+        store[place + 3] = -conic[1]
+        store[place + 4] = -0.5 * conic[2]
+        store[place + 5] = self.projected.opacity[s]
+        store[place + 6] = colour[0]
+        store[place + 7] = colour[1]
+        store[place + 8] = colour[2]
+        store[place + 9] = self.projected.depth[s]
+
+    @ti.kernel
+    def _forward(self, width: ti.i32, height: ti.i32, slot: INDICES, rows: INDICES):
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range(tiles * TILE_PIXELS):
+            splats = ti.simt.block.SharedArray((BATCH * WIDTH,), ti.f32)
+            spans = ti.simt.block.SharedArray((BATCH,), ti.i32)
+            # Whether a pixel of the tile is still open, in turns for the batches.
+            open_pixels = ti.simt.block.SharedArray((2,), ti.i32)
+            tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
+            row = thread >> ROW_BITS
+            x = tile % tiles_x * TILE_WIDTH + thread % TILE_WIDTH
+            y = tile // tiles_x * TILE_HEIGHT + row
+            inside = (x < width) & (y < height)
+            px, py = ti.cast(x, ti.f32) + 0.5, ti.cast(y, ti.f32) + 0.5
+            first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
+            T, red, green, blue, z = 1.0, 0.0, 0.0, 0.0, 0.0
+            counted = 0
+            # The block may come from another tile, whose threads are not all done with shared memory.
+            ti.simt.block.sync()
+            if thread == 0:
+                open_pixels[0] = 0
+                open_pixels[1] = 0
+            start = 0
+            going = count > 0
+            while going:
+                if start + thread < count:
+                    k = first + start + thread
+                    self._load(splats, thread * WIDTH, slot[k])
+                    spans[thread] = rows[k]
+                ti.simt.block.sync()
+                turn = start // BATCH % 2
+                for j in range(ti.select(inside, ti.min(BATCH, count - start), 0)):
+                    at = j * WIDTH
+                    if T > OPAQUE and row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
+                        dx, dy = px - splats[at], py - splats[at + 1]
+                        power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
+                        alpha = ti.min(splats[at + 5] * ti.exp(power), ALPHA_MAX)
+                        if alpha >= ALPHA_MIN:
+                            weight = alpha * T
+                            red += weight * splats[at + 6]
+                            green += weight * splats[at + 7]
+                            blue += weight * splats[at + 8]
+                            z += weight * splats[at + 9]
+                            T -= weight
+                            counted = start + j + 1
+                if inside and T > OPAQUE:
+                    open_pixels[turn] = 1
+                ti.simt.block.sync()
+                start += BATCH
+                going = start < count and open_pixels[turn] == 1
+                # That of the next batch, which nobody reads before the next barrier.
+                if thread == 0:
+                    open_pixels[1 - turn] = 0
+            # All threads are behind the last batch, whose rows the counts overwrite.
+            spans[thread] = counted
+            max_over_block(spans, thread)
+            if thread == 0:
+                self.pairs.reached[tile] = spans[0]
+            if inside:
+                plane = ti.static(self.images.plane)
+                target = (y + PAD) * self.images.stride + x + PAD
+                background = self.images.background[None]
+                self.images.colour[target] = red + T * background[0]
+                self.images.colour[target + plane] = green + T * background[1]
+                self.images.colour[target + 2 * plane] = blue + T * background[2]
+                self.images.depth[target] = z
+                self.images.opacity[target] = 1.0 - T
+
+    @ti.kernel
+    def _backward(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        slot: INDICES,
+        rows: INDICES,
+        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        gradient: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    ):
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range(tiles * TILE_PIXELS):
+            self._backward_pixel(i, width, height, slot, rows, origin, gradient, False)
+
+    @ti.kernel
+    def _backward_with_depth(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        slot: INDICES,
+        rows: INDICES,
+        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        gradient: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    ):
+        tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range(tiles * TILE_PIXELS):
+            self._backward_pixel(i, width, height, slot, rows, origin, gradient, True)
+
+    @ti.func
+    def _backward_pixel(
+        self,
+        i,
+        width,
+        height,
+        slot: ti.template(),
+        rows: ti.template(),
+        origin: ti.template(),
+        gradient: ti.template(),
+        with_depth: ti.template(),
+    ):
+        splats = ti.simt.block.SharedArray((STEP * WIDTH,), ti.f32)
+        spans = ti.simt.block.SharedArray((STEP,), ti.i32)
+        origins = ti.simt.block.SharedArray((STEP,), ti.i32)
+        image_grad = ti.simt.block.SharedArray(((3 + with_depth) * TILE_PIXELS,), ti.f32)
+        # Weights of phase A, and after phase B has read them its sums.
+        weights = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
+        power_grads = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
+
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        # Shifts and masks, by which LLVM sees that no index overflows.
+        tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
+        row, column = thread >> ROW_BITS, thread & (TILE_WIDTH - 1)
+        left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
+        x, y = left + column, top + row
+        inside = (x < width) & (y < height)
+        px, py = ti.cast(x, ti.f32) + 0.5, ti.cast(y, ti.f32) + 0.5
+        plane = ti.static(self.images.plane)
+        red_grad, green_grad, blue_grad, z_grad, behind = 0.0, 0.0, 0.0, 0.0, 0.0
+        # A pixel beyond the image is opaque from the start.
+        T = 0.0
+        if inside:
+            source = (y + PAD) * self.images.stride + x + PAD
+            T = 1.0
+            red_grad = self.images.colour_grad[source]
+            green_grad = self.images.colour_grad[source + plane]
+            blue_grad = self.images.colour_grad[source + 2 * plane]
+            behind = (
+                red_grad * self.images.colour[source]
+                + green_grad * self.images.colour[source + plane]
+                + blue_grad * self.images.colour[source + 2 * plane]
+                - self.images.opacity_grad[source] * (1.0 - self.images.opacity[source])
+            )
+            if ti.static(with_depth):
+                z_grad = self.images.depth_grad[source]
+                behind += z_grad * self.images.depth[source]
+        # The block may come from another tile, whose threads are not all done with shared memory.
+        ti.simt.block.sync()
+        image_grad[thread] = red_grad
+        image_grad[TILE_PIXELS + thread] = green_grad
+        image_grad[2 * TILE_PIXELS + thread] = blue_grad
+        if ti.static(with_depth):
+            image_grad[3 * TILE_PIXELS + thread] = z_grad
+
+        first, count, reached = self.pairs.first[tile], self.pairs.tile_count[tile], self.pairs.reached[tile]
+        for step in range((reached + STEP - 1) // STEP):
+            start = step * STEP
+            here = ti.min(STEP, reached - start)
+            if thread < here:
+                k = first + start + thread
+                self._load(splats, thread * WIDTH, slot[k])
+                spans[thread] = rows[k]
+                origins[thread] = ti.cast(origin[k], ti.i32)
+            ti.simt.block.sync()
+
+            for j in range(here):
+                at = j * WIDTH
+                if row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
+                    weight, power_grad = 0.0, 0.0
+                    dx, dy = px - splats[at], py - splats[at + 1]
+                    power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
+                    unclamped = splats[at + 5] * ti.exp(power)
+                    alpha = ti.min(unclamped, ALPHA_MAX)
+                    if alpha >= ALPHA_MIN and T > OPAQUE:
+                        weight = alpha * T
+                        shade = splats[at + 6] * red_grad + splats[at + 7] * green_grad + splats[at + 8] * blue_grad
+                        if ti.static(with_depth):
+                            shade += splats[at + 9] * z_grad
+                        contribution = weight * shade
+                        behind -= contribution
+                        T -= weight
+                        # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
+                        if unclamped <= ALPHA_MAX:
+                            power_grad = contribution - behind * alpha / (1.0 - alpha)
+                    weights[j * PLANE + thread] = weight
+                    power_grads[j * PLANE + thread] = power_grad
+            ti.simt.block.sync()
+
+            # Phase B: this thread's Gaussian and column of pixels.
+            g = thread >> ROW_BITS
+            sums = ti.Vector.zero(ti.f32, SUMS)
+            if g < here:
+                dx = px - splats[g * WIDTH]
+                dy = ti.cast(top, ti.f32) + 0.5 - splats[g * WIDTH + 1]
+                s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
+                s, s_y, s_yy = 0.0, 0.0, 0.0
+                for r in range(spans[g] & 0xFFFF, spans[g] >> 16):
+                    at = ((r << ROW_BITS) & (TILE_PIXELS - 1)) | column
+                    weight = weights[g * PLANE + at]
+                    power_grad = power_grads[g * PLANE + at]
+                    s_red += weight * image_grad[at]
+                    s_green += weight * image_grad[TILE_PIXELS + at]
+                    s_blue += weight * image_grad[2 * TILE_PIXELS + at]
+                    if ti.static(with_depth):
+                        s_z += weight * image_grad[3 * TILE_PIXELS + at]
+                    down = dy + ti.cast(r, ti.f32)
+                    u = power_grad * down
+                    s += power_grad
+                    s_y += u
+                    s_yy += u * down
+                sums = ti.Vector([s_red, s_green, s_blue, s_z, s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy])
+            ti.simt.block.sync()
+            for c in ti.static(range(SUMS)):
+                weights[(g * SUMS + c) * COLUMNS + column] = sums[c]
+            ti.simt.block.sync()
+
+            # Phase C: this thread's Gaussian and sum.
+            if thread < here * SUMS:
+                total = 0.0
+                for q in range(TILE_WIDTH):
+                    total += weights[thread * COLUMNS + q]
+                gradient[origins[thread // SUMS] * SUMS + thread % SUMS] = total
+            ti.simt.block.sync()
+        for k in range((count - reached) * SUMS // TILE_PIXELS + 1):
+            entry = k * TILE_PIXELS + thread
+            if entry < (count - reached) * SUMS:
+                place = ti.cast(origin[first + reached + entry // SUMS], ti.i32)
+                gradient[place * SUMS + entry % SUMS] = 0.0
+
+    @ti.kernel
+    def _gather(self, room: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+        """Sum every slot's pairs, in their order, into the gradients of what was composited.
+
+        Sixteen threads a slot, ten of them with a sum each: together they read a pair's gradient at once.
+        """
+        ti.loop_config(block_dim=TILE_PIXELS)
+        for i in range((self.projected.seen[None] + 15) // 16 * TILE_PIXELS):
+            totals = ti.simt.block.SharedArray((TILE_PIXELS,), ti.f32)
+            s, c = i // 16, i % 16
+            seen = self.projected.seen[None]
+            total = 0.0
+            if s < seen and c < SUMS:
+                end = ti.min(self.pairs.total[None], room)
+                if s + 1 < seen:
+                    end = self.projected.first_pair[s + 1]
+                for k in range(self.projected.first_pair[s], end):
+                    total += gradient[k * SUMS + c]
+            totals[i % TILE_PIXELS] = total
+            ti.simt.block.sync()
+            if s < seen and c == 0:
+                at = i % TILE_PIXELS
+                conic = self.projected.conic[s]
+                self.projected.colour.grad[s] = ti.Vector([totals[at], totals[at + 1], totals[at + 2]])
+                self.projected.depth.grad[s] = totals[at + 3]
+                self.projected.opacity.grad[s] = totals[at + 4] / ti.max(self.projected.opacity[s], 1e-12)
+                self.projected.mean.grad[s] = ti.Vector(
+                    [
+                        conic[0] * totals[at + 5] + conic[1] * totals[at + 6],
+                        conic[1] * totals[at + 5] + conic[2] * totals[at + 6],
+                    ]
+                )
+                self.projected.conic.grad[s] = ti.Vector(
+                    [-0.5 * totals[at + 7], -totals[at + 8], -0.5 * totals[at + 9]]
+                )
+            ti.simt.block.sync()

@@ -1,0 +1,90 @@
+"""The photometric model on a GPU: a thread a pixel; the gradient of the exposure is summed on the device."""
+
+import numpy as np
+import taichi as ti
+import torch
+
+from fields.buffers.images import PAD, ImageBuffers
+from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.backend import torch_device, without_waiting
+from fields.runtime.compiled_kernel import CompiledKernel
+from pipelines.render.cpu.photometric_model import PhotometricModel
+from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
+
+__all__ = ["DevicePhotometricModel"]
+
+NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
+
+
+@ti.data_oriented
+class DevicePhotometricModel(PhotometricModel):
+    """Develops `images.colour` in place, and takes `images.colour_grad` the other way; see `PhotometricModel`."""
+
+    def __init__(self, images: ImageBuffers) -> None:
+        super().__init__(images)
+        blocks = -(-images.max_width * images.max_height // THREADS)
+        self._partial = torch.zeros(12 * blocks, dtype=torch.float32, device=torch_device())
+        self._forward_pixels, self._backward_pixels = (
+            CompiledKernel(self._develop_pixels),
+            CompiledKernel(self._undevelop_pixels),
+        )
+        self._sum = BlockSums(12)
+        self._gradient = torch.zeros(12, dtype=torch.float32, device=torch_device())
+
+    def exposure_gradient(self) -> np.ndarray:
+        """d loss / d (A, b) (3, 4) of the picture that was developed last, after `backward`. Waits for the device."""
+        return self.async_exposure_gradient().numpy().astype(np.float64)
+
+    def async_exposure_gradient(self) -> AsyncReadback:
+        """The same in float32, on its way."""
+        return AsyncReadback(self._gradient.view(3, 4))
+
+    def _develop(self) -> None:
+        self._numbers = without_waiting(self._exposure.astype(np.float32).ravel())
+        self._forward_pixels(self.images.width, self.images.height, self._numbers)
+
+    def _undevelop(self) -> None:
+        width, height = self.images.width, self.images.height
+        self._backward_pixels(width, height, self._numbers, self._partial)
+        self._sum(-(-width * height // THREADS), self._partial, self._gradient)
+
+    @ti.kernel
+    def _develop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS):
+        for i in range(width * height):
+            plane = ti.static(self.images.plane)
+            p = (i // width + PAD) * self.images.stride + i % width + PAD
+            red, green, blue = self.images.colour[p], self.images.colour[plane + p], self.images.colour[2 * plane + p]
+            self.rendered[p], self.rendered[plane + p], self.rendered[2 * plane + p] = red, green, blue
+            for c in ti.static(range(3)):
+                developed = exposure[4 * c] * red + exposure[4 * c + 1] * green + exposure[4 * c + 2] * blue
+                developed += exposure[4 * c + 3]
+                self.images.colour[c * plane + p] = developed * self.vignette[c * plane + p]
+
+    @ti.kernel
+    def _undevelop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS, partial: NUMBERS):
+        blocks = (width * height + THREADS - 1) // THREADS
+        ti.loop_config(block_dim=THREADS)
+        for i in range(blocks * THREADS):
+            store = ti.simt.block.SharedArray((12 * THREADS,), ti.f32)
+            plane = ti.static(self.images.plane)
+            thread = i & (THREADS - 1)
+            # The block may come from other pixels, whose sums are not all read.
+            ti.simt.block.sync()
+            for c in ti.static(range(12)):
+                store[c * THREADS + thread] = 0.0
+            if i < width * height:
+                p = (i // width + PAD) * self.images.stride + i % width + PAD
+                rendered, h = ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3)
+                for c in ti.static(range(3)):
+                    rendered[c] = self.rendered[c * plane + p]
+                    h[c] = self.images.colour_grad[c * plane + p] * self.vignette[c * plane + p]
+                for c in ti.static(range(3)):
+                    for j in ti.static(range(3)):
+                        store[(4 * c + j) * THREADS + thread] = h[c] * rendered[j]
+                    store[(4 * c + 3) * THREADS + thread] = h[c]
+                    back = exposure[c] * h[0] + exposure[4 + c] * h[1] + exposure[8 + c] * h[2]
+                    self.images.colour_grad[c * plane + p] = back
+                    self.images.colour[c * plane + p] = rendered[c]
+            sum_over_block(store, thread, 12)
+            if thread < 12:
+                partial[(i >> THREAD_BITS) * 12 + thread] = store[thread * THREADS]

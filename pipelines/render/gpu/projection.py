@@ -1,0 +1,102 @@
+"""Projection on a GPU: depths sorted on the device, the number of visible Gaussians known only there."""
+
+import numpy as np
+import taichi as ti
+import torch
+
+from fields.buffers.projected import ProjectedGaussians
+from fields.buffers.view import ViewField
+from fields.map.gaussians import GaussianField
+from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.backend import torch_device
+from fields.runtime.compiled_kernel import CompiledKernel
+from pipelines.render.cpu.projection import Projection
+from pipelines.render.gpu.reductions import THREADS, sum_over_block
+
+__all__ = ["DeviceProjection"]
+
+# Sorts behind every depth. No infinity: Taichi compiles as if there were none.
+UNSEEN = 3e38
+
+
+@ti.data_oriented
+class DeviceProjection(Projection):
+    """Culls, orders and projects the Gaussians of `gaussians` for the view in `view` into `projected`.
+
+    The differentiable kernels are those of the CPU.
+    """
+
+    def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
+        self.gaussians = gaussians
+        self.view = view
+        self.projected = projected
+        self._depths = torch.empty(0, dtype=torch.float32, device=torch_device())
+        self._cull, self._assign = CompiledKernel(self._cull_all), CompiledKernel(self._assign_sorted)
+        self._sum_tangents = CompiledKernel(self._sum_all_tangents)
+        self._prepare_differentiable()
+        self._tangent = torch.zeros(6, dtype=torch.float32, device=torch_device())
+
+    def forward(self) -> int:
+        """Fill `projected` for the current view; return an upper bound of how many Gaussians it sees."""
+        self.projected.count = n = self.gaussians.count
+        if n == 0:
+            self._none_seen()
+            return 0
+        if len(self._depths) < n:
+            self._depths = torch.empty(1 << (n - 1).bit_length(), dtype=torch.float32, device=torch_device())
+        depths = self._depths[:n]
+        self._cull(depths)
+        # Stable: equal depths stay in the Gaussians' order.
+        ordered, gaussian = torch.sort(depths, stable=True)
+        self._assign(ordered, gaussian)
+        self._project(n)
+        self._shade(n)
+        return n
+
+    def camera_gradient(self) -> np.ndarray:
+        """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order. Waits for the device."""
+        return self.async_camera_gradient().numpy().astype(np.float64)
+
+    def async_camera_gradient(self) -> AsyncReadback:
+        """The same in float32, on its way."""
+        self._sum_tangents(self._tangent)
+        return AsyncReadback(self._tangent)
+
+    @ti.kernel
+    def _none_seen(self):
+        self.projected.seen[None] = 0
+
+    @ti.kernel
+    def _cull_all(self, depths: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+        for i in range(depths.shape[0]):
+            camera, stretch = self._camera()
+            depth = self._seen_at(i, camera, stretch)
+            depths[i] = ti.select(depth > 0.0, depth, UNSEEN)
+
+    @ti.kernel
+    def _assign_sorted(
+        self, depths: ti.types.ndarray(dtype=ti.f32, ndim=1), gaussian: ti.types.ndarray(dtype=ti.i64, ndim=1)
+    ):
+        n = depths.shape[0]
+        for s in range(n):
+            if depths[s] < UNSEEN:
+                self.projected.gaussian[s] = ti.cast(gaussian[s], ti.i32)
+                self.projected.tangent[s].fill(0.0)
+                if s + 1 == n or depths[ti.min(s + 1, n - 1)] >= UNSEEN:
+                    self.projected.seen[None] = s + 1
+            elif s == 0:
+                self.projected.seen[None] = 0
+
+    @ti.kernel
+    def _sum_all_tangents(self, out: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+        ti.loop_config(block_dim=THREADS)
+        for thread in range(THREADS):
+            partial = ti.simt.block.SharedArray((6 * THREADS,), ti.f32)
+            total = ti.Vector.zero(ti.f32, 6)
+            for k in range((self.projected.seen[None] - thread + THREADS - 1) // THREADS):
+                total += self.projected.tangent.grad[thread + k * THREADS]
+            for c in ti.static(range(6)):
+                partial[c * THREADS + thread] = total[c]
+            sum_over_block(partial, thread, 6)
+            if thread < 6:
+                out[thread] = partial[thread * THREADS]

@@ -1,0 +1,246 @@
+"""`rasterize`: the renderer as a differentiable function of PyTorch tensors."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import taichi as ti
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import hat, orthonormalised
+from fields.map.gaussians import SH_C0, GaussianField
+from fields.runtime.backend import on_gpu, program, torch_device
+from pipelines.render.renderer import Renderer
+
+__all__ = ["RasterizedView", "rasterize"]
+
+REAL = {torch.float32: ti.f32, torch.float64: ti.f64}
+# What Taichi's allocator is good for (docs/method.md); on the CPU memory follows what is used.
+MAX_GAUSSIANS = 1_500_000
+# Fields that Taichi 1.7.4 holds without writing beyond its memory; a third on the CPU has ended the process.
+MAX_KEPT = 2
+# Entries by which a pose may miss being rigid: rounding and drift, but no scale and no shear.
+MAX_DRIFT = 1e-3
+
+
+class RasterizedView(NamedTuple):
+    """image (H, W, 3) not clipped, depth (H, W) as the weighted sum of z, opacity (H, W)."""
+
+    image: Tensor
+    depth: Tensor
+    opacity: Tensor
+
+
+def rasterize(
+    position: Tensor,
+    log_scale: Tensor,
+    quaternion: Tensor,
+    opacity_logit: Tensor,
+    sh: Tensor | None = None,
+    *,
+    T_camera_world: Tensor,
+    camera: PinholeCamera,
+    colour: Tensor | None = None,
+    background: Tensor | None = None,
+    near: float = 0.01,
+) -> RasterizedView:
+    """The picture of N Gaussians, differentiable by every tensor. `initialise` must have been called.
+
+    position (N, 3); log_scale (N, 3); quaternion (N, 4) as w, x, y, z of any length but zero; opacity_logit (N,);
+    sh (N, K, 3) with K of 1, 4, 9 or 16: the stored form of 3DGS files, as `read_splats` gives it. Or, instead of sh,
+    colour (N, 3), the same from everywhere; what is below 0 is drawn as 0. All float32, or all float64 (CPU only), on
+    the device that `initialise` took.
+
+    T_camera_world (4, 4), world to camera, OpenCV axes, of either type, on any device: taken as the rigid motion
+    nearest to it. Its gradient is therefore tangent to SE(3): right for whatever pose it was computed from, such as
+    `torch_exp_se3(xi) @ T`, and with no part along which T would stop being rigid. A plain gradient step on T itself
+    leaves SE(3) to the second order.
+
+    background (3,): seen where nothing is, black by default. near: depth [scene units] below which nothing is drawn.
+
+    The fields behind it are kept between calls, a set for each type, number of harmonics, and doubling of the largest
+    image: there is room for two, so begin with the largest. `backward` renders anew where another picture has been
+    drawn since; it cannot itself be differentiated. On CUDA all happens on the default stream.
+
+    Raises TypeError or ValueError, in one line, for types, shapes, devices and values that do not fit, and RuntimeError
+    before `initialise` and where there is no room.
+    """
+    program()
+    if (sh is None) == (colour is None):
+        raise TypeError("rasterize takes either sh or colour")
+    tensors = {"position": position, "log_scale": log_scale, "quaternion": quaternion, "opacity_logit": opacity_logit}
+    tensors |= {"sh": sh} if colour is None else {"colour": colour}
+    _check(tensors, T_camera_world, background)
+    if colour is not None:
+        sh = ((colour - 0.5) / SH_C0)[:, None]
+    image, depth, opacity = _Rasterize.apply(
+        position, log_scale, quaternion, opacity_logit, sh, T_camera_world, camera, float(near)
+    )
+    if background is not None:
+        image = image + (1.0 - opacity)[..., None] * background
+    return RasterizedView(image, depth, opacity)
+
+
+def _check(tensors: dict[str, Tensor], T_camera_world: Tensor, background: Tensor | None) -> None:
+    """Raise for the first tensor that does not fit the others or the device."""
+    given = tensors | {"T_camera_world": T_camera_world}
+    given |= {} if background is None else {"background": background}
+    for name, tensor in given.items():
+        if not isinstance(tensor, Tensor):
+            raise TypeError(f"{name} is a {type(tensor).__name__}, expected a torch.Tensor")
+        if tensor.dtype not in REAL:
+            raise TypeError(f"{name} is {_kind(tensor)}, expected float32 or float64")
+    kind, device = tensors["position"].dtype, torch_device()
+    if kind == torch.float64 and on_gpu():
+        raise TypeError("position is float64, which the GPU's kernels do not have: use float32, or the CPU")
+    for name, tensor in given.items():
+        if name == "T_camera_world":
+            continue
+        if tensor.dtype != kind:
+            raise TypeError(f"{name} is {_kind(tensor)}, position {_kind(tensors['position'])}: give all in one type")
+        if tensor.device.type != device.type:
+            raise ValueError(
+                f"{name} lies on {tensor.device}, the kernels run on {device}: move it there, or initialise another"
+            )
+    n = tensors["position"].shape[0] if tensors["position"].ndim else 0
+    shapes = {"position": (n, 3), "log_scale": (n, 3), "quaternion": (n, 4), "opacity_logit": (n,), "colour": (n, 3)}
+    shapes |= {"T_camera_world": (4, 4), "background": (3,)}
+    for name, tensor in given.items():
+        shape = tuple(tensor.shape)
+        if name == "sh":
+            if shape not in [(n, k, 3) for k in (1, 4, 9, 16)]:
+                raise ValueError(f"sh has shape {shape}, expected ({n}, K, 3) with K of 1, 4, 9 or 16")
+        elif shape != shapes[name]:
+            raise ValueError(f"{name} has shape {shape}, expected {shapes[name]}")
+        finite = torch.isfinite(tensor.detach())
+        if not finite.all():
+            at = "" if name not in tensors else f" of Gaussian {int((~finite).nonzero()[0, 0])}"
+            raise ValueError(f"{name}{at} is not finite")
+    zero = (tensors["quaternion"].detach() == 0).all(dim=1)
+    if zero.any():
+        raise ValueError(f"quaternion of Gaussian {int(zero.nonzero()[0, 0])} is zero")
+
+
+def _kind(tensor: Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")
+
+
+def _rigid(T_camera_world: Tensor) -> NDArray[np.float64]:
+    """The rigid motion (4, 4) nearest to a pose. Raises ValueError where that is far."""
+    T = T_camera_world.detach().cpu().numpy().astype(np.float64)
+    rigid = orthonormalised(T)
+    rigid[3] = 0.0, 0.0, 0.0, 1.0
+    if np.abs(T - rigid).max() > MAX_DRIFT:
+        raise ValueError(
+            f"T_camera_world is no rigid motion: an entry is {np.abs(T - rigid).max():.2g} off; "
+            "optimise a tangent, T = torch_exp_se3(xi) @ T"
+        )
+    return rigid
+
+
+class _Rasterizer:
+    """The fields of one type and SH degree, of images up to a size.
+
+    owner: the program that they are fields of. drawn: counts the pictures, of which the last one stands.
+    """
+
+    def __init__(self, degree: int, kind: torch.dtype, width: int, height: int) -> None:
+        self.owner = program()
+        self.gaussians = GaussianField(degree, MAX_GAUSSIANS, REAL[kind])
+        self.renderer = Renderer(self.gaussians, width, height)
+        self.kind, self.width, self.height = kind, width, height
+        self.drawn = 0
+
+    def fits(self, degree: int, kind: torch.dtype, camera: PinholeCamera) -> bool:
+        fits = camera.width <= self.width and camera.height <= self.height
+        return fits and (degree, kind) == (self.gaussians.sh_degree, self.kind)
+
+    def draw(self, tensors: list[Tensor], T: NDArray[np.float64], camera: PinholeCamera, near: float) -> None:
+        self.gaussians.take(tensors)
+        self.renderer.forward(camera, T, near)
+        self.drawn += 1
+
+
+_rasterizers: list[_Rasterizer] = []
+
+
+def _rasterizer(kind: torch.dtype, sh_count: int, camera: PinholeCamera) -> _Rasterizer:
+    """The one that is there for this, or a new one, of the sizes that image buffers have in any case."""
+    if any(rasterizer.owner is not program() for rasterizer in _rasterizers):
+        _rasterizers.clear()
+    degree = int(np.sqrt(sh_count)) - 1
+    for found in _rasterizers:
+        if found.fits(degree, kind, camera):
+            return found
+    if len(_rasterizers) == MAX_KEPT:
+        raise RuntimeError(
+            f"rasterize keeps fields for {MAX_KEPT} types, SH degrees or doublings of the image size, and this is "
+            "another: begin with the largest image, or call modp_ti.initialise(), which frees all fields"
+        )
+    width, height = max(64, 1 << (camera.width - 1).bit_length()), -(-camera.height // 256) * 256
+    _rasterizers.append(_Rasterizer(degree, kind, width, height))
+    return _rasterizers[-1]
+
+
+class _Rasterize(torch.autograd.Function):
+    """position, log_scale, quaternion, opacity_logit, sh, T_camera_world -> image, depth, opacity."""
+
+    @staticmethod
+    def forward(ctx, *arguments) -> tuple[Tensor, Tensor, Tensor]:
+        *inputs, camera, near = arguments
+        ctx.camera, ctx.near, ctx.pose = camera, near, _rigid(inputs[5])
+        ctx.save_for_backward(*inputs)
+        ctx.set_materialize_grads(False)
+        rasterizer = _draw(ctx, inputs)
+        ctx.rasterizer, ctx.drawn = rasterizer, rasterizer.drawn
+        size = camera.height, camera.width
+        like = {"dtype": inputs[0].dtype, "device": inputs[0].device}
+        outputs = torch.empty(*size, 3, **like), torch.empty(size, **like), torch.empty(size, **like)
+        rasterizer.renderer.images.read_into(*outputs)
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        rasterizer = ctx.rasterizer
+        # Another picture may have been drawn since, or Taichi been started anew.
+        if rasterizer.owner is not program() or rasterizer.drawn != ctx.drawn:
+            rasterizer = _draw(ctx, inputs)
+        with_depth = gradients[1] is not None
+        size, like = (ctx.camera.height, ctx.camera.width), inputs[0]
+        shapes = (*size, 3), size, size
+        gradients = [
+            like.new_zeros(shape) if gradient is None else gradient.to(like.dtype).contiguous()
+            for shape, gradient in zip(shapes, gradients, strict=True)
+        ]
+        renderer, gaussians = rasterizer.renderer, rasterizer.gaussians
+        gaussians.clear_gradients()
+        renderer.images.set_gradients(*gradients)
+        renderer.backward(with_depth)
+        outputs = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs[:5]]
+        gaussians.gradients_into(outputs)
+        return *outputs, _pose_gradient(renderer.camera_gradient(), ctx.pose, inputs[5]), None, None
+
+
+def _draw(ctx, inputs: list[Tensor]) -> _Rasterizer:
+    rasterizer = _rasterizer(inputs[0].dtype, inputs[4].shape[1], ctx.camera)
+    rasterizer.draw([tensor.detach().contiguous() for tensor in inputs[:5]], ctx.pose, ctx.camera, ctx.near)
+    return rasterizer
+
+
+def _pose_gradient(tangent: NDArray[np.float64], T: NDArray[np.float64], like: Tensor) -> Tensor:
+    """d loss / d T (4, 4) from that by the tangent (6,) on the left of T.
+
+    T enters by its nearest rigid motion, whose derivative projects dR onto the tangents [omega]x R. G is the one
+    tangent itself with <G, d(exp(xi) T)> = tangent . xi for every xi.
+    """
+    G = np.zeros((4, 4))
+    G[:3, 3] = tangent[:3]
+    G[:3, :3] = 0.5 * hat(tangent[3:] - np.cross(T[:3, 3], tangent[:3])) @ T[:3, :3]
+    return torch.from_numpy(G).to(like)

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import exp_se3
+from fields.geometry.similarity import motion_around
+from fields.map.keyframes import KeyframeStore
+
+CAMERA = PinholeCamera(10.0, 40.0, 4.0, 3.0, 8, 6)
+
+
+def frame(index: int, depths: tuple[float, ...] = (2.0, 4.0, 6.0), T: np.ndarray | None = None) -> TrackedFrame:
+    """A frame whose points lie at the given depths on the optical axis."""
+    T = np.eye(4) if T is None else T
+    camera_points = np.array([[0.0, 0.0, z] for z in depths]).reshape(-1, 3)
+    xyz = (camera_points - T[:3, 3]) @ T[:3, :3]
+    points = SparsePoints(xyz, np.full((len(xyz), 2), 3.0), np.arange(len(xyz)))
+    return TrackedFrame(index, index / 30, f"{index}", np.zeros((6, 8, 3), np.float32), CAMERA, T, points)
+
+
+def test_a_view_has_the_scale_of_a_pixel_at_its_median_depth() -> None:
+    keyframe = KeyframeStore().append(frame(0, T=exp_se3([1, 2, 3, 0.1, 0.2, 0.3])))
+    assert keyframe.median_depth == pytest.approx(4.0)
+    assert keyframe.view_scale == pytest.approx(4.0 / 20.0)
+
+
+def test_points_behind_the_camera_have_no_say() -> None:
+    assert KeyframeStore().append(frame(0, (-5.0, 3.0, -7.0))).median_depth == pytest.approx(3.0)
+
+
+def test_the_scene_depth_is_the_median_over_keyframes() -> None:
+    store = KeyframeStore()
+    for index, depth in enumerate((1.0, 9.0, 2.0)):
+        store.append(frame(index, (depth,)))
+    assert store.scene_depth == pytest.approx(2.0)
+    assert store.append(frame(3, ())).median_depth == pytest.approx(2.0)
+
+
+def test_a_new_keyframe_starts_at_the_mean_error_and_the_first_at_one() -> None:
+    store = KeyframeStore()
+    first, second = store.append(frame(0)), store.append(frame(1))
+    assert (first.error, second.error) == (1.0, 1.0)
+    first.error, second.error = 0.1, 0.3
+    assert store.append(frame(2)).error == pytest.approx(0.2)
+
+
+def test_frames_between_keyframes_share_their_corrections() -> None:
+    store = KeyframeStore()
+    T = exp_se3([1, 0, 0, 0, 0.3, 0])
+    a, b = store.append(frame(10)), store.append(frame(20))
+    twist = np.array([0.2, -0.1, 0.3, 0.01, 0.02, -0.03])
+    a.T_camera_world = exp_se3(twist) @ a.T_tracked
+    b.T_camera_world = exp_se3(3 * twist) @ b.T_tracked
+    for index, share in ((0, 1.0), (10, 1.0), (15, 2.0), (20, 3.0), (99, 3.0)):
+        np.testing.assert_allclose(store.corrected(index, T), exp_se3(share * twist) @ T, atol=1e-12)
+
+
+def test_a_new_keyframe_begins_with_the_correction_of_the_last() -> None:
+    store = KeyframeStore()
+    first = store.append(frame(0))
+    first.T_camera_world = exp_se3([0.1, 0, 0, 0, 0, 0.2]) @ first.T_tracked
+    second = store.append(frame(1))
+    np.testing.assert_allclose(second.correction, first.correction, atol=1e-12)
+
+
+def test_without_keyframes_the_tracked_pose_stands() -> None:
+    T = exp_se3([1, 2, 3, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(KeyframeStore().corrected(5, T), T)
+
+
+def test_exposure_is_interpolated_between_keyframes_and_the_nearest_outside() -> None:
+    store = KeyframeStore()
+    assert store.exposure_at(0) is None
+    for index, value in ((2, 1.0), (6, 3.0), (8, 3.0)):
+        store.append(frame(index)).exposure = np.full((3, 4), value)
+    expected = {0: 1.0, 2: 1.0, 3: 1.5, 5: 2.5, 6: 3.0, 7: 3.0, 20: 3.0}
+    for index, value in expected.items():
+        np.testing.assert_allclose(store.exposure_at(index), value)
+
+
+def test_a_new_keyframe_starts_with_the_exposure_of_the_last_but_shares_no_memory_with_it() -> None:
+    store = KeyframeStore()
+    store.append(frame(0)).exposure = np.full((3, 4), 2.0)
+    new = store.append(frame(1))
+    np.testing.assert_array_equal(new.exposure, np.full((3, 4), 2.0))
+    new.exposure += 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        new.exposure_m += 1.0
+    np.testing.assert_array_equal(store[0].exposure, np.full((3, 4), 2.0))
+    np.testing.assert_array_equal(store[0].exposure_m, 0.0)
+
+
+def test_exposure_that_is_not_estimated_is_none() -> None:
+    store = KeyframeStore()
+    store.append(frame(0))
+    assert store.append(frame(1)).exposure is None
+    assert store.exposure_at(5) is None
+
+
+def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
+    store = KeyframeStore()
+    keyframe = store.append(frame(0, T=exp_se3([1, 2, 3, 0.1, 0.2, 0.3])))
+    keyframe.T_camera_world = exp_se3([0.02, 0.01, -0.03, 0.002, 0.001, 0.004]) @ keyframe.T_tracked
+    refinement, points = keyframe.correction, keyframe.points
+    seen = points.xyz @ keyframe.T_camera_world[:3, :3].T + keyframe.T_camera_world[:3, 3]
+    T = exp_se3([-0.5, 0.3, 2, -0.4, 0.1, 0])
+    S = motion_around(keyframe.T_tracked, T, 1.5)
+    keyframe.revise(T, S)
+    store.take_in_depths()
+    np.testing.assert_array_equal(keyframe.T_tracked, T)
+    refinement[:3, 3] *= 1.5
+    np.testing.assert_allclose(keyframe.correction, refinement, atol=1e-12)
+    now = keyframe.points.xyz @ keyframe.T_camera_world[:3, :3].T + keyframe.T_camera_world[:3, 3]
+    np.testing.assert_allclose(now, 1.5 * seen, atol=1e-12)
+    assert store.scene_depth == keyframe.median_depth == pytest.approx(6.0)
+    np.testing.assert_allclose(keyframe.pending_motion, S)
+    keyframe.revise_points(SparsePoints(now @ T[:3, :3], points.pixels, points.ids))
+    assert keyframe.median_depth == pytest.approx(np.median(now[:, 2]) + T[2, 3])

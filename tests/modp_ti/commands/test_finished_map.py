@@ -1,0 +1,333 @@
+"""`modp-ti render` and `modp-ti export` on the output folder of a real, small run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+from plyfile import PlyData
+from typer.testing import CliRunner, Result
+
+from modp_ti.commands.app import app
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import TransformsSettings
+from modp_ti.inputs.trackers.transforms import open_transforms
+from modp_ti.outputs.formats.exposure import write_exposures
+from modp_ti.outputs.formats.splats_ply import read_splats
+from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
+from modp_ti.outputs.playback.finished_run import open_run
+from modp_ti.outputs.playback.map_renderer import MapRenderer
+from tests.modp_ti.outputs.formats.splat_readers import READERS
+from tests.room import HIGH, LOW
+
+DEFAULTS = {"splat": "splats.splat", "spz": "splats.spz", "compressed-ply": "splats.compressed.ply"}
+
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def out(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the finished run's folder: exports are written into it."""
+    folder = tmp_path_factory.mktemp("finished")
+    return shutil.copytree(finished, folder / "out")
+
+
+def invoke(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def done(*arguments: str | Path) -> Path:
+    """The place that a command says it has written to."""
+    result = invoke(*arguments)
+    assert result.exit_code == 0, result.output
+    return Path(result.stdout.removeprefix("written to ").strip())
+
+
+def held_out_pairs(out: Path) -> dict[int, tuple[NDArray, NDArray]]:
+    """Frame and render of the run's own pictures, by position."""
+    return {
+        int(path.stem): tuple(np.hsplit(cv2.imread(str(path))[..., ::-1], 2))
+        for path in sorted((out / "renders").iterdir())
+    }
+
+
+def test_frames_json_says_which_frames_are_what(out: Path) -> None:
+    data = json.loads((out / "frames.json").read_text())
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert data["held_out"] == [0, 4, 8]
+    assert len(data["keyframes"]) == metrics["keyframes"]
+    assert not set(data["keyframes"]) & {0, 4, 8}
+    assert data["near"] == pytest.approx(0.01 * data["scene_depth"])
+    assert 1.0 < data["scene_depth"] < 4.0  # metres, in the test room
+
+
+def test_the_recorded_path_shows_what_the_run_itself_showed(out: Path, tmp_path: Path) -> None:
+    folder = done("render", out, "-o", tmp_path / "pictures")
+    assert sorted(p.name for p in folder.iterdir()) == [f"{i:06d}.png" for i in range(9)]
+    for index, (_, render) in held_out_pairs(out).items():
+        picture = cv2.imread(str(folder / f"{index:06d}.png"))[..., ::-1]
+        np.testing.assert_array_equal(picture, render)
+
+
+def test_exposure_is_that_of_each_frame_where_it_is_asked_for(out: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(out, tmp_path / "run")
+    assert "no exposures were estimated" in failure("render", run, "--exposure", "-o", tmp_path / "none")
+    matrix = np.array([[0.5, 0.1, 0, 0.05], [0, 0.6, 0, 0.1], [0, 0, 0.7, 0.0]])
+    exposures = [matrix if index == 4 else np.eye(3, 4) for index in range(9)]
+    write_exposures(run / "exposure.json", range(9), [0.1 * index for index in range(9)], exposures, {1, 5})
+    assert "--path orbit has none" in failure("render", run, "--exposure", "--path", "orbit")
+    neutral, exposed = (
+        done("render", run, "-o", tmp_path / name, *option) for name, option in (("n", ()), ("e", ("--exposure",)))
+    )
+    for index in (3, 4):
+        before, after = (cv2.imread(str(f / f"{index:06d}.png"))[..., ::-1].astype(float) for f in (neutral, exposed))
+        expected = before @ exposures[index][:, :3].T + 255 * exposures[index][:, 3]
+        unclipped = (before > 0).all(axis=2) & (before < 255).all(axis=2)
+        assert unclipped.mean() > 0.5
+        assert np.abs(after - expected)[unclipped].max() <= 1.1
+
+
+def test_frames_are_spread_evenly_over_those_that_were_mapped(out: Path) -> None:
+    run = open_run(out)
+    assert run.mapped == run.spread(6) == run.spread(100) == [1, 2, 3, 5, 6, 7]
+    assert run.spread(3) == [1, 3, 6]
+
+
+def test_depth_is_that_of_the_room(out: Path, tmp_path: Path) -> None:
+    folder = done("render", out, "-o", tmp_path / "depth", "--show", "depth")
+    z = cv2.imread(str(folder / "000004.tiff"), cv2.IMREAD_UNCHANGED)
+    assert z.dtype == np.float32 and z.shape == (60, 80)
+    assert (z > 0).mean() > 0.5
+    assert 1.0 < np.median(z[z > 0]) < 4.0
+
+
+@pytest.mark.parametrize("path", ["smoothed", "orbit"])
+def test_a_video_has_the_frames_and_the_size_that_were_asked_for(out: Path, tmp_path: Path, path: str) -> None:
+    place = done("render", out, "--path", path, "--frames", 5, "--size", "65x48", "-o", tmp_path / "film.mp4")
+    video = cv2.VideoCapture(str(place))
+    assert (video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (64, 48)
+    pictures = []
+    while (frame := video.read())[0]:
+        pictures.append(frame[1])
+    assert len(pictures) == 5
+    assert min(picture.std() for picture in pictures) > 10  # something is to be seen
+    assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_path_of_ones_own_and_a_wider_view(out: Path, tmp_path: Path) -> None:
+    times, poses = read_trajectory(out / "trajectory.txt")
+    write_trajectory(tmp_path / "mine.txt", times[4:5], poses[4:5])
+    folder = done("render", out, "--path", tmp_path / "mine.txt", "-o", tmp_path / "same")
+    _, render = held_out_pairs(out)[4]
+    same = cv2.imread(str(folder / "000000.png"))[..., ::-1]
+    np.testing.assert_array_equal(same, render)
+    # The recorded camera sees 2 atan(2 / 3) degrees across: at twice the tangent, all is half as large.
+    wide = 2 * np.degrees(np.arctan(2 * 2 / 3))
+    folder = done("render", out, "--path", tmp_path / "mine.txt", "--fov", wide, "-o", tmp_path / "wide")
+    wide = cv2.imread(str(folder / "000000.png"))[..., ::-1].astype(np.float64)
+    half = cv2.resize(same, (40, 30), interpolation=cv2.INTER_AREA).astype(np.float64)
+    assert np.abs(wide[15:45, 20:60] - half).mean() < 12
+
+
+def test_the_recorded_video_is_an_export_too(out: Path, tmp_path: Path) -> None:
+    video = cv2.VideoCapture(str(done("export", out, "--format", "video", "-o", tmp_path / "a.mp4")))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 9
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
+
+
+def psnr(renderer: MapRenderer, out: Path, state: dict) -> float:
+    """Mean over the held-out frames [dB] of the Gaussians that some reader found."""
+    run = open_run(out)
+    full = np.zeros_like(run.gaussians["sh"])
+    full[:, : state["sh"].shape[1]] = state["sh"]
+    renderer.renderer.gaussians.load({**state, "sh": full})
+    errors = []
+    for index, (frame, _) in held_out_pairs(out).items():
+        picture = renderer.picture(run.cameras[index], run.poses[index]).astype(np.float64)
+        errors.append(-10 * np.log10(((picture - frame) ** 2).mean() / 255**2))
+    return float(np.mean(errors))
+
+
+@pytest.fixture(scope="module")
+def renderer(out: Path, taichi_on_the_cpu: None) -> Callable[[], MapRenderer]:
+    """Made anew in each test: a command that renders has started Taichi again."""
+    from modp_ti.outputs.playback.map_renderer import start_device
+
+    def make() -> MapRenderer:
+        start_device("cpu")
+        run = open_run(out)
+        return MapRenderer(run.gaussians, 80, 60, run.record.near)
+
+    return make
+
+
+def test_every_form_of_the_splats_shows_the_same_map(out: Path, renderer: Callable[[], MapRenderer]) -> None:
+    """Read by another implementation: at most 0.01 dB from ours for the PLY, half a decibel for what is compressed."""
+    vertex = PlyData.read(out / "splats.ply")["vertex"]
+    rest = [p.name for p in vertex.properties if p.name.startswith("f_rest_")]
+
+    def columns(*names: str) -> NDArray:
+        return np.stack([vertex[name] for name in names], axis=1)
+
+    sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    if rest:
+        sh = np.concatenate([sh, columns(*rest).reshape(len(sh), 3, -1).transpose(0, 2, 1)], axis=1)
+    ply = {
+        "position": columns("x", "y", "z"),
+        "log_scale": columns("scale_0", "scale_1", "scale_2"),
+        "quaternion": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        "opacity_logit": vertex["opacity"],
+        "sh": sh,
+    }
+    files = {form: done("export", out, "--format", form) for form in DEFAULTS}
+    assert {form: path.name for form, path in files.items()} == DEFAULTS
+    show = renderer()
+    ours = psnr(show, out, read_splats(out / "splats.ply"))
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert ours == pytest.approx(metrics["refined"]["held_out"]["psnr"], abs=0.05)
+    assert abs(psnr(show, out, ply) - ours) <= 0.01
+    # `.splat` holds no colours beyond [0, 1] and none that depend on the direction: fitted, it is better than clipped.
+    held = np.clip(0.5 + 0.2820948 * sh[:, :1], 0, 1)
+    clipped = psnr(show, out, {**ply, "sh": (held - 0.5) / 0.2820948})
+    for form, path in files.items():
+        there = psnr(show, out, READERS[form](path))
+        assert there > clipped if form == "splat" else abs(there - ours) <= 0.5, form
+
+
+def test_points_are_the_opaque_gaussians(out: Path, tmp_path: Path) -> None:
+    import open3d as o3d
+
+    cloud = o3d.io.read_point_cloud(str(done("export", out, "--format", "points", "-o", tmp_path / "p.ply")))
+    state = read_splats(out / "splats.ply")
+    solid = state["opacity_logit"] >= 0
+    np.testing.assert_allclose(np.asarray(cloud.points), state["position"][solid], atol=1e-6)
+    colours = np.clip(0.5 + 0.2820948 * state["sh"][solid, 0], 0, 1)
+    np.testing.assert_allclose(np.asarray(cloud.colors), colours, atol=1.01 / 255)
+
+
+def test_a_mesh_lies_in_the_room(out: Path, tmp_path: Path) -> None:
+    import open3d as o3d
+
+    mesh = o3d.io.read_triangle_mesh(str(done("export", out, "--format", "mesh", "-o", tmp_path / "m.ply")))
+    vertices = np.asarray(mesh.vertices)
+    assert len(mesh.triangles) > 1000
+    inside = ((vertices > LOW - 0.2) & (vertices < HIGH + 0.2)).all(axis=1)
+    assert inside.mean() > 0.8
+    assert np.asarray(mesh.vertex_colors).std() > 0.05
+
+
+def test_a_mesh_is_made_of_the_map_s_own_pictures_where_the_images_are_gone(out: Path, tmp_path: Path) -> None:
+    import open3d as o3d
+
+    run = shutil.copytree(out, tmp_path / "run")
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(config.replace("  stop: null", "  stop: 8"))
+    result = invoke("export", run, "--format", "mesh")
+    assert result.exit_code == 0
+    assert "note: matching the map's own pictures, for want of the images: " in result.stderr
+    assert "the source no longer gives the frames that were mapped" in result.stderr
+    assert len(o3d.io.read_triangle_mesh(str(run / "mesh.ply")).triangles) > 1000
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_colmap_data_set_has_model_and_images(out: Path, tmp_path: Path, kept: bool) -> None:
+    """Whether the run kept its images or they are read again from its source."""
+    source = shutil.copytree(out, tmp_path / "run")
+    if kept:
+        first = done("export", source, "--format", "colmap", "-o", tmp_path / "first")
+        shutil.copytree(first / "images", source / "colmap" / "images")
+        shutil.rmtree(source / "colmap" / "images" / "unused", ignore_errors=True)
+        shutil.copytree(first / "sparse" / "0", source / "colmap", dirs_exist_ok=True)
+    folder = done("export", source, "--format", "colmap", "-o", tmp_path / "set")
+    model, before = (pycolmap.Reconstruction(str(p)) for p in (folder / "sparse" / "0", out / "colmap"))
+    for number, image in model.images.items():
+        assert image.name.endswith(".png")
+        picture = cv2.imread(str(folder / "images" / image.name))
+        camera = model.cameras[image.camera_id]
+        assert picture.shape == (camera.height, camera.width, 3)
+        np.testing.assert_array_equal(image.cam_from_world().matrix(), before.images[number].cam_from_world().matrix())
+    assert len(model.points3D) == len(before.points3D)
+    for index, (frame, _) in held_out_pairs(out).items():
+        np.testing.assert_array_equal(
+            cv2.imread(str(folder / "images" / model.images[index + 1].name))[..., ::-1], frame
+        )
+
+
+def test_a_nerfstudio_data_set_is_read_by_our_own_reader_and_has_its_split(out: Path, tmp_path: Path) -> None:
+    folder = done("export", out, "--format", "nerfstudio", "-o", tmp_path / "ns")
+    data = json.loads((folder / "transforms.json").read_text())
+    assert data["camera_model"] == "OPENCV" and (data["w"], data["h"]) == (80, 60)
+    assert len(data["test_filenames"]) == 3 and len(data["train_filenames"]) == 6
+    assert data["val_filenames"] == data["test_filenames"]  # nerfstudio refuses a set that lists two splits of three
+    assert not set(data["train_filenames"]) & set(data["test_filenames"])
+    assert PlyData.read(folder / data["ply_file_path"])["vertex"].count > 100
+    source, tracker = SourceSettings(path=folder / "images"), TransformsSettings(path=folder)
+    frames = list(open_transforms(source, tracker))
+    run = open_run(out)
+    for frame, T, camera in zip(frames, run.poses, run.cameras, strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, T, atol=1e-9)
+        assert frame.camera == camera
+
+
+def failure(*arguments: str | Path) -> str:
+    result = invoke(*arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    return result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--format", "mesh", "-o", "m.stl"], "--format mesh writes a file in .ply, .glb, .obj"),
+        (["--format", "spz", "-o", "none/here.spz"], "no such folder; make it first"),
+        (["--format", "points", "-o", "{out}/splats.ply"], "is the map itself"),
+        (["--format", "video", "-o", "film.avi"], "in .mp4 or .webm"),
+    ],
+)
+def test_an_export_that_cannot_be_is_refused_in_one_line(out: Path, arguments: list[str], part: str) -> None:
+    said = failure("export", out, *(a.format(out=out) for a in arguments))
+    assert said.startswith("error: ") and said.count("\n") == 1
+    assert part in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--path", "gone.txt"], "--path gone.txt: no such file, and none of recorded, smoothed, orbit"),
+        (["--size", "640"], "write it as WIDTHxHEIGHT"),
+        (["--size", "5000x100"], "at most 2048 pixels"),
+        (["--frames", "5"], "--frames is for the paths"),
+        (["-o", "{out}"], "is not empty"),
+    ],
+)
+def test_a_render_that_cannot_be_is_refused_in_one_line(out: Path, arguments: list[str], part: str) -> None:
+    said = failure("render", out, *(a.format(out=out) for a in arguments))
+    assert said.startswith("error: ") and said.count("\n") == 1
+    assert part in said
+
+
+def test_an_unknown_format_is_refused_with_the_list(out: Path) -> None:
+    said = failure("export", out, "--format", "usd")
+    assert "usd" in said and "nerfstudio" in said
+
+
+def test_what_is_no_finished_run_is_refused(out: Path, tmp_path: Path) -> None:
+    assert "no such folder" in failure("render", tmp_path / "gone")
+    assert "no run has left anything here" in failure("render", tmp_path)
+    broken = shutil.copytree(out, tmp_path / "broken")
+    (broken / "frames.json").unlink()
+    assert "an earlier version made it, without frames.json: run it again" in failure("render", broken)
+    (broken / "trajectory.txt").unlink()
+    assert "trajectory.txt is missing" in failure("export", broken, "--format", "mesh")
+    (broken / "frames.json").write_text('{"near": 0.1, "scene_depth": 1, "keyframes": [99], "held_out": []}')
+    shutil.copy(out / "trajectory.txt", broken)
+    assert "names frames beyond the 9" in failure("render", broken)

@@ -1,0 +1,61 @@
+"""After a warm-up nothing is left to compile; bad input gets one line and exit code 2."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from modp_ti.commands import app as cli
+
+SCENE = """
+source: {path: images}
+tracker: {kind: colmap}
+output: out
+device: cpu
+mapping: {optimise: {steps: 1, last_steps: 2}, densify: {pixels: 200, warm_up: 2}}
+refine: {steps: 1}
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "name a scene file, or give --size 640x480"),
+        (["--size", "640"], "--size 640: write it as WIDTHxHEIGHT, for example 640x480"),
+        (["--size", "640x0"], "--size 640x0: write it as WIDTHxHEIGHT"),
+        (["--size", "640x480", "--set", "seed=1"], "--set changes keys of a scene file: name one"),
+        (["gone.yaml"], "gone.yaml: no such scene file"),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_code_two(arguments: list[str], complaint: str) -> None:
+    result = CliRunner().invoke(cli.app, ["warmup", *arguments])
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+    assert complaint in result.stderr
+
+
+@pytest.mark.slow
+def test_a_run_after_the_warm_up_compiles_nothing(plane_scene, tmp_path) -> None:
+    plane_scene.write_colmap(np.random.default_rng(0).uniform(-1, 1, (60, 3)) * [1.8, 1.8, 0])
+    scene = plane_scene.folder.parent / "scene.yaml"
+    scene.write_text(SCENE)
+    cache = tmp_path / "cache"
+    environment = os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(cache), "TORCH_HOME": str(tmp_path / "no-torch")}
+
+    def kernels_after(*arguments: str) -> tuple[set[str], str]:
+        command = [sys.executable, "-m", *arguments]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, done.stderr
+        return {file.name for file in cache.iterdir() if file.suffix == ".tic"}, done.stdout
+
+    compiled, said = kernels_after("modp_ti.commands.warmup", str(scene))
+    assert len(compiled) > 30
+    assert re.search(r"^320x240 on cpu: [0-9.]+ s$", said, re.MULTILINE)
+    assert kernels_after("modp_ti.commands.app", "run", str(scene))[0] == compiled

@@ -1,0 +1,261 @@
+"""A run that was stopped goes on as if it had not been: real processes, killed and interrupted, and real files."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from modp_ti.engine.snapshots import load_resumed
+from modp_ti.engine.snapshots.file import FILE, read_arrays, write_arrays
+from modp_ti.files.errors import InputError
+from tests.modp_ti.runs import finished_run
+
+if TYPE_CHECKING:
+    from tests.room import Room
+
+pytestmark = pytest.mark.slow
+
+# Exposure and pruning; corrections come from klt, below: all that a snapshot must hold.
+SCENE = """
+source:  {path: images, holdout: 4, fps: 10}
+tracker: {kind: colmap, path: sparse/0}
+output:  out
+device:  cpu
+seed:    3
+mapping: {optimise: {steps: 3, last_steps: 4}, densify: {warm_up: 3, prune_every: 4}, exposure: {enabled: true}}
+refine:  {steps: 9}
+export:  {report: false}
+snapshot_every: 2
+"""
+SAME = ("splats.ply", "trajectory.txt", "exposure.json", "frames.json", "scores.csv")
+FIGURES = ("frames", "keyframes", "gaussians", "corrections", "online", "refined", "guards", "frames_left_out")
+
+
+@pytest.fixture(scope="module")
+def in_peace(tmp_path_factory: pytest.TempPathFactory, room: Room) -> Path:
+    from tests.room import RoomRecording, pinhole, walk
+
+    folder = tmp_path_factory.mktemp("peace")
+    RoomRecording(room, pinhole(64, 48), walk(14)).write(folder, gains=np.exp(0.3 * np.sin(np.arange(14))))
+    return finished_run(folder, SCENE, "device: CPU")
+
+
+@pytest.fixture
+def scene(in_peace: Path, tmp_path: Path) -> Path:
+    """The same scene with the same images, in a folder of its own."""
+    for name in ("images", "sparse"):
+        (tmp_path / name).symlink_to(in_peace.parent / name)
+    return Path(shutil.copy(in_peace.parent / "scene.yaml", tmp_path))
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "modp_ti.run", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Where the tests run in a shell's background, children inherit that Ctrl-C is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
+def position(file: Path) -> tuple[int, int]:
+    """Frames and corrections taken in, and steps of refinement, of the snapshot; (-1, -1) without one."""
+    if not file.exists():
+        return -1, -1
+    about = read_arrays(file)[1]["position"]
+    return about["events"], about["refined"]
+
+
+def wait_for(process: subprocess.Popen[str], file: Path, least: tuple[int, int]) -> None:
+    def is_there() -> bool:
+        return all(now >= wanted for now, wanted in zip(position(file), least, strict=True))
+
+    while process.poll() is None and not is_there():
+        time.sleep(0.01)
+    assert process.poll() is None, process.communicate()
+
+
+def assert_the_same(out: Path, peace: Path) -> None:
+    assert set(os.listdir(out)) == set(os.listdir(peace))
+    for name in set(SAME) & set(os.listdir(peace)):
+        assert (out / name).read_bytes() == (peace / name).read_bytes(), name
+    figures, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (out, peace))
+    assert {name: figures[name] for name in FIGURES} == {name: expected[name] for name in FIGURES}
+    assert expected["snapshots"]["resumed"] == 0 < figures["snapshots"]["resumed"]
+
+
+def assert_resumed_ends_the_same(out: Path, peace: Path) -> None:
+    process = start("--resume", str(out))
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert_the_same(out, peace)
+
+
+def test_a_finished_run_keeps_no_snapshot(in_peace: Path) -> None:
+    assert not (in_peace / FILE).exists()
+    assert json.loads((in_peace / "metrics.json").read_text())["snapshots"]["written"] >= 7
+    with pytest.raises(InputError, match="the run there is finished, there is nothing to resume"):
+        load_resumed(in_peace, None, [])
+
+
+def test_a_run_that_is_killed_and_interrupted_on_its_way_ends_as_one_in_peace(scene: Path, in_peace: Path) -> None:
+    out = scene.parent / "out"
+    process = start(str(scene))
+    wait_for(process, out / FILE, (6, 0))
+    process.kill()
+    process.communicate()
+    before = position(out / FILE)
+
+    process = start("--resume", str(out), "--json")
+    wait_for(process, out / FILE, (before[0] + 1, 0))
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert f"modp-ti run --resume {out} goes on" in json.loads(said)["error"], errors
+    assert position(out / FILE) > before
+    assert {"splats.ply", "trajectory.txt", "frames.json", "colmap", "config.yaml"} <= set(os.listdir(out))
+    assert not (out / "metrics.json").exists()
+
+    process = start("--resume", str(out))
+    wait_for(process, out / FILE, (0, 6))  # in the midst of refinement
+    process.kill()
+    process.communicate()
+
+    assert_resumed_ends_the_same(out, in_peace)
+    assert not (out / FILE).exists()
+
+
+def test_a_run_that_is_interrupted_while_it_is_scored_keeps_its_map_and_is_scored_later(
+    scene: Path, in_peace: Path
+) -> None:
+    out = scene.parent / "out"
+    process = start(str(scene))
+    while process.poll() is None and not (scene.parent / "out.partial" / "splats.ply").exists():
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 130, errors
+    assert "resume" in errors
+    assert not (out / "metrics.json").exists()
+    for name in ("splats.ply", "trajectory.txt"):
+        assert (out / name).read_bytes() == (in_peace / name).read_bytes()
+
+    assert_resumed_ends_the_same(out, in_peace)
+
+
+def test_a_tracker_that_finds_the_poses_itself_finds_them_again(tmp_path: Path, room: Room) -> None:
+    from tests.room import RoomRecording, pinhole, walk
+
+    camera = pinhole(160, 120)
+    RoomRecording(room, camera, walk(16)).write(tmp_path)
+    scene = f"""
+source:  {{path: images, holdout: 8, fps: 10, intrinsics: {{fx: {camera.fx}, fy: {camera.fy}, cx: 80, cy: 60}}}}
+tracker: {{kind: klt}}
+output:  out
+device:  cpu
+mapping: {{optimise: {{steps: 2, last_steps: 2}}}}
+refine:  {{steps: 4}}
+export:  {{report: false}}
+snapshot_every: 3
+"""
+    peace = finished_run(tmp_path, scene, "device: CPU").rename(tmp_path / "peace")
+    assert json.loads((peace / "metrics.json").read_text())["corrections"]["received"] > 0
+    out = tmp_path / "out"
+    process = start(str(tmp_path / "scene.yaml"))
+    wait_for(process, out / FILE, (6, 0))
+    process.kill()
+    process.communicate()
+    assert_resumed_ends_the_same(out, peace)
+
+
+@pytest.fixture
+def stopped(tmp_path: Path) -> Path:
+    """The output folder of a run of which nothing but a snapshot is known: its settings are real, its map is not."""
+    from modp_ti.config.scene_file import load_scene
+
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    config = load_scene(tmp_path / "scene.yaml")
+    (tmp_path / "out").mkdir()
+    about = {
+        "settings": config.model_dump(mode="json"),
+        "position": {"events": 1, "digest": 5, "finished": False, "refined": 0},
+        "numbers": {},
+    }
+    write_arrays(tmp_path / "out" / FILE, {"a": np.zeros(1)}, about)
+    return tmp_path / "out"
+
+
+def test_the_settings_come_from_the_snapshot_and_some_may_change(stopped: Path) -> None:
+    config, snapshot = load_resumed(stopped, None, ["threads=1", "snapshot_every=5", "export.report=true"])
+    assert (config.seed, config.threads, config.snapshot_every, config.export.report) == (3, 1, 5, True)
+    assert config.output == stopped and snapshot.position.digest == 5
+
+
+def test_an_output_folder_that_was_moved_is_written_where_it_is_now(stopped: Path) -> None:
+    moved = stopped.rename(stopped.with_name("moved"))
+    assert load_resumed(moved, None, [])[0].output == moved
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("mapping.optimise.steps=5", "its mapping.optimise.steps is 3, here it is 5"),
+        ("seed=4", "its seed is 3, here it is 4"),
+        ("source.scale=0.5", "its source.scale is 1.0, here it is 0.5"),
+        ("refine.steps=10", "its refine.steps is 9, here it is 10"),
+    ],
+)
+def test_a_snapshot_of_another_scene_is_refused_with_what_differs(stopped: Path, change: str, said: str) -> None:
+    with pytest.raises(InputError, match=f"is of another scene: {said}"):
+        load_resumed(stopped, stopped.parent / "scene.yaml", [change])
+
+
+def test_settings_that_this_version_does_not_have_are_refused(stopped: Path) -> None:
+    arrays, about = read_arrays(stopped / FILE)
+    del about["version"]
+    about["settings"]["mapping"]["magic"] = 1
+    write_arrays(stopped / FILE, arrays, about)
+    with pytest.raises(InputError, match=r"unknown key `mapping\.magic`"):
+        load_resumed(stopped, None, [])
+
+
+def test_a_snapshot_with_the_keys_of_all_trackers_as_0_1_0_wrote_it_is_taken(stopped: Path) -> None:
+    arrays, about = read_arrays(stopped / FILE)
+    del about["version"]
+    about["settings"]["tracker"] |= {"path": None, "camera": "camera-rgb", "patience": 120.0}
+    write_arrays(stopped / FILE, arrays, about)
+    assert load_resumed(stopped, None, [])[0] == load_resumed(stopped, stopped.parent / "scene.yaml", [])[0]
+
+
+def test_a_folder_without_a_snapshot_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        load_resumed(tmp_path / "gone", None, [])
+    with pytest.raises(InputError, match="there is no snapshot: start the run from its scene"):
+        load_resumed(tmp_path, None, [])
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("tracker.kind=socket", "frames that come live are gone"),
+        ("mode=offline", "snapshot_every is for mode: online"),
+    ],
+)
+def test_what_cannot_be_resumed_is_said_at_once(tmp_path: Path, settings: str, said: str) -> None:
+    from modp_ti.config.scene_file import load_scene
+
+    text = "tracker: {kind: synthetic}\noutput: out\nsnapshot_every: 3\n"
+    (tmp_path / "scene.yaml").write_text(text)
+    with pytest.raises(InputError, match=said):
+        load_scene(tmp_path / "scene.yaml", [settings])

@@ -1,0 +1,77 @@
+"""pycolmap leaves the terminal, the folder for temporary files and the signals of the process alone.
+
+In processes of their own, as pycolmap is imported once: other tests here import it bare.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TERMINATED = """
+import os, signal, sys, threading, time
+{before}
+def load():
+    from modp_ti.files.quiet_pycolmap import pycolmap
+    assert pycolmap.Reconstruction
+{load}
+os.kill(os.getpid(), signal.SIGTERM)
+time.sleep(60)
+"""
+IN_MAIN = "load()"
+IN_THREAD = "thread = threading.Thread(target=load); thread.start(); thread.join()"
+
+# Points so near the cameras that the normal equations have no Cholesky factorization, from an observation that is not
+# one: Ceres warns of the former at every step, and tells of the latter as an error.
+DEGENERATE = """
+import numpy as np
+from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.multiview.bundle_adjustment import adjusted_bundle
+camera = Lens.radial(100.0, 0.0, 100, 100).camera
+draw = np.random.default_rng(0)
+poses = {i: np.eye(4) for i in range(3)}
+for i in poses:
+    poses[i][0, 3] = i
+xyz = (draw.normal(size=(20, 3)) + [0.0, 0.0, 5.0]) * [1.0, 1.0, 1e-12]
+view, point, pixels = np.repeat(np.arange(3), 20), np.tile(np.arange(20), 3), draw.uniform(0.0, 100.0, (60, 2))
+adjusted_bundle(camera, poses, view, point, pixels, xyz, {1, 2}, 50)
+pixels[0] = np.nan
+assert adjusted_bundle(camera, poses, view, point, pixels, xyz, {1, 2}, 50) is None
+"""
+
+
+def run(code: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """The code in a process of its own, whose folder for temporary files is `folder`."""
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith("GLOG_")}
+    variables = {**inherited, "TMPDIR": str(folder), **environment}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables, timeout=120)
+
+
+@pytest.mark.parametrize("load", [IN_MAIN, IN_THREAD], ids=["in the main thread", "in another"])
+def test_a_terminated_process_dies_of_the_signal_without_a_stack_trace(load: str, tmp_path: Path) -> None:
+    ended = run(TERMINATED.format(before="", load=load), tmp_path)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGTERM, "", "")
+
+
+def test_a_handler_that_a_program_has_set_is_kept(tmp_path: Path) -> None:
+    before = "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))"
+    ended = run(TERMINATED.format(before=before, load=IN_MAIN), tmp_path)
+    assert (ended.returncode, ended.stderr) == (7, "")
+
+
+def test_an_adjustment_of_which_ceres_warns_is_silent_and_leaves_no_file(tmp_path: Path) -> None:
+    ended = run(DEGENERATE, tmp_path)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_log_is_shown_to_those_who_ask_for_it(tmp_path: Path) -> None:
+    """Which tells, too, that the adjustment above is one of which Ceres warns."""
+    said = run(DEGENERATE, tmp_path, GLOG_minloglevel="0").stderr
+    assert "levenberg_marquardt_strategy.cc" in said and "Cholesky factorization" in said
+    assert "Initial residual and Jacobian evaluation failed" in said

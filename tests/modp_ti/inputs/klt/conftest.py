@@ -1,0 +1,104 @@
+"""A camera that walks through a box room of textured walls: every pixel sees one wall, its depth is known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.inputs.synthetic.camera_path import look_at
+
+# Corners of the room [m], texels per metre.
+LOW, HIGH = np.array([-3.0, -2.0, 0.0]), np.array([3.0, 3.0, 2.6])
+FINENESS = 90
+
+
+@dataclass(frozen=True)
+class BoxRoom:
+    """textures: of the six walls, by (axis, side)."""
+
+    camera: PinholeCamera
+    textures: dict[tuple[int, int], NDArray[np.uint8]]
+
+    def image(self, T: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """RGB (H, W, 3) seen from T_camera_world; by ray casting of the box and bilinear lookup of its walls."""
+        c = self.camera
+        x, y = np.meshgrid(np.arange(c.width) + 0.5, np.arange(c.height) + 0.5)
+        rays = np.stack([(x - c.cx) / c.fx, (y - c.cy) / c.fy, np.ones_like(x)], axis=-1) @ T[:3, :3]
+        eye = -T[:3, :3].T @ T[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = np.where(rays > 0, (HIGH - eye) / rays, (LOW - eye) / rays)
+        wall = reach.argmin(axis=-1)
+        hit = eye + rays * reach.min(axis=-1)[..., None]
+        image = np.zeros((c.height, c.width, 3), np.uint8)
+        for (axis, side), texture in self.textures.items():
+            mine = (wall == axis) & ((np.take(rays, axis, axis=-1) > 0) == bool(side))
+            u, v = ((np.take(hit, i, axis=-1) - LOW[i]) * FINENESS for i in range(3) if i != axis)
+            seen = cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+            image[mine] = seen[mine]
+        return image
+
+    def grey(self, T: NDArray[np.float64]) -> NDArray[np.uint8]:
+        return cv2.cvtColor(self.image(T), cv2.COLOR_RGB2GRAY)
+
+    def depth(self, T: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """z (N,) of what is seen at pixels (N, 2)."""
+        c = self.camera
+        rays = np.c_[(pixels[:, 0] - c.cx) / c.fx, (pixels[:, 1] - c.cy) / c.fy, np.ones(len(pixels))] @ T[:3, :3]
+        eye = -T[:3, :3].T @ T[:3, 3]
+        return np.where(rays > 0, (HIGH - eye) / rays, (LOW - eye) / rays).min(axis=1)
+
+
+def _texture(rng: np.random.Generator, height: int, width: int) -> NDArray[np.uint8]:
+    sheet = np.zeros((height, width, 3), np.float32)
+    for size in (5, 12, 40):
+        noise = rng.random((height // size + 2, width // size + 2, 3)).astype(np.float32)
+        sheet += cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(255 * (sheet - sheet.min()) / np.ptp(sheet), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="session")
+def box_room() -> BoxRoom:
+    rng = np.random.default_rng(11)
+    size = np.ceil((HIGH - LOW) * FINENESS).astype(int) + 2
+    textures = {}
+    for axis in range(3):
+        u, v = (size[i] for i in range(3) if i != axis)
+        for side in range(2):
+            textures[axis, side] = _texture(rng, int(v), int(u))
+    return BoxRoom(PinholeCamera(270.0, 270.0, 160.0, 120.0, 320, 240), textures)
+
+
+def walk(frames: int) -> list[NDArray[np.float64]]:
+    """T_camera_world (4, 4) of a camera that goes sideways and turns a little, 3 cm a frame."""
+    t = np.arange(frames)
+    eyes = np.stack([-1.2 + 0.03 * t, -1.2 + 0.1 * np.sin(0.1 * t), 1.3 + 0.05 * np.sin(0.23 * t)], axis=1)
+    targets = np.stack([-1.0 + 0.035 * t, np.full(frames, 3.0), 1.0 + 0.04 * np.cos(0.2 * t)], axis=1)
+    return [look_at(eye, target) for eye, target in zip(eyes, targets, strict=True)]
+
+
+@dataclass(frozen=True)
+class Walk:
+    poses: list[NDArray[np.float64]]
+    images: list[NDArray[np.uint8]]
+
+    @property
+    def grey(self) -> list[NDArray[np.uint8]]:
+        return [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in self.images]
+
+    def written(self, folder: Path) -> Path:
+        folder.mkdir(exist_ok=True)
+        for i, image in enumerate(self.images):
+            cv2.imwrite(str(folder / f"{i:04d}.png"), image[..., ::-1])
+        return folder
+
+
+@pytest.fixture(scope="session")
+def box_walk(box_room: BoxRoom) -> Walk:
+    poses = walk(60)
+    return Walk(poses, [box_room.image(T) for T in poses])

@@ -1,0 +1,135 @@
+"""`KltTracker` over files: what it delivers, corrects, says and refuses."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.settings import SourceSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.klt import KltTracker, open_klt
+from modp_ti.inputs.klt.tracker import ArrivingNames
+from modp_ti.inputs.sources import FrameReader, ImageFolder, Intrinsics
+from modp_ti.inputs.sources.distortion import Distortion
+from modp_ti.outputs.evaluation import absolute_trajectory_error
+
+
+def known_camera(source: SourceSettings, box_room, distortion: Distortion | None = None) -> KltTracker:
+    images = ImageFolder(source.path)
+    intrinsics = Intrinsics(box_room.camera, distortion or Distortion())
+    return KltTracker(FrameReader(images, source), ArrivingNames(images, source), intrinsics, source)
+
+
+@pytest.fixture(scope="module")
+def delivered(box_room, box_walk, tmp_path_factory):
+    """The walk at half its size: the tracker, what its events were, and the frames that it gives afterwards."""
+    folder = box_walk.written(tmp_path_factory.mktemp("walk") / "images")
+    tracker = known_camera(SourceSettings(path=folder, scale=0.5, holdout=8), box_room)
+    return tracker, list(tracker.events()), list(tracker)
+
+
+def test_frames_keep_the_contract_of_a_tracker(delivered, box_room, box_walk):
+    _, events, _ = delivered
+    frames = [event for event in events if isinstance(event, TrackedFrame)]
+    assert [frame.index for frame in frames] == list(range(60))
+    assert [frame.name for frame in frames] == [f"{i:04d}.png" for i in range(60)]
+    assert [frame.index for frame in frames if frame.held_out] == list(range(0, 60, 8))
+    np.testing.assert_allclose([frame.timestamp for frame in frames], np.arange(60) / 30)
+    camera = box_room.camera.resized(160, 120)
+    for frame in frames:
+        assert frame.camera == camera and frame.image.shape == (120, 160, 3)
+        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+        error = np.linalg.norm(camera.project(p) - frame.points.pixels, axis=1)
+        assert len(error) > 60 and np.median(error) < 0.3 and error.max() < 1.5
+    # What a point's number means does not change: it shows the same place of the room in two frames.
+    a, b = frames[20].points, frames[28].points
+    shared, at_a, at_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    assert len(shared) > 30
+    places = []
+    for points, at, i in ((a, at_a, 20), (b, at_b, 28)):
+        T = box_walk.poses[i]
+        local = camera.unproject(points.pixels[at], box_room.depth(T, 2 * points.pixels[at]))
+        places.append((local - T[:3, 3]) @ T[:3, :3])
+    assert np.median(np.linalg.norm(places[0] - places[1], axis=1)) < 0.02
+
+
+def test_corrections_lead_from_the_delivered_poses_to_the_last_ones(delivered, box_walk):
+    _, events, last = delivered
+    poses: dict[int, np.ndarray] = {}
+    corrections = 0
+    for event in events:
+        if isinstance(event, PoseCorrection):
+            corrections += 1
+            assert set(event.index.tolist()) <= set(poses), "a frame is corrected after it was delivered"
+            poses.update(zip(event.index.tolist(), event.T_camera_world, strict=True))
+        else:
+            poses[event.index] = event.T_camera_world
+    assert corrections >= 1
+    for frame in last:
+        np.testing.assert_array_equal(frame.T_camera_world, poses[frame.index])
+    assert absolute_trajectory_error([poses[i] for i in range(60)], box_walk.poses) < 0.01
+
+
+def test_iterating_alone_tracks_too_and_gives_the_same(delivered, box_room, box_walk, tmp_path):
+    source = SourceSettings(path=box_walk.written(tmp_path / "images"), scale=0.5, holdout=8)
+    frames = list(known_camera(source, box_room))
+    _, _, last = delivered
+    for one, other in zip(frames, last, strict=True):
+        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
+        np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
+
+
+def test_no_point_is_delivered_where_the_mask_is_black(box_room, box_walk, tmp_path):
+    folder = box_walk.written(tmp_path / "images")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, 200:] = 0
+    for i in range(60):
+        cv2.imwrite(str(masks / f"{i:04d}.png"), mask)
+    frames = list(known_camera(SourceSettings(path=folder, stop=40, masks=masks), box_room))
+    assert len(frames) == 40
+    assert all((frame.points.pixels[:, 0] < 200).all() for frame in frames)
+    assert min(len(frame.points) for frame in frames) > 30
+
+
+def test_a_camera_that_nobody_described_is_estimated_and_said(box_room, box_walk, tmp_path):
+    tracker = open_klt(SourceSettings(path=box_walk.written(tmp_path / "images")))
+    assert "estimated" in tracker.notes[0]
+    assert tracker.intrinsics.camera.fx == pytest.approx(box_room.camera.fx, rel=0.05)
+
+
+def test_images_that_do_not_tell_the_camera_give_a_guess_and_a_map_of_nothing_is_refused(tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / f"{i}.png"), np.zeros((120, 160, 3), np.uint8))
+    tracker = open_klt(SourceSettings(path=folder))
+    assert "is a guess" in tracker.notes[0]
+    with pytest.raises(InputError, match="could place none of the 4 images"):
+        list(tracker.events())
+
+
+def test_images_of_two_sizes_are_refused_before_tracking(tmp_path):
+    for i, width in enumerate((160, 160, 100)):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((120, width, 3), np.uint8))
+    with pytest.raises(InputError, match=r"2\.png is 100x120, the first image 160x120"):
+        open_klt(SourceSettings(path=tmp_path))
+
+
+def test_desk_is_tracked_from_its_images_alone(shared_data):
+    """Oracle: COLMAP's poses of the same images."""
+    import pycolmap
+
+    data = shared_data("desk")
+    frames = list(open_klt(SourceSettings(path=data / "images", scale=0.25)))
+    model = pycolmap.Reconstruction(str(data / "sparse" / "0"))
+    truth = {image.name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in model.images.values()}
+    assert len(frames) >= 27
+    poses = [truth[frame.name] for frame in frames]
+    error = absolute_trajectory_error([frame.T_camera_world for frame in frames], poses)
+    centres = np.array([-T[:3, :3].T @ T[:3, 3] for T in poses])
+    assert error < 0.01 * np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()

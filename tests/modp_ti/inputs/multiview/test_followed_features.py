@@ -1,0 +1,193 @@
+"""Corners followed along a video lie where geometry says, and nothing of a held-out frame reaches another."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.inputs.multiview import triangulation
+from modp_ti.inputs.multiview.followed_features import follow_features, looks_like_video
+from modp_ti.inputs.replay import PosedImage
+from modp_ti.inputs.sources import Distortion, ImageFolder, Undistorter
+
+FRAMES = 16
+SIZE = (240, 180)
+CAMERA = PinholeCamera(220.0, 220.0, 120.5, 89.0, *SIZE)
+METRES = 0.01  # of a texel of the plane z = 0
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A camera that passes a textured plane, three away, and turns meanwhile. Folder and T_camera_world (F, 4, 4)."""
+    rng = np.random.default_rng(11)
+    texture = np.zeros((600, 800), np.float32)
+    for size in (4, 8, 16, 40):
+        noise = rng.random((600 // size + 2, 800 // size + 2)).astype(np.float32)
+        texture += cv2.resize(noise, (800, 600), interpolation=cv2.INTER_CUBIC)
+    texture = np.clip(255 * (texture - texture.min()) / np.ptp(texture), 0, 255).astype(np.uint8)
+    world_texture = np.array([[METRES, 0, -4.0], [0, METRES, -3.0], [0, 0, 1]])
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # to cv2's integer centres
+    folder = tmp_path_factory.mktemp("video")
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    for i, T in enumerate(poses):
+        T[:3, :3] = Rotation.from_euler("yxz", [1.5 * i - 12, 0.4 * i, 0.5 * i], degrees=True).as_matrix()
+        T[:3, 3] = T[:3, :3] @ [0.05 * i - 0.4, 0.0, 3.0]
+        H = half @ CAMERA.matrix() @ T[:3, [0, 1, 3]] @ world_texture @ np.linalg.inv(half)
+        cv2.imwrite(str(folder / f"{i:03d}.png"), cv2.warpPerspective(texture, H, SIZE, flags=cv2.INTER_AREA))
+    return folder, poses
+
+
+def posed(video, camera: Undistorter | None = None) -> tuple[ImageFolder, list[PosedImage]]:
+    images = ImageFolder(video[0])
+    undistorter = camera or Undistorter(CAMERA)
+    return images, [PosedImage(name, undistorter, T) for name, T in zip(images.names, video[1], strict=True)]
+
+
+def on_plane(T: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Where (N, 2) on the plane z = 0 the rays of pixels meet it: the oracle."""
+    H = CAMERA.matrix() @ T[:3, [0, 1, 3]]
+    p = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(H).T
+    return p[:, :2] / p[:, 2:]
+
+
+def test_a_corner_stays_on_its_place_of_the_plane(video):
+    images, frames = posed(video)
+    found = follow_features(images, frames, np.ones(FRAMES, bool))
+    places = np.zeros((len(found.frame), 2))
+    for i, T in enumerate(video[1]):
+        places[found.frame == i] = on_plane(T, found.pixels[found.frame == i])
+    long = np.flatnonzero(np.bincount(found.track) >= 8)
+    assert len(long) > 100
+    spread = [np.linalg.norm(np.ptp(places[found.track == track], axis=0)) for track in long]
+    pixel = 3.0 / CAMERA.fx  # its size on the plane
+    assert np.median(spread) < 0.7 * pixel
+    assert np.percentile(spread, 90) < 2.0 * pixel
+    keys = found.frame * (found.track.max() + 1) + found.track
+    assert len(np.unique(keys)) == len(keys), "a track has one place in a frame"
+
+
+def test_points_lie_on_the_plane_and_keep_their_numbers(video, monkeypatch):
+    monkeypatch.setattr(triangulation, "FEW_FRAMES", 5)
+    images, frames = posed(video)
+    result = triangulation.triangulated_frames(images, frames, np.ones(FRAMES, bool))
+    for frame in result:
+        assert len(frame.points) >= 100
+        z = frame.points.xyz[:, 2]
+        assert np.median(np.abs(z)) < 0.02 and np.percentile(np.abs(z), 90) < 0.1  # three away
+        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+        error = np.linalg.norm(CAMERA.project(p) - frame.points.pixels, axis=1)
+        assert np.median(error) < 0.5
+    shared = set(result[4].points.ids.tolist()) & set(result[9].points.ids.tolist())
+    assert len(shared) >= 30
+
+
+def test_a_lens_is_followed_through_too(video, tmp_path, monkeypatch):
+    """The same views through a lens, made by cv2's own undistortion maps turned around."""
+    lens = Distortion((-0.15, 0.03))
+    columns, rows = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    K = CAMERA.matrix()
+    ideal = cv2.undistortPoints(
+        np.stack([columns, rows], -1).reshape(-1, 1, 2), K, np.array([-0.15, 0.03, 0, 0]), P=K
+    ).reshape(SIZE[1], SIZE[0], 2)
+    for file in sorted(video[0].iterdir()):
+        image = cv2.imread(str(file))
+        maps = (ideal - 0.5).astype(np.float32)
+        bent = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        cv2.imwrite(str(tmp_path / file.name), bent)
+    monkeypatch.setattr(triangulation, "FEW_FRAMES", 5)
+    images, frames = posed((tmp_path, video[1]), Undistorter(CAMERA, lens))
+    result = triangulation.triangulated_frames(images, frames, np.ones(FRAMES, bool))
+    z = np.concatenate([frame.points.xyz[:, 2] for frame in result])
+    assert len(z) > 1500 and np.median(np.abs(z)) < 0.03
+
+
+def test_held_out_frames_change_nothing_but_what_they_are_told(video, tmp_path, monkeypatch):
+    monkeypatch.setattr(triangulation, "FEW_FRAMES", 5)
+    held_out = np.arange(FRAMES) % 4 == 0
+    images, frames = posed(video)
+    before = triangulation.triangulated_frames(images, frames, ~held_out)
+    for i, file in enumerate(sorted(video[0].iterdir())):
+        image = cv2.imread(str(file))
+        cv2.imwrite(str(tmp_path / file.name), 255 - image if held_out[i] else image)
+    other, _ = posed((tmp_path, video[1]))
+    after = triangulation.triangulated_frames(other, frames, ~held_out)
+    places = [{tuple(xyz) for frame in frames for xyz in frame.points.xyz} for frames in (before, after)]
+    assert len(places[0]) > 150
+    assert places[0] == places[1], "bit for bit"
+    for i in np.flatnonzero(~held_out):
+        assert np.array_equal(before[i].points.pixels, after[i].points.pixels)
+        assert np.array_equal(before[i].points.ids, after[i].points.ids)
+    assert all(len(before[i].points) >= 80 for i in np.flatnonzero(held_out)), "the first frame too"
+    assert all(len(after[i].points) < 20 for i in np.flatnonzero(held_out)), "a negative shows none of the corners"
+
+
+def off(video) -> np.ndarray:
+    """The poses, each turned by half a degree and shifted by two pixels or so."""
+    rng = np.random.default_rng(2)
+    wrong = video[1].copy()
+    for T in wrong:
+        T[:3, :3] = Rotation.from_rotvec(np.radians(0.3) * rng.standard_normal(3)).as_matrix() @ T[:3, :3]
+        T[:3, 3] += 0.01 * rng.standard_normal(3)
+    return wrong
+
+
+def next_turns(poses: np.ndarray) -> Rotation:
+    return Rotation.from_matrix((poses[1:] @ np.linalg.inv(poses[:-1]))[:, :3, :3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("few", [5, 60], ids=["followed", "matched"])
+def test_adjusted_poses_are_those_of_the_images_and_none_hangs_on_held_out_ones(video, tmp_path, monkeypatch, few):
+    monkeypatch.setattr(triangulation, "FEW_FRAMES", few)
+    held_out = np.arange(FRAMES) % 4 == 0
+    wrong = off(video)
+    images, frames = posed((video[0], wrong))
+    result, note = triangulation.adjusted_frames(images, frames, ~held_out)
+    before, after = (float(word) for word in re.findall(r"([\d.]+) px", note))
+    assert after < 0.5 < before
+    found = np.stack([frame.T_camera_world for frame in result])
+    truth = next_turns(video[1])
+    before, after = (np.degrees((truth.inv() * next_turns(poses)).magnitude()) for poses in (wrong, found))
+    assert np.median(before) > 0.4
+    assert np.median(after) < 0.08 and after.max() < 0.25, "held-out frames too"
+    for i, frame in enumerate(result):
+        assert len(frame.points) >= (80 if held_out[i] else 100)
+        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+        assert np.median(np.linalg.norm(CAMERA.project(p) - frame.points.pixels, axis=1)) < 0.5
+
+    for i, file in enumerate(sorted(video[0].iterdir())):
+        image = cv2.imread(str(file))
+        cv2.imwrite(str(tmp_path / file.name), 255 - image[::-1] if held_out[i] else image)
+    other, _ = posed((tmp_path, wrong))
+    again, _ = triangulation.adjusted_frames(other, frames, ~held_out)
+    for i in np.flatnonzero(~held_out):
+        assert np.array_equal(result[i].T_camera_world, again[i].T_camera_world), "bit for bit"
+        assert np.array_equal(result[i].points.xyz, again[i].points.xyz)
+
+
+def test_frames_without_overlap_are_no_video(video, tmp_path):
+    images, frames = posed(video)
+    everything = np.ones(FRAMES, bool)
+    assert looks_like_video(images, frames, everything)
+    rng = np.random.default_rng(0)
+    for file in video[0].iterdir():
+        noise = cv2.resize(rng.integers(0, 255, (45, 60, 3), dtype=np.uint8), SIZE, interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(tmp_path / file.name), noise)
+    strange, frames = posed((tmp_path, video[1]))
+    assert not looks_like_video(strange, frames, everything)
+    assert not looks_like_video(images, frames[:1], everything[:1])
+
+
+def test_frames_without_any_corner_have_none(tmp_path, video):
+    for i in range(4):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((SIZE[1], SIZE[0], 3), 128, np.uint8))
+    images, frames = posed((tmp_path, video[1][:4]))
+    found = follow_features(images, frames, np.ones(4, bool))
+    assert len(found.frame) == len(found.pixels) == 0
+    assert len(follow_features(images, frames, np.zeros(4, bool)).frame) == 0

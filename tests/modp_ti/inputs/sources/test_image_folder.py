@@ -1,0 +1,135 @@
+"""A folder of images is listed in natural order, decoded as stored, and bad images are named."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import ImageFolder
+
+IMAGE = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Makes images of the given names (RGB: `IMAGE`) and opens their folder."""
+
+    def make(*names: str) -> ImageFolder:
+        for name in names:
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(tmp_path / name), IMAGE[..., ::-1])
+        return ImageFolder(tmp_path)
+
+    return make
+
+
+def test_names_are_in_natural_order_with_subfolders_and_without_other_files(folder, tmp_path):
+    (tmp_path / "notes.txt").write_text("x")
+    made = folder("f10.png", "f9.png", "F2.PNG", "f0010.jpg", "b/1.png", ".hidden/1.png", "._f9.png")
+    assert made.names == ("b/1.png", "F2.PNG", "f9.png", "f0010.jpg", "f10.png")
+    assert [made.position(name) for name in made.names] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".tiff", ".ppm"])
+def test_pixels_are_rgb_and_exact(folder, suffix):
+    made = folder("a" + suffix)
+    assert np.array_equal(made.read("a" + suffix), IMAGE)
+    assert made.size("a" + suffix) == (30, 20)
+
+
+def test_jpeg_is_decoded(folder):
+    flat = ImageFolder(folder("a.jpeg").path)
+    assert flat.read("a.jpeg").shape == (20, 30, 3)
+    assert flat.size("a.jpeg") == (30, 20)
+
+
+def test_grey_sixteen_bit_and_transparent_images_become_rgb_bytes(folder, tmp_path):
+    made = folder("a.png")
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 5), 0x8000, np.uint16))
+    assert made.read("a.png").tolist() == np.full((4, 5, 3), 128).tolist()
+    cv2.imwrite(
+        str(tmp_path / "a.png"),
+        np.dstack([np.full((4, 5, 3), (1, 2, 3), np.uint8), np.zeros((4, 5), np.uint8)]),
+    )
+    assert made.read("a.png")[0, 0].tolist() == [3, 2, 1]
+
+
+def test_exif_orientation_is_not_applied(folder, tmp_path):
+    made = folder("a.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    # TIFF header, one entry: tag 0x0112 (orientation), SHORT, 1 value, 6 = turn by 90 degrees
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    (tmp_path / "a.jpg").write_bytes(data[:2] + segment + data[2:])
+    assert cv2.imread(str(tmp_path / "a.jpg")).shape == (30, 20, 3), "the file asks to be turned"
+    assert made.read("a.jpg").shape == (20, 30, 3)
+    assert made.size("a.jpg") == (30, 20)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
+@pytest.mark.parametrize("part", [0.0, 0.1, 0.6, 0.98])
+def test_image_that_was_cut_off_is_named(folder, tmp_path, suffix, part, capfd):
+    made = folder("good" + suffix, "bad" + suffix)
+    file = tmp_path / ("bad" + suffix)
+    file.write_bytes(file.read_bytes()[: int(part * file.stat().st_size)])
+    for use in (made.read, made.size):
+        with pytest.raises(InputError, match=rf"bad\{suffix}: unreadable image: .*; replace it") as caught:
+            use("bad" + suffix)
+        assert "\n" not in str(caught.value)
+    assert made.read("good" + suffix).shape == (20, 30, 3)
+    assert capfd.readouterr().err == "", "the decoder's own complaints are kept quiet"
+
+
+def test_file_that_only_looks_like_an_image_is_named(folder, tmp_path):
+    made = folder("a.png")
+    for content in (b"no image at all", b"\xff\xd8" + bytes(100) + b"\xff\xd9"):
+        (tmp_path / "a.png").write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.png: unreadable image"):
+            made.read("a.png")
+
+
+def test_image_that_vanished_is_named(folder, tmp_path):
+    made = folder("a.png")
+    (tmp_path / "a.png").unlink()
+    for use in (made.read, made.size):
+        with pytest.raises(InputError, match=r"a\.png: unreadable image: No such file"):
+            use("a.png")
+
+
+def test_missing_or_empty_folder_is_named(tmp_path):
+    with pytest.raises(InputError, match="gone: no such folder of images"):
+        ImageFolder(tmp_path / "gone")
+    with pytest.raises(InputError, match="holds no image"):
+        ImageFolder(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="this is a file"):
+        ImageFolder(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ("a/1.png", "a/1.png"),
+        ("./a/1.png", "a/1.png"),
+        ("dataset/a/1.png", "a/1.png"),
+        ("dataset\\a\\1.png", "a/1.png"),
+        ("/abs/a/1", "a/1.png"),
+        ("3.5", "3.5.png"),
+        ("2.jpg", None),
+        ("1.png", None),
+        ("a", None),
+        ("", None),
+    ],
+)
+def test_name_of_a_tracker_is_found_by_its_end_and_without_suffix(folder, asked, found):
+    assert folder("a/1.png", "2.png", "3.5.png").find(asked) == found
+
+
+def test_range_selects_by_position(folder):
+    made = folder(*(f"{i}.png" for i in range(12)))
+    assert made.selected(1, 8, 3) == ("1.png", "4.png", "7.png")
+    assert made.selected(10, None, 1) == ("10.png", "11.png")
+    with pytest.raises(InputError, match=r"source\.start=12 leaves no frame"):
+        made.selected(12, None, 1)

@@ -1,0 +1,295 @@
+"""A live source delivers frames as they come, can be read again, drops what nobody takes, and lets go at its end.
+
+The stream is MJPEG over HTTP from a server in a thread of this process, which sends a frame when the test says so.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from queue import SimpleQueue
+
+import cv2
+import numpy as np
+import pytest
+
+from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import open_source
+from modp_ti.inputs.sources.live import WAITING, LiveSource
+
+PATIENCE = 30.0  # seconds until a test gives up
+
+
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Ctrl-C as in a shell's foreground: a process that was started in the background may ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def jpeg(number: int) -> bytes:
+    """A flat picture whose grey value tells its number."""
+    _, data = cv2.imencode(".jpg", np.full((48, 64, 3), 5 * number, np.uint8))
+    return data.tobytes()
+
+
+class Camera:
+    """send: a frame of this number; end: of the stream."""
+
+    def __init__(self) -> None:
+        self._frames: SimpleQueue[int | None] = SimpleQueue()
+        camera = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                while (number := camera._frames.get()) is not None:
+                    data = jpeg(number)
+                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                    try:
+                        self.wfile.write(head.encode() + data + b"\r\n")
+                    except OSError:
+                        return  # the client is gone
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        self.url = f"http://user:secret@127.0.0.1:{self._server.server_address[1]}/stream.mjpg?quality=90"
+
+    def send(self, *numbers: int) -> None:
+        for number in numbers:
+            self._frames.put(number)
+
+    def end(self) -> None:
+        self._frames.put(None)
+
+    def shut_down(self) -> None:
+        self.end()
+        self._server.shutdown()
+        self._server.server_close()
+
+
+@pytest.fixture
+def camera():
+    made = Camera()
+    yield made
+    made.shut_down()
+
+
+@pytest.fixture
+def opened(camera):
+    """Opens the camera, which needs some frames sent to begin with, and closes it at the end of the test."""
+    sources = []
+
+    def make() -> LiveSource:
+        sources.append(LiveSource(camera.url))
+        return sources[-1]
+
+    yield make
+    camera.end()  # else their threads wait for the next frame
+    for source in sources:
+        source.close()
+
+
+def wait_until(condition) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+
+
+def numbers(source: LiveSource, names) -> list[int]:
+    return [round(source.read(name).mean() / 5) for name in names]
+
+
+def test_frames_arrive_in_order_with_their_times_and_can_be_read_again(camera, opened):
+    camera.send(*range(6))
+    camera.end()
+    before = time.time()
+    source = opened()
+    names = list(source.arriving(0, None, 1))
+    assert names == [f"live_{i:06d}" for i in range(6)] == list(source.names)
+    times = [source.timestamp(name) for name in names]
+    assert times == sorted(times) and before <= times[0] and times[-1] <= time.time() + 0.5
+    for again in range(2):
+        assert numbers(source, names) == list(range(6)), again
+        assert list(source.arriving(0, None, 1)) == names, "as for the evaluation at a run's end"
+    assert list(source.arriving(1, 5, 2)) == ["live_000001", "live_000003"] == list(source.selected(1, 5, 2))
+    assert source.position("live_000004") == 4
+    assert source.size("live_000004") == (64, 48)
+    assert source.find("x/live_000002.png") == "live_000002" and source.find("2") is None
+    assert len(source.notes) == 1, "nothing was dropped"
+    source.add_note("the camera is guessed")
+    assert source.notes[1:] == ["the camera is guessed"]
+
+
+def test_what_is_read_again_is_what_the_decoder_gave(camera, opened):
+    camera.send(*range(4))
+    camera.end()
+    source = opened()
+    name = list(source.arriving(0, None, 1))[3]
+    expected = cv2.imdecode(np.frombuffer(jpeg(3), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert np.abs(source.read(name).astype(int) - expected).max() <= 2  # two decoders of JPEG
+    assert np.array_equal(source.read(name), source.read(name))
+
+
+def test_a_frame_is_delivered_before_the_next_has_come(camera, opened):
+    camera.send(0, 1, 2, 3, 4)  # the decoder looks at some before it opens
+    source = opened()
+    arriving = source.arriving(0, None, 1)
+    first = [next(arriving) for _ in range(3)]
+    assert numbers(source, first) == [0, 1, 2]
+    camera.send(5, 6, 7, 8, 9)
+    assert numbers(source, [next(arriving) for _ in range(4)]) == [3, 4, 5, 6]
+
+
+def test_frames_that_nobody_takes_are_dropped_oldest_first_and_counted(camera, opened):
+    total = WAITING + 15
+    camera.send(*range(total))
+    camera.end()
+    source = opened()
+    wait_until(lambda: not source._thread.is_alive())
+    names = list(source.arriving(0, None, 1))
+    assert numbers(source, names) == list(range(15, total))
+    assert source.dropped == 15
+    assert source.notes[1].startswith("15 frames of ") and source.notes[1].endswith(f"dropped; {WAITING} were used")
+
+
+def test_stop_lets_the_camera_go(camera, opened):
+    camera.send(*range(8))
+    source = opened()
+    assert numbers(source, list(source.arriving(0, 3, 1))) == [0, 1, 2]
+    camera.send(*range(8, 12))  # the thread may be waiting for one
+    wait_until(lambda: not source._thread.is_alive())
+    assert len(source) == 3
+
+
+def test_close_ends_the_thread_and_removes_what_was_kept(camera, opened):
+    camera.send(*range(6))
+    source = opened()
+    name = next(source.arriving(0, None, 1))
+    folder = Path(source._kept.name)
+    assert [file.name for file in folder.iterdir()] == ["000000.png"]
+    camera.send(*range(6))
+    source.close()
+    source.close()  # a second time is no fault
+    assert not source._thread.is_alive()
+    assert not folder.exists()
+    with pytest.raises(InputError, match=r"000000\.png: the frame that was kept there is gone"):
+        source.read(name)
+
+
+def test_ctrl_c_ends_the_recording_and_a_second_one_interrupts(camera, opened):
+    camera.send(*range(6))
+    source = opened()
+    arriving = source.arriving(0, None, 1)
+    taken = [next(arriving)]
+    os.kill(os.getpid(), signal.SIGINT)
+    taken += arriving  # ends though the stream does not
+    assert numbers(source, taken) == list(range(len(taken)))
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(PATIENCE)
+
+
+def test_ctrl_c_after_the_end_of_the_stream_interrupts(camera, opened):
+    camera.send(*range(6))
+    source = opened()
+    assert len(list(source.arriving(0, 4, 1))) == 4
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(PATIENCE)
+
+
+def test_closing_gives_ctrl_c_back(camera, opened):
+    before = signal.getsignal(signal.SIGINT)
+    camera.send(*range(6))
+    source = opened()
+    assert signal.getsignal(signal.SIGINT) != before
+    camera.end()
+    source.close()
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_process_that_forgets_to_close_ends_cleanly(camera):
+    code = (
+        "import sys; from modp_ti.inputs.sources.live import LiveSource; source = LiveSource(sys.argv[1]); "
+        "print(next(source.arriving(0, None, 1))); print(source._kept.name)"
+    )
+    camera.send(*range(40))
+    result = subprocess.run([sys.executable, "-c", code, camera.url], capture_output=True, text=True, check=True)
+    assert result.stderr == ""
+    name, folder = result.stdout.split()
+    assert name == "live_000000" and not Path(folder).exists()
+
+
+def test_passwords_are_not_shown(camera, opened):
+    camera.send(*range(6))
+    source = opened()
+    assert str(source.path).endswith("/stream.mjpg") and str(source.path).startswith("127.0.0.1:")
+    assert "secret" not in " ".join(source.notes)
+
+
+def test_past_frames_are_asked_of_it_in_vain_before_any_was_taken(camera, opened):
+    camera.send(*range(6))
+    with pytest.raises(InputError, match="a live source has no past frames: take a tracker that follows it"):
+        opened().selected(0, None, 1)
+
+
+def test_given_intrinsics_are_for_the_streams_size(camera):
+    camera.send(*range(6))
+    settings = SourceSettings(stream=camera.url, intrinsics=IntrinsicsSettings(fx=70.0))
+    source = open_source(settings)
+    camera.end()
+    source.close()
+    assert (source.intrinsics.camera.cx, source.intrinsics.camera.height) == (32.0, 48)
+
+
+def test_intrinsics_of_another_size_let_the_camera_go(camera):
+    threads = threading.active_count()
+    camera.send(*range(6))
+    camera.end()
+    settings = SourceSettings(stream=camera.url, intrinsics=IntrinsicsSettings(fx=70.0, width=640, height=480))
+    with pytest.raises(InputError, match=r"source\.intrinsics are for 640x480, the images are 64x48"):
+        open_source(settings)
+    wait_until(lambda: threading.active_count() <= threads)
+
+
+def test_full_disk_is_said_in_one_line(camera, opened, monkeypatch):
+    camera.send(*range(6))
+    source = opened()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(InputError, match=r"cannot be kept there: No space left on device; make room, or set TMPDIR"):
+        next(source.arriving(0, None, 1))
+
+
+@pytest.mark.parametrize(
+    ("stream", "message"),
+    [
+        (99, "camera 99: no such camera, or it is in use (source.stream)"),
+        ("98", "camera 98: no such camera, or it is in use (source.stream)"),
+        ("http://user:secret@127.0.0.1:1/x", "127.0.0.1:1/x: no stream that can be opened (source.stream)"),
+        (__file__, f"{__file__}: is a file (source.stream): give it as source.path"),
+    ],
+)
+def test_stream_that_is_not_there_is_named(stream, message):
+    with pytest.raises(InputError) as caught:
+        LiveSource(stream)
+    assert str(caught.value) == message

@@ -1,0 +1,135 @@
+"""A source is recognised by what is there, and said; the user's intrinsics win, and must be of the images' size."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from modp_ti.config.scene_file import load_scene
+from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import ImageFolder, open_source, require_intrinsics
+from modp_ti.inputs.sources.recognition import recognised_kind
+
+
+def image(file, width=64, height=48):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(file), np.zeros((height, width, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("files", "kind"),
+    [
+        (["a.png"], "images"),
+        (["images/a.png", "depth/a.png"], "images"),
+        (["results/a.png"], "images"),
+        (["rgb/1.0.png", "rgb.txt"], "tum_rgbd"),
+        (["results/frame000000.jpg", "results/depth000000.png", "traj.txt"], "replica"),
+        (["frame-000000.color.png", "frame-000000.depth.png"], "sevenscenes"),
+        (["images/frame-000000.color.jpg"], "sevenscenes"),
+        (["frame-000000.depth.png"], "images"),
+        (["rectified/0.png", "trajectory.json"], "release"),
+    ],
+)
+def test_folder_is_recognised_by_its_layout(tmp_path, files, kind):
+    for name in files:
+        image(tmp_path / name) if name.endswith((".png", ".jpg")) else (tmp_path / name).write_text("")
+    assert recognised_kind(tmp_path) == kind
+
+
+def test_file_is_recognised_by_its_suffix(tmp_path):
+    for name, kind in (("a.MOV", "video"), ("a.webm", "video"), ("a.vrs", "vrs")):
+        assert recognised_kind(tmp_path / name) == kind
+    (tmp_path / "a.pdf").write_text("")
+    with pytest.raises(InputError, match=r"a\.pdf: is neither a folder of images nor a file that \.pdf tells"):
+        recognised_kind(tmp_path / "a.pdf")
+
+
+def test_plain_images_need_no_word_and_may_be_insisted_on(tmp_path):
+    image(tmp_path / "frame-000000.color.png")
+    image(tmp_path / "frame-000000.depth.png")
+    insisted = open_source(SourceSettings(path=tmp_path, kind="images"))
+    assert isinstance(insisted, ImageFolder)
+    assert len(insisted) == 2 and insisted.notes == [] and insisted.intrinsics is None
+
+
+def camera_of(tmp_path, **given) -> tuple:
+    image(tmp_path / "images" / "a.png")
+    source = SourceSettings(path=tmp_path / "images", intrinsics=IntrinsicsSettings(**given))
+    return open_source(source).intrinsics
+
+
+def test_given_intrinsics_are_opencvs_in_our_pixels(tmp_path):
+    lens = {"k1": 0.11, "k2": -0.08, "p1": 0.003, "p2": -0.002, "k3": 0.02}
+    made = camera_of(tmp_path, fx=50.0, fy=51.0, cx=33.0, cy=25.0, **lens)
+    points = np.array([[0.2, -0.1, 1.0], [-0.5, 0.3, 1.2], [0.0, 0.4, 1.0]])
+    K = np.array([[50.0, 0, 33.0], [0, 51.0, 25.0], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(list(lens.values())))
+    ideal = made.distortion.distort(points[:, :2] / points[:, 2:])
+    np.testing.assert_allclose(ideal * (made.camera.fx, made.camera.fy) + (33, 25), expected[:, 0], atol=1e-9)
+    assert (made.camera.width, made.camera.height) == (64, 48)
+
+
+def test_given_fisheye_is_opencvs(tmp_path):
+    made = camera_of(tmp_path, fx=30.0, k1=0.05, k2=-0.01, k3=0.003, k4=-0.001, fisheye=True)
+    points = np.array([[[0.9, -0.4, 1.0]], [[-0.3, 1.3, 1.0]]])
+    K = np.array([[30.0, 0, 32], [0, 30, 24], [0, 0, 1]])
+    lens = np.array([0.05, -0.01, 0.003, -0.001])
+    expected, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, lens)
+    ideal = made.distortion.distort(points[:, 0, :2])
+    np.testing.assert_allclose(ideal * 30 + (32, 24), expected[:, 0], atol=1e-9)
+
+
+def test_given_intrinsics_win_over_the_data_sets(tmp_path):
+    image(tmp_path / "results" / "frame000000.jpg", 1200, 680)
+    given = IntrinsicsSettings(fx=700.0)
+    made = open_source(SourceSettings(path=tmp_path, intrinsics=given))
+    assert (made.intrinsics.camera.fx, made.intrinsics.camera.fy) == (700.0, 700.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"cx": 16.0, "cy": 12.0}, "cx 16, cy 12 lie far from the middle of the 64x48 images"),
+        ({"cx": 64.0, "cy": 48.0}, "cx 64, cy 48 lie far from the middle"),
+        ({"width": 128, "height": 96}, "source.intrinsics are for 128x96, the images are 64x48"),
+    ],
+)
+def test_intrinsics_of_another_size_are_refused(tmp_path, given, message):
+    with pytest.raises(InputError, match=message):
+        camera_of(tmp_path, fx=50.0, **given)
+
+
+def test_a_principal_point_off_the_middle_is_taken_where_the_size_is_given(tmp_path):
+    assert camera_of(tmp_path, fx=50.0, cx=16.0, cy=12.0, width=64, height=48).camera.cx == 16.0
+
+
+def test_camera_that_is_not_known_is_asked_for(tmp_path):
+    image(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"the camera is not known: give source\.intrinsics: \{fx"):
+        require_intrinsics(open_source(SourceSettings(path=tmp_path)))
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("{kind: live}", "source.stream is missing: `source.kind: live` needs a camera number or a URL"),
+        ("{kind: video, stream: 0}", "source.stream is for `source.kind: live`, not video"),
+        ("{path: a, stream: 0}", "source.path and source.stream cannot both be given"),
+        ("{path: a, intrinsics: {fx: 500}}", "tracker.kind: colmap brings its own cameras; take source.intrinsics out"),
+        ("{path: a, intrinsics: {cx: 500}}", "source.intrinsics.fx is missing"),
+        ("{path: a, intrinsics: {fx: 500, k4: 0.1}}", "source.intrinsics.k4 is for `fisheye: true` alone"),
+        ("{path: a, intrinsics: {fx: 500, p1: 0.1, fisheye: true}}", "OpenCV's fisheye model has no p1 and p2"),
+        ("{path: a, intrinsics: {fx: 500, width: 640}}", "give width and height, or neither"),
+        ("{path: a, kind: film}", "source.kind: must be 'auto', 'images', 'video'"),
+        ("{stream: 0}", "tracker.kind: colmap cannot follow source.stream"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused_by_line(tmp_path, source, message):
+    file = tmp_path / "scene.yaml"
+    file.write_text(f"tracker: {{kind: colmap}}\noutput: out\nsource: {source}\n")
+    with pytest.raises(InputError) as caught:
+        load_scene(file)
+    assert message in str(caught.value)
+    assert str(caught.value).startswith(str(file))

@@ -1,0 +1,361 @@
+"""A video's frames are those of the file in any order, with the container's times; bad files get one line.
+
+Oracles: what was written (a lossless codec), OpenCV's reading from the first frame to the last, to the bit, and MP4
+files whose bytes are changed by hand.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from fractions import Fraction
+from pathlib import Path
+from threading import Thread
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import VideoFile
+
+FRAMES, FPS = 40, 12.5
+RNG = np.random.default_rng(5)
+IMAGES = [cv2.GaussianBlur(RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8), (0, 0), 2) for _ in range(FRAMES)]
+# Inter-coded with a keyframe every twelve frames, each frame on its own, and lossless.
+CODECS = {"room.mp4": "mp4v", "room.avi": "MJPG", "room.mkv": "FFV1"}
+# Written by FFmpeg: codec and pixels; with frames out of order, ten bits, grey, other colours, and a late first frame.
+FORMS = {
+    "film/room.mp4": ("libx264", {"pix_fmt": "yuv420p", "colorspace": 1, "color_range": 1}),
+    "full/room.mp4": ("libx264", {"pix_fmt": "yuvj420p", "colorspace": 1, "color_range": 2}),
+    "deep/room.mkv": ("libx264", {"pix_fmt": "yuv420p10le"}),
+    "grey/room.mkv": ("ffv1", {"pix_fmt": "gray"}),
+    "room.webm": ("libvpx-vp9", {"pix_fmt": "yuv420p"}),
+    "room.ts": ("mpeg4", {"pix_fmt": "yuv420p"}),
+}
+
+
+def write(file: Path, codec: str, images=IMAGES) -> Path:
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*codec), FPS, (64, 48))
+    assert writer.isOpened()
+    for image in images:
+        writer.write(image[..., ::-1])
+    writer.release()
+    return file
+
+
+def by_ffmpeg(file: Path, codec: str, metadata: str = "", **properties) -> Path:
+    """Properties: of the codec's context."""
+    file.parent.mkdir(exist_ok=True)
+    with av.open(str(file), "w") as output:
+        output.metadata["title"] = metadata
+        stream = output.add_stream(codec, rate=Fraction(FPS))
+        for name, value in {"width": 64, "height": 48, "pix_fmt": "yuv420p", **properties}.items():
+            setattr(stream.codec_context, name, value)
+        for image in (*IMAGES, None):
+            frame = None if image is None else av.VideoFrame.from_ndarray(image, format="rgb24")
+            output.mux(stream.encode(frame))
+    return file
+
+
+@pytest.fixture(params=[*CODECS, *FORMS.items()], ids=[*CODECS, *("ffmpeg's " + name for name in FORMS)])
+def video(tmp_path, request) -> Path:
+    if isinstance(request.param, str):
+        return write(tmp_path / request.param, CODECS[request.param])
+    name, (codec, properties) = request.param
+    return by_ffmpeg(tmp_path / name, codec, **properties)
+
+
+@pytest.fixture
+def mp4(tmp_path) -> Path:
+    return write(tmp_path / "room.mp4", "mp4v")
+
+
+def by_opencv(file: Path) -> list[np.ndarray]:
+    capture, images = cv2.VideoCapture(str(file)), []
+    while True:
+        more, image = capture.read()
+        if not more:
+            return images
+        images.append(image[..., ::-1])
+
+
+def test_frames_are_named_counted_and_timed_by_the_container(video):
+    made = VideoFile(video, fps=99.0)
+    assert made.names[:2] == ("room_000000", "room_000001")
+    assert len(made) == FRAMES
+    assert made.position("room_000012") == 12
+    assert made.size("room_000003") == (64, 48)
+    np.testing.assert_allclose([made.timestamp(n) for n in made.names], np.arange(FRAMES) / FPS, atol=1e-3)
+    assert made.notes == [] and made.intrinsics is None
+
+
+def test_every_order_of_reading_gives_the_frames_of_the_file(video):
+    expected = by_opencv(video)
+    backwards, shuffled = range(FRAMES - 1, -1, -1), RNG.permutation(FRAMES)
+    for orders in ([range(FRAMES)] * 2, [range(0, FRAMES, 7), backwards], [shuffled, shuffled[::-1]]):
+        made = VideoFile(video)
+        for order in orders:
+            for i in order:
+                assert np.array_equal(made.read(made.names[i]), expected[i]), (list(order), i)
+
+
+def test_times_are_those_of_opencv_to_the_bit(video):
+    made, capture = VideoFile(video), cv2.VideoCapture(str(video))
+    for name in made.names:
+        assert capture.grab()
+        assert made.timestamp(name) == capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+
+
+def test_frames_out_of_order_are_timed_where_the_container_knows_only_their_order(tmp_path):
+    """AVI states no times and FFmpeg guesses them; OpenCV gave those of decoding, and 0 for the last two frames."""
+    file = by_ffmpeg(tmp_path / "room.avi", "libx264")
+    made, expected = VideoFile(file), by_opencv(file)
+    assert made.notes == []
+    times = np.array([made.timestamp(name) for name in made.names])
+    assert (np.diff(times) > 0).all() and np.abs(times - np.arange(FRAMES) / FPS).max() < 2.5 / FPS
+    for i in (*range(FRAMES), 3, 38, 20):
+        assert np.array_equal(made.read(made.names[i]), expected[i]), i
+
+
+def test_lossless_video_gives_the_very_pixels_that_were_written(tmp_path):
+    made = VideoFile(write(tmp_path / "a.mkv", "FFV1"))
+    difference = [np.abs(made.read(n).astype(int) - image).max() for n, image in zip(made.names, IMAGES, strict=True)]
+    assert max(difference) == 0
+
+
+def test_frames_behind_a_place_that_seeking_gets_wrong_are_right_all_the_same(mp4, monkeypatch):
+    """A container whose search lands elsewhere than it says is found out, and read from its beginning."""
+    from modp_ti.inputs.sources.video_decoder import VideoDecoder
+
+    made, expected = VideoFile(mp4), by_opencv(mp4)
+    for name in made.names:
+        made.read(name)
+    lands_at = VideoDecoder.seek
+
+    def two_frames_late(decoder, milliseconds):
+        shown = lands_at(decoder, milliseconds)
+        decoder.advance(), decoder.advance()
+        return shown
+
+    monkeypatch.setattr(VideoDecoder, "seek", two_frames_late)
+    for i in (30, 5, 17, 2):
+        assert np.array_equal(made.read(made.names[i]), expected[i])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damaged_video_looks_the_same_whenever_it_is_read(mp4, seed):
+    rng, data = np.random.default_rng(seed), bytearray(mp4.read_bytes())
+    end = data.index(b"moov") - 4
+    for place in rng.integers(500, end, 25):
+        data[place] ^= 0xFF
+    mp4.write_bytes(data)
+    made, again = VideoFile(mp4), VideoFile(mp4)
+    first = [made.read(name) for name in made.names]
+    order = rng.permutation(len(made))
+    assert all(np.array_equal(made.read(made.names[i]), first[i]) for i in order)
+    assert all(np.array_equal(again.read(again.names[i]), first[i]) for i in order)
+    assert len(made) > 20
+
+
+def test_a_frame_that_cannot_be_decoded_does_not_end_the_video(tmp_path):
+    file = write(tmp_path / "room.avi", "MJPG")
+    expected = by_opencv(file)
+
+    def spoil(data: bytearray) -> None:
+        place = [at for at in range(data.index(b"movi"), len(data)) if data.startswith(b"00dc", at)][20]
+        length = int.from_bytes(data[place + 4 : place + 8], "little")
+        data[place + 8 : place + 8 + length] = bytes(length)
+
+    made = VideoFile(patch(file, spoil))
+    assert len(made) == FRAMES - 1
+    for order in (range(FRAMES - 1), range(FRAMES - 2, -1, -1)):
+        for i in order:
+            assert np.array_equal(made.read(made.names[i]), expected[i + (i >= 20)]), i
+
+
+def test_frames_of_another_size_are_brought_to_that_of_the_first(tmp_path):
+    parts = [by_ffmpeg(tmp_path / f"{width}.ts", "mpeg4", width=width) for width in (64, 96)]
+    (tmp_path / "room.ts").write_bytes(b"".join(part.read_bytes() for part in parts))
+    made = VideoFile(tmp_path / "room.ts")
+    shapes = {made.read(made.names[i]).shape for i in (len(made) - 1, 2, FRAMES + 9, 30)}
+    assert (len(made), shapes, made.size(made.names[-1])) == (2 * FRAMES, {(48, 64, 3)}, (64, 48))
+
+
+def test_two_threads_may_read(mp4):
+    made, expected, wrong = VideoFile(mp4), by_opencv(mp4), []
+
+    def read(order):
+        wrong.extend(i for i in order if not np.array_equal(made.read(made.names[i]), expected[i]))
+
+    threads = [Thread(target=read, args=(order,)) for order in (range(FRAMES), range(FRAMES - 1, -1, -1))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def test_stop_ends_the_reading_there(mp4):
+    made = VideoFile(mp4, stop=7)
+    assert len(made) == 7
+    assert made.selected(1, 7, 3) == ("room_000001", "room_000004")
+    with pytest.raises(InputError, match=r"source\.start=7 leaves no frame of the 7 in the file"):
+        made.selected(7, None, 1)
+
+
+def patch(file: Path, change) -> Path:
+    data = bytearray(file.read_bytes())
+    change(data)
+    file.write_bytes(data)
+    return file
+
+
+def test_frame_times_are_those_of_the_time_table(mp4):
+    def faster(data: bytearray) -> None:
+        # stts: length, kind, version and flags, one entry: number of frames and the time of each
+        place = data.index(b"stts") + 16
+        data[place : place + 4] = (int.from_bytes(data[place : place + 4], "big") // 4).to_bytes(4, "big")
+
+    made = VideoFile(patch(mp4, faster))
+    np.testing.assert_allclose([made.timestamp(n) for n in made.names], np.arange(FRAMES) / FPS / 4, atol=1e-3)
+
+
+def test_portrait_that_was_recorded_lying_is_turned_and_said(mp4):
+    upright = by_opencv(mp4)
+
+    def lie_down(data: bytearray) -> None:
+        # tkhd ends in a 3x3 matrix (16.16 fixed point, its last column 2.30), width and height: a turn by 90 degrees
+        place = data.index(b"tkhd") + 4 + 40
+        matrix = [0, 1 << 16, 0, -(1 << 16), 0, 0, 48 << 16, 0, 1 << 30]
+        data[place : place + 36] = b"".join(value.to_bytes(4, "big", signed=True) for value in matrix)
+
+    made = VideoFile(patch(mp4, lie_down))
+    assert made.size("room_000000") == (48, 64)
+    assert np.array_equal(made.read("room_000009"), np.rot90(upright[9], -1))
+    assert made.notes == [
+        f"{mp4} asks to be turned clockwise by 90 degrees, and is: its frames are 48x64, and intrinsics are for that"
+    ]
+
+
+def test_stream_without_times_is_timed_by_the_setting(tmp_path):
+    made = VideoFile(by_ffmpeg(tmp_path / "room.h264", "libx264"), fps=20.0)
+    assert made.timestamp("room_000010") == 0.5
+    assert "holds no frame times: frame n is taken to be of second n / 20" in made.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ("room_000003", "room_000003"),
+        ("frames/room_000003.png", "room_000003"),
+        ("frames\\room_000003.JPG", "room_000003"),
+        ("room_000040", None),
+        ("000003.png", None),
+        ("room.mp4", None),
+        ("", None),
+    ],
+)
+def test_a_frame_is_found_by_its_whole_name_alone(mp4, asked, found):
+    assert VideoFile(mp4).find(asked) == found
+
+
+@pytest.mark.parametrize("part", [0.5, 0.9])
+@pytest.mark.parametrize("codec", [c for c in CODECS if c != "room.mp4"])
+def test_cut_off_video_is_named_with_its_mend(tmp_path, codec, part):
+    file = write(tmp_path / codec, CODECS[codec])
+    whole = by_opencv(file)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(part * len(data))])
+    with pytest.raises(InputError, match=r"cut off, \d+ bytes are missing: copy it again, or set") as caught:
+        VideoFile(file)
+    readable = int(str(caught.value).partition("source.stop: ")[2].split()[0])
+    assert 0 < readable < FRAMES
+    rest = VideoFile(file, stop=readable)  # the mend
+    assert len(rest) == readable
+    assert np.array_equal(rest.read(rest.names[1]), whole[1])
+
+
+def test_mp4_without_its_table_is_named(mp4):
+    mp4.write_bytes(mp4.read_bytes()[:3000])  # the table comes last
+    with pytest.raises(InputError, match=r"room\.mp4: the video is cut off, \d+ bytes are missing: copy it again$"):
+        VideoFile(mp4)
+
+
+def test_files_that_are_no_videos_are_named(tmp_path):
+    file = tmp_path / "a.mp4"
+    for content, message in ((b"", "the video file is empty"), (b"no video", "no video that FFmpeg can read")):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=rf"a\.mp4: {message}"):
+            VideoFile(file)
+    with pytest.raises(InputError, match=r"gone\.mp4: no such video file"):
+        VideoFile(tmp_path / "gone.mp4")
+    with pytest.raises(InputError, match="must be a file, this is a folder"):
+        VideoFile(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile room.mp4\n", "#EXTM3U\n#EXTINF:3,\nroom.mp4\n"])
+def test_lists_that_name_other_files_are_no_videos(mp4, text):
+    for name in ("list.mp4", "list.m3u8"):
+        (mp4.parent / name).write_text(text)
+        with pytest.raises(InputError, match="no video that FFmpeg can read"):
+            VideoFile(mp4.parent / name)
+
+
+def test_frames_beyond_the_largest_image_are_refused(tmp_path, monkeypatch):
+    from modp_ti.inputs.sources import video_decoder
+
+    files = [by_ffmpeg(tmp_path / name, "mpeg4") for name in ("room.mp4", "room.ts")]
+    for limit, refused in ((64 * 48 - 1, True), (1 << 20, False)):  # codecs count what they put around an image
+        monkeypatch.setattr(video_decoder, "LIMITS", {"max_pixels": str(limit)})
+        for file in files:
+            if refused:
+                with pytest.raises(InputError, match="no video that FFmpeg can read"):
+                    VideoFile(file)
+            else:
+                assert len(VideoFile(file)) == FRAMES
+
+
+def test_words_in_another_encoding_do_no_harm(tmp_path):
+    file = by_ffmpeg(tmp_path / "room.mp4", "mpeg4", metadata="kitchen")
+    file.write_bytes(file.read_bytes().replace(b"kitchen", "k\xfcche..".encode("latin-1")))
+    assert len(VideoFile(file)) == FRAMES
+
+
+def test_video_without_a_frame_is_named(mp4):
+    def no_frames(data: bytearray) -> None:
+        for table, entry in ((b"stts", 4), (b"stsz", 8), (b"stsc", 4), (b"stco", 4)):  # the number of entries
+            place = data.index(table) + 4 + entry
+            data[place : place + 4] = bytes(4)
+
+    with pytest.raises(InputError, match="no video that FFmpeg can read, or without a frame"):
+        VideoFile(patch(mp4, no_frames))
+
+
+def test_closed_video_says_that_it_cannot_be_read(mp4):
+    made = VideoFile(mp4)
+    made.close()
+    with pytest.raises(InputError, match="frame 3 cannot be decoded"):
+        made.read("room_000003")
+
+
+def test_decoder_keeps_its_own_complaints_to_itself(tmp_path):
+    """In a process of its own: the decoder is told when it is first used."""
+    cut = write(tmp_path / "cut.mkv", "FFV1")
+    cut.write_bytes(cut.read_bytes()[:30_000])
+    (tmp_path / "none.mp4").write_bytes(b"no video")
+    code = """
+import sys
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import VideoFile
+for file in sys.argv[1:]:
+    try:
+        VideoFile(file)
+    except InputError as error:
+        print(error)
+"""
+    command = [sys.executable, "-c", code, str(cut), str(tmp_path / "none.mp4")]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stderr == ""
+    assert len(result.stdout.splitlines()) == 2

@@ -1,0 +1,236 @@
+"""What comes through the server is what the mapper gets, and where the server is."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import struct
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import ColmapSettings, SocketSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.tracker_server import open_tracker_server
+from modp_ti.inputs.trackers import Tracker
+from modp_ti.inputs.trackers.colmap import open_colmap
+from tests.modp_ti.inputs.tracker_server.clients import (
+    CORRECTION,
+    DONE,
+    END,
+    FRAME,
+    HELLO,
+    POSE,
+    SIZE,
+    answer,
+    colours,
+    connect,
+    correction,
+    frame,
+    greeted,
+    hello,
+    late,
+    message,
+    opened,
+    point,
+    pose,
+)
+
+
+def test_frames_come_out_as_they_were_sent(tmp_path: Path) -> None:
+    picture = np.arange(SIZE[0] * SIZE[1] * 3, dtype=np.uint8).reshape(SIZE[1], SIZE[0], 3)
+    points = point(7, 0.5, 0.25, 2.0, 6.0, 4.0) + point(2**40, 0, 0, -1, 3.0, 3.0) + point(3, 0, 0, 5, 4.0, 3.0)
+    with opened(tmp_path / "s", holdout=2) as tracker:
+        assert isinstance(tracker, Tracker)
+        with greeted(tmp_path / "s") as connection:
+            connection.sendall(message(FRAME, frame(5, points=points, image=picture.tobytes())))
+            connection.sendall(message(FRAME, frame(9)) + message(END))
+            assert answer(connection) == (DONE, struct.pack("<I", 2))
+        first, second = list(tracker)
+    assert (first.index, first.timestamp, first.held_out) == (0, 0.5, True)
+    assert (second.index, second.timestamp, second.held_out) == (1, 0.1 * 9, False)
+    np.testing.assert_array_equal(first.rgba[..., :3], picture)
+    assert first.mask is None
+    np.testing.assert_array_equal(first.T_camera_world, pose(0.5))
+    c = first.camera
+    assert (c.fx, c.fy, c.cx, c.cy, c.width, c.height) == (9.0, 9.5, 4.0, 3.0, 8, 6)
+    # A point behind the camera is none that it sees.
+    assert first.points.ids.tolist() == [7, 3]
+    np.testing.assert_array_equal(first.points.xyz, [[0.5, 0.25, 2], [0, 0, 5]])
+    np.testing.assert_array_equal(first.points.pixels, [[6, 4], [4, 3]])
+
+
+def test_a_lens_and_a_scale_are_treated_as_the_colmap_reader_does(plane_scene, tmp_path: Path) -> None:
+    import pycolmap
+
+    rng = np.random.default_rng(2)
+    folder = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (60, 2)), np.zeros(60)])
+    model = pycolmap.Reconstruction(str(folder))
+    K, k = plane_scene.K, [0.1, -0.05, 0.002, -0.003]
+    intrinsics = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    lens = pycolmap.Camera(model="OPENCV", width=320, height=240, params=[*intrinsics, *k])
+    model.cameras[1].model, model.cameras[1].params = lens.model, lens.params
+    model.write_binary(str(folder))
+    source = SourceSettings(path=plane_scene.folder, scale=0.5)
+    expected = list(open_colmap(source, ColmapSettings()))
+    with opened(tmp_path / "s", scale=0.5, prefetch=8) as tracker, connect(tmp_path / "s") as connection:
+        start = struct.pack("<IIII12d", 320, 240, 2, 1, *intrinsics, *k, *[0.0] * 4)
+        connection.sendall(message(HELLO, start + b"a tracker"))
+        by_name = {image.name: image for image in model.images.values()}
+        for i, (name, T) in enumerate(zip(plane_scene.names, expected, strict=True)):
+            seen = sorted(by_name[name].get_observation_points2D(), key=lambda p: p.point3D_id)
+            block = b"".join(point(p.point3D_id, *model.points3D[p.point3D_id].xyz, *p.xy) for p in seen)
+            data = (plane_scene.folder / name).read_bytes()
+            connection.sendall(message(FRAME, frame(i, T=T.T_camera_world, points=block, image=data)))
+        connection.sendall(message(END))
+        got = list(tracker)
+    assert len(got) == len(expected) == 7
+    assert "the tracker there is a tracker" in tracker.notes
+    for ours, theirs in zip(got, expected, strict=True):
+        assert ours.camera == theirs.camera
+        np.testing.assert_array_equal(ours.T_camera_world, theirs.T_camera_world)
+        np.testing.assert_array_equal(ours.rgba, theirs.rgba)
+        for column in ("ids", "xyz", "pixels"):
+            np.testing.assert_array_equal(getattr(ours.points, column), getattr(theirs.points, column))
+        assert len(ours.points) > 20
+
+
+def test_poses_may_come_later_and_frames_keep_their_order(tmp_path: Path) -> None:
+    with opened(tmp_path / "s", prefetch=8) as tracker, greeted(tmp_path / "s") as connection:
+        for number in (1, 2, 4):
+            connection.sendall(message(FRAME, frame(number, state=0)))
+        connection.sendall(message(FRAME, frame(6)))  # its pose is known before theirs
+        connection.sendall(message(FRAME, frame(7, state=2)))  # lost
+        connection.sendall(message(POSE, late(4, T=pose(4.0), points=point(1, 0, 0, 3, 4.0, 3.0))))
+        connection.sendall(message(POSE, late(2, state=2)))
+        connection.sendall(message(POSE, late(1, T=pose(1.0))))
+        connection.sendall(message(FRAME, frame(8, state=0)) + message(END))  # nothing comes of the last one
+        frames = list(tracker)
+        assert answer(connection) == (DONE, struct.pack("<I", 3))
+    assert colours(frames) == [1, 4, 6]
+    assert [f.index for f in frames] == [0, 1, 2]
+    assert [f.timestamp for f in frames] == [0.1, 0.4, 0.1 * 6]
+    assert [f.T_camera_world[0, 3] for f in frames] == [1.0, 4.0, 0.1 * 6]
+    assert [f.points.ids.tolist() for f in frames] == [[], [1], []]
+    assert tracker.notes[-1] == "3 of 6 frames came without a pose: skipped"
+
+
+def test_a_correction_names_delivered_frames_and_they_are_there_again_with_it(tmp_path: Path) -> None:
+    seen = point(5, 0, 0, 3, 4.0, 3.0) + point(6, 0, 0, 4, 4.0, 3.0)
+    with opened(tmp_path / "s", prefetch=16) as tracker, greeted(tmp_path / "s") as connection:
+        connection.sendall(message(FRAME, frame(10, points=seen)) + message(FRAME, frame(11, state=2)))
+        connection.sendall(message(FRAME, frame(12)) + message(FRAME, frame(14)) + message(FRAME, frame(15)))
+        moved = {10: pose(2.0), 14: pose(3.4)}
+        connection.sendall(message(CORRECTION, correction(moved, {5: (1.0, 0, 3), 99: (0, 0, 1)})))
+        connection.sendall(message(FRAME, frame(16)) + message(END))
+        arrived = list(tracker.events())
+        again = list(tracker)
+    assert [type(e) for e in arrived] == [TrackedFrame] * 4 + [PoseCorrection] + [TrackedFrame]
+    revised = arrived[4]
+    assert revised.index.tolist() == [0, 2]  # frames by their place among those delivered
+    np.testing.assert_array_equal(revised.T_camera_world, [pose(2.0), pose(3.4)])
+    assert (revised.ids.tolist(), revised.xyz.tolist()) == ([5, 99], [[1, 0, 3], [0, 0, 1]])
+    # 10 moved by 1.0 and 14 by 2.0: the frame between by half of both, the one behind as 14, the new one not at all.
+    x = [f.T_camera_world[0, 3] for f in again]
+    np.testing.assert_allclose(x, [2.0, 1.2 + 1.5, 3.4, 1.5 + 2.0, 1.6], atol=1e-12)
+    assert again[0].points.xyz.tolist() == [[1, 0, 3], [0, 0, 4]]
+    assert colours(again) == [10, 12, 14, 15, 16]
+
+
+def test_alpha_says_which_pixels_count(tmp_path: Path) -> None:
+    rgba = np.full((SIZE[1], SIZE[0], 4), 200, dtype=np.uint8)
+    rgba[2, 3, 3] = 0
+    png = cv2.imencode(".png", rgba)[1].tobytes()
+    for encoding, data in ((5, rgba.tobytes()), (2, png)):
+        path = tmp_path / f"s{encoding}"
+        with opened(path) as tracker, connect(path) as connection:
+            connection.sendall(message(HELLO, hello(encoding=encoding)))
+            connection.sendall(message(FRAME, frame(1, image=data)) + message(END))
+            (only,) = list(tracker)
+        assert not only.mask[2, 3]
+        assert only.mask.sum() == SIZE[0] * SIZE[1] - 1
+        assert only.rgba[0, 0].tolist() == [200, 200, 200, 255]
+
+
+def test_nothing_more_is_read_while_the_mapper_is_busy(tmp_path: Path) -> None:
+    with opened(tmp_path / "s", prefetch=1) as tracker, greeted(tmp_path / "s") as connection:
+        sent = 0
+
+        def payload(number: int) -> bytes:
+            return struct.pack("<I", number) + frame(number % 250, time=0.1 * number)[4:]
+
+        def push_all() -> None:
+            nonlocal sent
+            for number in range(1500):
+                connection.sendall(message(FRAME, payload(number)))
+                sent += 1
+            connection.sendall(message(END))
+
+        thread = threading.Thread(target=push_all)
+        thread.start()
+        before = -1
+        while sent != before:  # until it stands still
+            before = sent
+            time.sleep(0.5)
+        assert 0 < sent < 1500
+        assert len(os.listdir(tracker._spool.path)) < 10
+        assert sum(1 for _ in tracker) == 1500
+        thread.join()
+
+
+# ---- where it listens ----------------------------------------------------------------------------------------
+
+
+def test_a_closed_server_leaves_nothing_behind(tmp_path: Path) -> None:
+    with opened(tmp_path / "s") as tracker, greeted(tmp_path / "s") as connection:
+        assert stat.S_IMODE((tmp_path / "s").stat().st_mode) == 0o600
+        connection.sendall(message(FRAME, frame(1)))
+        next(iter(tracker))
+        kept = tracker._spool.path
+        assert (kept / "000001.rgb8").stat().st_size == 144
+    assert not kept.exists()
+    assert list(tmp_path.iterdir()) == []
+    assert not tracker._thread.is_alive()
+
+
+def test_an_address_is_of_this_machine_unless_another_is_asked_for() -> None:
+    def notes(address: str) -> tuple[str, list[str]]:
+        tracker = open_tracker_server(SourceSettings(), SocketSettings(address=address))
+        tracker.close()
+        return tracker.address, tracker.notes
+
+    assert notes("127.0.0.1:0")[1][1:] == []
+    assert "is open to the network" in notes("0.0.0.0:0")[1][1]
+    assert SocketSettings().address is None
+
+
+def test_an_address_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    def failure(**tracker: object) -> str:
+        with pytest.raises(InputError) as caught:
+            open_tracker_server(SourceSettings(), SocketSettings(**tracker))
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    assert "write it as host:port" in failure(address="7007")
+    assert "write it as host:port" in failure(address="127.0.0.1:70070")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert "cannot listen there" in failure(address=f"127.0.0.1:{taken.getsockname()[1]}")
+    (tmp_path / "file").write_text("precious")
+    assert "is there already and no socket" in failure(path=tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "precious"
+    with opened(tmp_path / "s"):
+        assert "another program listens there" in failure(path=tmp_path / "s")
+    left = socket.socket(socket.AF_UNIX)
+    left.bind(str(tmp_path / "left"))
+    left.close()
+    with opened(tmp_path / "left") as tracker, greeted(tmp_path / "left") as connection:
+        connection.sendall(message(FRAME, frame(1)) + message(END))
+        assert len(list(tracker)) == 1

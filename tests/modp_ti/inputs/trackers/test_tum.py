@@ -1,0 +1,129 @@
+"""Tracker `tum`: any trajectory in TUM's format, with points of a file or none; what is wrong is named by line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from modp_ti.inputs.trackers import Tracker
+
+
+@pytest.fixture
+def posed(recording):
+    recording.write("trajectory.txt", ["# time tx ty tz qx qy qz qw", *recording.tum_lines()])
+    recording.write_points()
+    return recording
+
+
+def test_poses_are_turned_to_world_to_camera_and_points_are_projected(posed):
+    tracker = posed.open("tum", points=posed.root / "points.txt")
+    assert isinstance(tracker, Tracker)
+    posed.assert_frames(tracker, range(7))
+    assert tracker.notes == []
+    frames = list(tracker)
+    np.testing.assert_allclose([frame.timestamp for frame in frames], np.arange(7) / 30)
+    # One point has one number in every frame: where frames share points, their places are the same.
+    for number, xyz in zip(frames[0].points.ids, frames[0].points.xyz, strict=True):
+        assert np.array_equal(posed.xyz[number], xyz)
+
+
+def test_image_and_pose_are_joined_by_the_nearest_time_within_the_limit(posed):
+    lines = posed.tum_lines(first_time=100.009)
+    shifted = {"time_offset": -100.0, "points": posed.root / "points.txt"}
+    posed.write("trajectory.txt", [lines[i] for i in (0, 1, 3, 4, 6)])
+    tracker = posed.open("tum", **shifted)
+    posed.assert_frames(tracker, [0, 1, 3, 4, 6])
+    assert tracker.notes == ["2 of 7 images have no pose in trajectory.txt: skipped (the first: view10.png)"]
+    message = posed.failure("tum", max_difference=0.005, **shifted)
+    assert "trajectory.txt: no pose lies within 0.005 s of a frame" in message
+    assert "0.009000" in message and "source.fps, tracker.time_offset" in message
+
+
+def test_range_and_scale_of_the_source_hold(posed):
+    tracker = posed.open(
+        "tum", {"start": 1, "stop": 6, "step": 2, "scale": 0.5, "holdout": 3}, points=posed.root / "points.txt"
+    )
+    assert [frame.name for frame in tracker] == [posed.names[i] for i in (1, 3, 5)]
+    assert [frame.held_out for frame in tracker] == [True, False, False]
+    camera = tracker.frames[0].undistorter.camera
+    assert (camera.width, camera.fx) == (160, 150.0)
+
+
+def test_without_a_point_file_points_are_triangulated_on_the_surface(posed):
+    tracker = posed.open("tum")
+    for frame in tracker.frames:
+        assert len(frame.points) >= 100
+        assert np.median(np.abs(frame.points.xyz[:, 2])) < 0.02  # the plane z = 0, four away
+
+
+def test_points_of_a_ply_file_are_the_same(posed):
+    header = ["ply", "format ascii 1.0", f"element vertex {len(posed.xyz)}"]
+    header += [f"property double {axis}" for axis in "xyz"] + ["end_header"]
+    ply = posed.write("points.ply", [*header, *(" ".join(map(repr, row)) for row in posed.xyz.tolist())])
+    one, other = (posed.open("tum", points=file) for file in (ply, posed.root / "points.txt"))
+    for a, b in zip(one.frames, other.frames, strict=True):
+        assert np.array_equal(a.points.xyz, b.points.xyz)
+
+
+def test_frames_of_a_place_keep_the_same_points_where_there_are_too_many(posed):
+    tracker = posed.open("tum", points=posed.root / "points.txt", max_points=15)
+    kept = [set(frame.points.ids.tolist()) for frame in tracker.frames]
+    assert [len(each) for each in kept] == [15] * 7
+    everywhere = posed.open("tum", points=posed.root / "points.txt")
+    seen_by_all = set.intersection(*(set(frame.points.ids.tolist()) for frame in everywhere.frames))
+    assert len(set.union(*kept)) < 30, "drawn anew for each frame it would be most of the 60"
+    assert len(set.intersection(*kept) & seen_by_all) >= 8
+
+
+@pytest.mark.parametrize(
+    ("line", "parts"),
+    [
+        ("0.1 1 2 3 0 0 1", ["trajectory.txt:4", "7 columns instead of 8"]),
+        ("0.1 1 2 3 0 0 0 1 9", ["trajectory.txt:4", "9 columns instead of 8"]),
+        ("0.1 1 2 three 0 0 0 1", ["trajectory.txt:4", "not a row of numbers"]),
+        ("0.1 nan 2 3 0 0 0 1", ["trajectory.txt:4", "NaN"]),
+        ("0.1 1 2 inf 0 0 0 1", ["trajectory.txt:4", "infinite"]),
+        ("0.1 1 2 3 0 0 0 0", ["trajectory.txt:4", "length 0 instead of 1"]),
+        ("0.1 1 2 3 0.5 0.5 0.5 0.7", ["trajectory.txt:4", "length 1.114 instead of 1"]),
+        ("0.01 1 2 3 0 0 0 1", ["trajectory.txt:4", "time 0.010000 does not lie after 0.033333"]),
+        ("0.033333 1 2 3 0 0 0 1", ["trajectory.txt:4", "doubles"]),
+    ],
+)
+def test_wrong_line_is_named(posed, line, parts):
+    lines = posed.tum_lines()
+    posed.write("trajectory.txt", ["# comment", *lines[:2], line, *lines[3:]])
+    message = posed.failure("tum", points=posed.root / "points.txt")
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("# nothing\n", ["points.txt: holds no row of x y z (tracker.points)"]),
+        ("1 2\n", ["points.txt:1: holds 2 columns instead of 3"]),
+        ("1 2 3\n1 nan 3\n", ["points.txt:2", "NaN"]),
+        ("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\n", ["points.txt: not a PLY file"]),
+        (
+            "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\n"
+            "end_header\n",
+            ["points.txt: holds no point", "triangulated"],
+        ),
+        ("0 0 -900\n", ["points.txt: none of its 1 points is seen", "camera to world"]),
+    ],
+)
+def test_point_file_that_is_none_is_named(posed, text, parts):
+    (posed.root / "points.txt").write_text(text)
+    message = posed.failure("tum", points=posed.root / "points.txt")
+    for part in parts:
+        assert part in message
+
+
+def test_what_is_missing_is_named_with_the_key_that_gives_it(posed):
+    assert "no such file (tracker.points)" in posed.failure("tum", points=posed.root / "gone.ply")
+    assert "no such file (tracker.path)" in posed.failure("tum", path=posed.root / "gone.txt")
+    assert "give source.intrinsics" in posed.failure("tum", {"intrinsics": {}})
+    (posed.root / "trajectory.txt").write_bytes(b"\xff\xfe\x00\x01")
+    assert "trajectory.txt: cannot be read as text" in posed.failure("tum")
+    (posed.root / "trajectory.txt").unlink()
+    assert "set tracker.path to a trajectory in TUM's format" in posed.failure("tum")

@@ -1,0 +1,161 @@
+"""Fused depth is the surface that it shows, and mesh files hold it for other programs."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from mesh_accuracy import precision_recall, true_surface
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.synthetic import SyntheticTracker
+from modp_ti.inputs.synthetic.renderer import RoomRenderer
+from modp_ti.outputs.formats.mesh import (
+    SurfaceView,
+    extracted,
+    fused,
+    read_mesh,
+    without_edges,
+    without_floating_parts,
+    write_mesh,
+)
+
+CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
+COLOUR = np.float32([0.25, 0.5, 1.0])
+
+
+def plane_views(normal: np.ndarray, offset: float, count: int = 6) -> Iterator[SurfaceView]:
+    """A plane normal . X = offset from cameras that look along z, with the exact depth of every pixel's centre."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[:120, :160] + 0.5
+    rays = np.stack([(u - 80.0) / 100.0, (v - 60.0) / 100.0, np.ones_like(u)], axis=2)
+    for _ in range(count):
+        centre = rng.uniform(-0.1, 0.1, 3)
+        T = np.eye(4)
+        T[:3, 3] = -centre
+        z = (offset - normal @ centre) / (rays @ normal)
+        yield SurfaceView(
+            CAMERA, T, np.where((z > 0.3) & (z < 4), z, 0).astype(np.float32), np.tile(COLOUR, (120, 160, 1))
+        )
+
+
+def test_a_slanted_plane_is_fused_where_it_is() -> None:
+    """No half pixel is lost: seen aslant, it would shift the plane by 20 mm at its far end."""
+    normal = np.array([0.8, 0.0, -0.6])
+    mesh = extracted(fused(plane_views(normal, -1.2), voxel=0.02, farthest=4.0))
+    vertices = np.asarray(mesh.vertices)
+    assert len(vertices) > 10_000
+    for near, far in ((1.2, 1.8), (1.8, 2.5), (2.5, 3.5)):
+        error = vertices[(vertices[:, 2] > near) & (vertices[:, 2] < far)] @ normal + 1.2
+        assert abs(error.mean()) < 0.001
+        assert np.abs(error).mean() < 0.004
+    # But for the rim, where a vertex lies beside voxels that nobody saw.
+    coloured = np.abs(np.asarray(mesh.vertex_colors) - COLOUR).max(axis=1) < 2e-3
+    assert coloured.mean() > 0.995
+
+
+@pytest.mark.slow
+def test_the_room_is_fused_to_its_true_surface() -> None:
+    """From true depth at true poses: nine tenths within one percent of the room's size, both ways."""
+    tracker = SyntheticTracker(width=160, height=120, frames=20, room=RoomRenderer(texel=1.0))
+    poses = tracker.ground_truth()
+    depths = [tracker.depth(index) for index in range(len(tracker))]
+    grey = np.full((120, 160, 3), 0.5, np.float32)
+    seen = [without_edges(z) for z in depths]
+    views = [SurfaceView(tracker.camera, T, z, grey) for T, z in zip(poses, seen, strict=True)]
+    mesh = without_floating_parts(extracted(fused(views, voxel=0.025, farthest=10.0)))
+    surface = true_surface(tracker.camera, poses, depths)
+    precision, recall = precision_recall(np.asarray(mesh.vertices), surface, 0.01 * 4.8)
+    assert precision > 0.9
+    assert recall > 0.9
+
+
+def test_depth_is_left_out_at_the_edges_of_things() -> None:
+    z = np.full((20, 20), 2.0, np.float32)
+    z[:, 10:] = 3.0
+    z[:, 9] = 2.6  # what compositing makes of an edge
+    z[15:] = 0
+    depth = without_edges(z)
+    assert (depth[:15, :9] == 2.0).all() and (depth[:15, 10:] == 3.0).all()
+    assert (depth[:, 9] == 0).all()
+    assert (depth[15:] == 0).all()
+
+
+def test_small_parts_on_their_own_go_and_large_ones_stay() -> None:
+    sphere = o3d.geometry.TriangleMesh.create_sphere(1.0)
+    other = o3d.geometry.TriangleMesh.create_sphere(0.5).translate((3.0, 0, 0))
+    crumb = o3d.geometry.TriangleMesh.create_sphere(0.03).translate((0, 3.0, 0))
+    mesh = without_floating_parts(sphere + other + crumb)
+    vertices = np.asarray(mesh.vertices)
+    assert vertices[:, 0].max() == pytest.approx(3.5)
+    assert vertices[:, 1].max() == pytest.approx(1.0, abs=0.02)
+    assert len(vertices) == len(sphere.vertices) + len(other.vertices)
+
+
+def test_views_of_nothing_are_refused() -> None:
+    nothing = SurfaceView(CAMERA, np.eye(4), np.zeros((120, 160), np.float32), np.zeros((120, 160, 3), np.float32))
+    with pytest.raises(InputError, match="shows no surface"):
+        fused([nothing], voxel=0.02, farthest=4.0)
+
+
+def test_a_file_without_triangles_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file; modp-ti export OUT --format mesh makes a mesh"):
+        read_mesh(tmp_path / "none.ply")
+    (tmp_path / "damaged.ply").write_text("ply\n")
+    with pytest.raises(InputError, match="holds no triangle"):
+        read_mesh(tmp_path / "damaged.ply")
+
+
+@pytest.fixture(scope="module")
+def tetrahedron() -> o3d.geometry.TriangleMesh:
+    mesh = o3d.geometry.TriangleMesh.create_tetrahedron()
+    mesh.vertex_colors = o3d.utility.Vector3dVector([[1, 0, 0], [0, 0.5, 0], [0, 0, 0.2], [0.8, 0.8, 0.8]])
+    return mesh
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_another_program_reads_places_triangles_and_colours(
+    tmp_path: Path, tetrahedron: o3d.geometry.TriangleMesh, suffix: str
+) -> None:
+    path = tmp_path / f"mesh{suffix}"
+    write_mesh(path, o3d.geometry.TriangleMesh(tetrahedron))
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    back = o3d.io.read_triangle_mesh(str(path))
+    vertices, colours = np.asarray(back.vertices), np.asarray(back.vertex_colors)
+    if suffix == ".glb":
+        vertices = vertices * [1, -1, -1]  # y is up there
+        colours = np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055)  # linear there
+    corners = {tuple(np.round(v, 5)): c for v, c in zip(vertices, colours, strict=True)}
+    for vertex, colour in zip(np.asarray(tetrahedron.vertices), np.asarray(tetrahedron.vertex_colors), strict=True):
+        np.testing.assert_allclose(corners[tuple(np.round(vertex, 5))], colour, atol=0.5 / 255 + 1e-6)
+    area = back.get_surface_area()
+    assert area == pytest.approx(tetrahedron.get_surface_area(), rel=1e-5)
+    assert len(back.triangles) == 4
+    # Seen from outside, triangles still turn the same way.
+    centre = vertices.mean(axis=0)
+    for triangle in np.asarray(back.triangles):
+        a, b, c = vertices[triangle]
+        assert np.dot(np.cross(b - a, c - a), a - centre) > 0
+
+
+def test_glb_has_the_layout_that_is_published(tmp_path: Path, tetrahedron: o3d.geometry.TriangleMesh) -> None:
+    write_mesh(tmp_path / "mesh.glb", o3d.geometry.TriangleMesh(tetrahedron))
+    data = (tmp_path / "mesh.glb").read_bytes()
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and length % 4 == 0
+    document = json.loads(data[20 : 20 + length])
+    binary_length, kind = struct.unpack_from("<I4s", data, 20 + length)
+    assert kind == b"BIN\0" and 28 + length + binary_length == len(data)
+    assert document["buffers"] == [{"byteLength": binary_length}]
+    binary = data[28 + length :]
+    view = document["bufferViews"][document["accessors"][1]["bufferView"]]
+    places = np.frombuffer(binary, "<f4", 12, view["byteOffset"]).reshape(4, 3)
+    np.testing.assert_allclose(places, np.asarray(tetrahedron.vertices) * [1, -1, -1], atol=1e-6)
+    assert document["accessors"][1]["max"] == places.max(axis=0).tolist()

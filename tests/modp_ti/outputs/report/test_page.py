@@ -1,0 +1,251 @@
+"""`report.html`: one file that loads nothing, whose figures, curves and pictures are those of the run."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from modp_ti.engine.results import Results
+from modp_ti.outputs.report.curves import frame_rate
+from modp_ti.outputs.report.page import ReportedRun, write_report
+from tests.modp_ti.outputs.report.made_up_run import Page, black_frame, delivered, made_up_run, picture
+
+EVIL = "</td><script>alert('x')</script><img src=http://evil.example/a.png> & \"{{ 7 * 7 }}\""
+
+
+def written(tmp_path, run: ReportedRun) -> tuple[Page, str]:
+    file = tmp_path / "report.html"
+    write_report(file, run)
+    html = file.read_text(encoding="utf-8")
+    return Page(html), html
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run, and its page as parsed and as text."""
+    folder = tmp_path_factory.mktemp("page")
+    run = made_up_run(folder)
+    return run, *written(folder, run)
+
+
+def fitted(drawn, data):
+    """The straight map from data to drawing of one axis, and by how much it is missed at most."""
+    A = np.stack([data, np.ones(len(data))], axis=1)
+    coefficients = np.linalg.lstsq(A, drawn, rcond=None)[0]
+    return coefficients, np.abs(A @ coefficients - drawn).max()
+
+
+def assert_draws(points, x, y):
+    """A drawn curve is the data, but for the axes' scales: x to the right, y up."""
+    assert len(points) == len(x)
+    to_right, miss = fitted(points[:, 0], np.asarray(x, float))
+    assert to_right[0] > 0 and miss < 0.01
+    upwards, miss = fitted(points[:, 1], np.asarray(y, float))
+    assert (upwards[0] < 0 or np.ptp(y) == 0) and miss < 0.01
+
+
+def test_the_page_loads_nothing(made) -> None:
+    _, page, html = made
+    for tag, key, value in page.attributes:
+        assert key not in ("href", "srcset", "action", "background", "poster"), (tag, key)
+        if key == "src":
+            assert value.startswith("data:image/"), value[:60]
+        assert not key.startswith("on")
+    assert not set(page.tags) & {"script", "link", "iframe", "object", "embed", "base"}
+    assert "url(" not in html and "@import" not in html
+    for svg in page.embedded("curves", "svg+xml") + page.embedded("trajectory", "svg+xml"):
+        hrefs = re.findall(r'(?:xlink:)?href="([^"]{0,20})', svg.decode())
+        assert all(href.startswith(("#", "data:")) for href in hrefs)
+
+    assert "default-src 'none'" in html
+
+
+def test_the_numbers_are_those_of_the_metrics(made) -> None:
+    run, page, _ = made
+    rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
+    for stage in ("online", "refined"):
+        m = run.metrics[stage]
+        expected = []
+        for which in ("held_out", "all"):
+            s = m[which]
+            expected += [f"{s['psnr']:.2f}", f"{s['ssim']:.3f}", "–", str(s["count"])]
+        assert rows[stage] == [*expected, f"{m['gaussians']:,}", f"{m['view_renders']:,}"]
+    assert rows["trajectory error after mapping"] == ["0.0123"]
+    assert rows["most memory held"] == ["1,234 MB"]
+    headline = " ".join(page.text)
+    assert f"{run.metrics['refined']['held_out']['psnr']:.2f} dB" in headline
+    assert f"{run.metrics['gaussians']:,}" in headline
+
+
+def test_the_stages_are_those_of_the_metrics_and_their_bars_as_long(made) -> None:
+    run, page, html = made
+    rows = {row[0]: row[1:] for row in page.tables["time"]}
+    seconds = run.metrics["seconds"]
+    assert {name for name in rows if name != "total"} == {k for k, v in seconds.items() if v > 0 and k != "total"}
+    for name, row in rows.items():
+        assert row[1] == f"{seconds[name]:.1f} s"
+    widths = [float(w) for w in re.findall(r'<i style="width: ([0-9.]+)%">', html)]
+    assert sum(widths) == pytest.approx(100, abs=0.1)
+    assert f"{100 * seconds['optimise'] / seconds['total']:.2f}" in re.findall(r"width: ([0-9.]+)%", html)
+
+
+def test_the_curves_are_the_recorded_numbers(made) -> None:
+    run, page, _ = made
+    curves = page.curves()
+    frames = run.record.frames
+    index = [note.index for note in frames]
+    assert_draws(curves["gaussians"][0], index, [note.gaussians for note in frames])
+    rate = frame_rate(frames, 5)
+    assert_draws(curves["frame-rate"][0], index[4:], rate[4:])
+    mapped = [note for note in frames if note.psnr is not None]
+    assert_draws(curves["view-psnr"][0], [n.index for n in mapped], [n.psnr for n in mapped])
+    assert_draws(curves["step-psnr"][0], [n.step for n in run.record.steps], [n.psnr for n in run.record.steps])
+    for stage in ("online", "refined"):
+        of = [score for score in run.scores if score.stage == stage]
+        assert_draws(curves[f"psnr-{stage}"][0], [s.index for s in of], [s.psnr for s in of])
+
+
+def test_both_versions_of_a_curve_have_the_same_scale(made) -> None:
+    run, page, _ = made
+    curves = page.curves()
+    drawn = np.concatenate([curves["psnr-online"][0][:, 1], curves["psnr-refined"][0][:, 1]])
+    data = np.array([s.psnr for stage in ("online", "refined") for s in run.scores if s.stage == stage])
+    assert fitted(drawn, data)[1] < 0.01
+
+
+def test_the_trajectory_is_seen_from_above_before_and_after(made) -> None:
+    run, page, _ = made
+    curves = page.curves()
+    # World's z is up: what is drawn is a similarity of x and y, in both panels.
+    for panel in range(2):
+        drawn = np.concatenate([curves[f"way-{name}"][panel] for name in ("before", "after")])
+        drawn[:, 1] *= -1
+        ways = [run.tracked, run.versions["refined"].trajectory]
+        ground = np.array([(-T[:3, :3].T @ T[:3, 3])[:2] for way in ways for T in way])
+        a, b = (v - v.mean(axis=0) for v in (ground, drawn))
+        U, s, Vt = np.linalg.svd(a.T @ b)
+        assert np.linalg.det(U @ Vt) > 0, "seen from above, not from below"
+        scale = s.sum() / (a * a).sum()
+        np.testing.assert_allclose(scale * a @ (U @ Vt), b, atol=0.1)
+
+
+def test_the_changes_of_the_poses_are_those_that_were_made(made) -> None:
+    _, page, _ = made
+    curves = page.curves()
+    # 1 and 2 % of a unit, and 1 and 2 degrees, at every frame; the depth is 2 units.
+    for name in ("shift", "turn"):
+        online, refined = (curves[f"{name}-{stage}"][0][:, 1] for stage in ("online", "refined"))
+        assert np.ptp(online) < 0.01 and np.ptp(refined) < 0.01
+        assert refined[0] < online[0]
+
+
+def test_the_pictures_are_those_of_the_held_out_frames_the_worst_first(made) -> None:
+    run, page, _ = made
+    pictures = page.embedded("pictures", "jpeg")
+    assert len(pictures) == 3 * 6
+    held_out = sorted(s.psnr for s in run.scores if s.held_out and s.stage == "refined")
+    captions = [line for line in page.text if re.search(r"frame \d+, frame", line)]
+    assert [float(re.search(r"([0-9.]+) dB", line)[1]) for line in captions] == pytest.approx(held_out, abs=0.006)
+    assert captions[0].startswith("worst: ") and captions[-1].startswith("best: ")
+
+
+def test_the_settings_that_were_changed_are_named_with_their_defaults(made) -> None:
+    run, page, _ = made
+    rows = {row[0]: row[1:] for row in page.tables["settings"][1:]}
+    assert rows["source.scale"] == ["0.5", "1.0"]
+    assert rows["source.holdout"] == ["4", "empty"]
+    assert rows["tracker.kind"] == ['"synthetic"', "none"]
+    assert rows["output"] == [f'"{run.config.output}"', "none"]
+    assert len(rows) == 4
+    made_with = {row[0]: row[1] for row in page.tables["machine"]}
+    assert made_with["backend"] == "CPU" and "Taichi 1." in made_with["libraries"]
+
+
+def test_text_from_files_is_text_and_no_markup(tmp_path) -> None:
+    run = made_up_run(
+        tmp_path, frames=5, refine=0, name=EVIL.replace("{", "{{").replace("}", "}}") + "{}", notes=(EVIL,)
+    )
+    config = run.config.model_copy(update={"output": tmp_path / EVIL.replace("/", ":")})
+    page, html = written(tmp_path, dataclasses.replace(run, config=config))
+    assert "script" not in page.tags and "<script" not in html
+    assert not [value for _, key, value in page.attributes if key == "src" and not value.startswith("data:image/")]
+    assert " ".join(EVIL.split()) in page.text
+    assert sum(EVIL in line for line in page.text) >= 2
+    assert "49" not in "".join(line for line in page.text if "script" in line), "the text is no template"
+
+
+def test_passwords_of_streams_are_left_out(tmp_path) -> None:
+    note = "frames come from rtsp://user:secret@camera:554/live"
+    _, html = written(tmp_path, made_up_run(tmp_path, frames=5, refine=0, notes=(note,)))
+    assert "secret" not in html and "rtsp://camera:554/live" in html
+
+
+@pytest.mark.parametrize(
+    ("changes", "there", "missing"),
+    [
+        ({"mode": "offline"}, ["Offline optimisation"], ["Post refinement", "While the frames came"]),
+        ({"refine": 0}, ["While the frames came"], ["Post refinement"]),
+        ({"holdout": 0}, ["The map was made of these frames: none was held out."], ["held-out frame"]),
+        ({"truth": False}, ["From above"], ["trajectory error"]),
+        ({"frames": 2, "holdout": 2, "refine": 1}, ["From above"], []),
+        ({"frames": 1, "holdout": 0, "refine": 0, "truth": False}, ["From above"], []),
+        ({"frames": 40, "keyframe_every": 10**6}, ["While the frames came"], []),
+    ],
+)
+def test_every_kind_of_run_has_its_page(tmp_path, changes, there, missing, recwarn, caplog) -> None:
+    page, _ = written(tmp_path, made_up_run(tmp_path, **changes))
+    text = "\n".join(page.text)
+    assert not [line for line in there if line not in text]
+    assert not [line for line in missing if line.lower() in text.lower().replace("held-out frames\n", "")]
+    assert not [str(w.message) for w in recwarn] + caplog.messages, "drawing warns of nothing"
+
+
+def test_scores_that_are_not_finite_are_gaps(tmp_path) -> None:
+    run = made_up_run(tmp_path, frames=6, refine=0)
+    scores = [dataclasses.replace(s, psnr=float("inf")) if s.index == 3 else s for s in run.scores]
+    page, _ = written(tmp_path, dataclasses.replace(run, scores=scores))
+    assert len(page.curves()["psnr-online"][0]) == 5
+
+
+def test_a_map_without_anything_opaque_has_its_page(tmp_path) -> None:
+    run = made_up_run(tmp_path, frames=4, refine=0)
+    state = {name: values[:0] for name, values in run.versions["online"].gaussians.items()}
+    version = dataclasses.replace(run.versions["online"], gaussians=state)
+    page, _ = written(tmp_path, dataclasses.replace(run, versions={"online": version}))
+    assert "way-after" in page.curves()
+
+
+def test_a_long_run_of_large_pictures_stays_small(tmp_path) -> None:
+    run = made_up_run(tmp_path, frames=1000, holdout=50, refine=5000, size=(480, 640))
+    _, html = written(tmp_path, run)
+    assert len(html) < 3_000_000
+
+
+class Keyframes(list):
+    """Of a `KeyframeStore` what a report needs."""
+
+    scene_depth = 2.0
+
+
+@pytest.mark.parametrize("stages", ["all", "none"])
+def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path, stages) -> None:
+    run = made_up_run(tmp_path, frames=6, refine=0, holdout=0)
+    results = Results(run.config, delivered(list(run.tracked), [False] * 6))
+    scores = list(run.scores) if stages == "all" else []
+    with results.writing():
+        for i in range(6):
+            image, render = picture(i, (16, 16)), picture(i + 1, (16, 16))
+            results.write_frame(dataclasses.replace(black_frame(i), image=image), render)
+        versions = dict(run.versions) if stages == "all" else {}
+        said = results.write_report(run.record, dict(run.metrics), scores, versions, Keyframes(), [])
+    assert (run.config.output / "config.yaml").is_file()
+    if stages == "all":
+        assert said is None
+        page = Page((run.config.output / "report.html").read_text(encoding="utf-8"))
+        assert len(page.embedded("pictures", "jpeg")) == 3 * 6
+    else:
+        assert said.startswith("report.html could not be made: IndexError") and "\n" not in said
+        assert not (run.config.output / "report.html").exists()

@@ -1,0 +1,125 @@
+"""The page of a finished map: what a browser gets from where a frame was taken, and how the command fails."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from typer.testing import CliRunner
+
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3, quaternion_from_matrix
+from modp_ti.commands.app import app
+from modp_ti.config.settings import ViewSettings
+from modp_ti.outputs.formats.frames_json import FramesRecord
+from modp_ti.outputs.formats.splats_ply import write_splats
+from modp_ti.outputs.playback.finished_run import FinishedRun
+from modp_ti.outputs.playback.map_renderer import MapRenderer
+from modp_ti.outputs.viewer.finished import FinishedViewer
+from modp_ti.outputs.viewer.handover import BrowserCamera
+from modp_ti.outputs.viewer.modes import MODES, UNSEEN
+
+pytestmark = pytest.mark.slow
+
+CAMERA = PinholeCamera(90.0, 90.0, 48.0, 32.0, 96, 64)
+NAMES = ["a.png", "b.png", "c.png"]
+
+
+def wall() -> dict[str, np.ndarray]:
+    """Gaussians close together on the plane z = 2, of many colours."""
+    rng = np.random.default_rng(2)
+    x, y = np.meshgrid(np.linspace(-1.6, 1.6, 60), np.linspace(-1.2, 1.2, 45))
+    n = x.size
+    return {
+        "position": np.stack([x.ravel(), y.ravel(), np.full(n, 2.0)], axis=1).astype(np.float32),
+        "log_scale": np.tile(np.float32(np.log([0.05, 0.05, 0.002])), (n, 1)),
+        "quaternion": np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        "opacity_logit": np.full(n, 3.0, dtype=np.float32),
+        "sh": rng.normal(0, 0.6, (n, 1, 3)).astype(np.float32),
+    }
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> FinishedRun:
+    """Three frames of the wall, from three places; of the last the image is brighter by 0.1."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [0.0, -0.5, 0.5]
+    write_splats(tmp_path / "splats.ply", wall())
+    model = pycolmap.Reconstruction()
+    model.add_point3D([0.5, 0.25, 2.0], pycolmap.Track())
+    (tmp_path / "colmap").mkdir()
+    model.write_binary(str(tmp_path / "colmap"))
+    renderer = MapRenderer(wall(), 96, 64, 0.01)
+    (tmp_path / "colmap" / "images").mkdir()
+    for i, name in enumerate(NAMES):
+        picture = np.clip(renderer.view(CAMERA, poses[i]).colour + (0.1 if i == 2 else 0.0), 0, 1)
+        cv2.imwrite(str(tmp_path / "colmap" / "images" / name), np.round(255 * picture[..., ::-1]))
+    return FinishedRun(tmp_path, NAMES, np.arange(3.0), poses, [CAMERA] * 3, FramesRecord(0.01, 2.0, [0, 2], []))
+
+
+def looks(viewer: FinishedViewer, T: np.ndarray, width: int, height: int) -> None:
+    """A browser looks from T_camera_world, with the camera's field of view."""
+    T_world_camera = inverse_se3(T)
+    q = quaternion_from_matrix(T_world_camera[:3, :3])
+    fov = 2 * np.arctan(CAMERA.height / 2 / CAMERA.fy)
+    viewer.page.requests.look(BrowserCamera(5, q, T_world_camera[:3, 3] * viewer.page.units, fov, width, height))
+
+
+def test_a_browser_at_a_frames_place_gets_the_frames_picture_in_every_mode(run: FinishedRun):
+    viewer = FinishedViewer(run, ViewSettings(port=0), "cpu")
+    got: dict[str, np.ndarray] = {}
+    viewer.page.show_picture = lambda client, picture: got.setdefault(viewer.page.requests.mode, picture)
+    try:
+        for mode in MODES[1:]:
+            viewer.page.requests.show(mode)
+            looks(viewer, run.poses[2], 96, 64)
+            viewer.serve(lambda mode=mode: mode in got)
+        image = cv2.imread(str(run.folder / "colmap" / "images" / "c.png"))[..., ::-1].astype(float)
+        unclipped = (image < 255) & (got["colour"] > 0)
+        assert unclipped.mean() > 0.5
+        np.testing.assert_allclose((image - got["colour"])[unclipped], 25.5, atol=1.01)
+        # 0.1 of 0.25, in the colours of the error; where the image is clipped it is less.
+        expected = cv2.applyColorMap(np.full((1, 1), 102, np.uint8), cv2.COLORMAP_TURBO)[0, 0, ::-1]
+        plain = unclipped.all(axis=2)
+        assert np.abs(got["error"][plain] - expected.astype(int)).max() <= 12
+        assert not (got["error"] == UNSEEN).all(axis=2)[1:-1, 1:-1].any()
+        assert np.ptp(got["depth"].reshape(-1, 3), axis=0).max() <= 12  # one plane, one depth
+        assert got["opacity"].min() > 230
+    finally:
+        viewer.close()
+
+
+def test_the_chosen_frame_is_shown_with_its_picture(run: FinishedRun):
+    viewer = FinishedViewer(run, ViewSettings(port=0), "cpu")
+    shown = []
+    viewer.page.show_frame = shown.append
+    try:
+        viewer._chosen.put(0)
+        viewer._chosen.put(1)
+        viewer.serve(lambda: len(shown) > 0)
+        assert len(shown) == 1
+        np.testing.assert_array_equal(shown[0].T_camera_world, run.poses[1])
+        image = cv2.imread(str(run.folder / "colmap" / "images" / "b.png"))[..., ::-1]
+        np.testing.assert_array_equal(shown[0].picture, image)
+    finally:
+        viewer.close()
+
+
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    result = CliRunner().invoke(app, ["view", str(tmp_path / "nowhere")])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+
+
+def test_without_viser_a_run_ends_before_it_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    (tmp_path / "scene.yaml").write_text("tracker: {kind: synthetic}\noutput: out\n")
+    result = CliRunner().invoke(app, ["run", str(tmp_path / "scene.yaml"), "--view"])
+    assert result.exit_code == 2
+    assert result.stderr.startswith('error: the viewer needs viser: pip install "modp-ti[viewer]"')
+    assert result.stderr.count("\n") == 1 and result.stdout == ""
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,133 @@
+"""The hand-over between the mapping thread and the viewer: bounded, the latest wins, nobody waits who must not."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+
+from modp_ti.outputs.viewer.handover import MAX_BROWSERS, BrowserCamera, Gate, Latest, Requests
+
+
+def camera(client: int, x: float = 0.0) -> BrowserCamera:
+    return BrowserCamera(client, np.array([1.0, 0, 0, 0]), np.array([x, 0, 0]), 1.0, 640, 480)
+
+
+def test_only_the_latest_value_waits():
+    box: Latest[int] = Latest()
+    for value in range(1000):
+        box.put(value)
+    assert box.take(timeout=0.0) == 999
+    assert box.take(timeout=0.0) is None
+
+
+def test_a_newer_value_can_take_over_what_it_lacks():
+    box: Latest[dict] = Latest(lambda newer, waiting: waiting | newer)
+    box.put({"splats": 1, "numbers": 1})
+    box.put({"numbers": 2})
+    assert box.take(timeout=0.0) == {"splats": 1, "numbers": 2}
+
+
+def test_whoever_waits_for_a_value_gets_it_and_is_let_go_at_the_end():
+    box: Latest[str] = Latest()
+    got: list[str | None] = []
+
+    def wait() -> None:
+        while not box.closed:
+            got.append(box.take())
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    box.put("picture")
+    while not got:
+        pass
+    box.close()
+    thread.join(timeout=30)
+    assert not thread.is_alive()
+    assert got == ["picture", None]
+
+
+def test_an_open_gate_holds_nobody():
+    gate = Gate()
+    looked: list[int] = []
+    gate.hold(lambda: looked.append(1))
+    assert looked == []
+
+
+def frames_through(gate: Gate, actions: list) -> list[int]:
+    """Frames that have passed the gate when each action was taken, one at each look around while held."""
+    passed, seen = 0, []
+
+    def meanwhile() -> None:
+        seen.append(passed)
+        if actions:
+            actions.pop(0)()
+
+    while actions:
+        gate.hold(meanwhile, every=0.0)
+        passed += 1
+    return seen
+
+
+def test_a_step_lets_one_frame_through_and_clicks_do_not_pile_up():
+    gate = Gate()
+    gate.pause(True)
+
+    def two_clicks() -> None:
+        gate.step()
+        gate.step()
+
+    nothing = lambda: None  # noqa: E731
+    seen = frames_through(gate, [nothing, gate.step, nothing, two_clicks, nothing, nothing, lambda: gate.pause(False)])
+    assert seen == [0, 0, 1, 1, 2, 2, 2]
+    assert not gate.paused
+
+
+def test_a_step_pauses_a_running_map():
+    gate = Gate()
+    gate.step()
+    gate.hold(lambda: None)
+    assert gate.paused
+
+
+def test_a_browser_is_served_once_for_each_change_and_only_its_last_view():
+    requests = Requests("colour")
+    assert requests.next() is None
+    for x in range(500):
+        requests.look(camera(1, x))
+    assert requests.next().position[0] == 499
+    assert requests.next() is None
+    requests.outdate()
+    requests.show("depth")
+    assert requests.next().position[0] == 499
+    assert requests.next() is None
+    assert requests.mode == "depth"
+
+
+def test_browsers_take_turns_and_those_that_left_are_forgotten():
+    requests = Requests("colour")
+    for client in (1, 2, 3):
+        requests.look(camera(client))
+    first = requests.next().client
+    requests.look(camera(first))  # moves on and on
+    assert [first, requests.next().client, requests.next().client, requests.next().client] == [1, 2, 3, 1]
+    requests.outdate()
+    requests.leave(2)
+    assert len(requests) == 2
+    assert {requests.next().client, requests.next().client} == {1, 3}
+    assert requests.next() is None
+
+
+def test_browsers_beyond_the_limit_are_left_out_until_one_goes():
+    requests = Requests("splats")
+    for client in range(MAX_BROWSERS + 5):
+        requests.look(camera(client))
+    assert len(requests) == MAX_BROWSERS
+    requests.look(camera(MAX_BROWSERS))
+    assert len(requests) == MAX_BROWSERS
+    requests.look(camera(3, x=1.0))  # one that is known may move
+    requests.leave(0)
+    requests.look(camera(MAX_BROWSERS))
+    asked = [requests.next().client for _ in range(MAX_BROWSERS)]
+    assert sorted(asked) == list(range(1, MAX_BROWSERS + 1))
+    assert requests.next() is None

@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import exp_se3
+from fields.map.gaussians import SH_C0, GaussianField
+from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.occupancy import OccupancyVoxels
+from pipelines.densify.depth import DepthEstimate
+from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
+from pipelines.memory_budget import MemoryBudget
+from pipelines.optimise.safeguards import Safeguards
+from pipelines.settings import DensifySettings
+
+CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
+POSE = exp_se3([0.3, -0.2, 0.4, 0.3, -0.5, 0.8])
+RNG = np.random.default_rng(0)
+
+
+def to_world(camera_points: np.ndarray) -> np.ndarray:
+    return (camera_points - POSE[:3, 3]) @ POSE[:3, :3]
+
+
+def view(count: int = 40, mask: np.ndarray | None = None) -> Keyframe:
+    """A keyframe of noise with points all over it, and some that it does not see."""
+    rng = np.random.default_rng(1)
+    pixels = rng.uniform([0, 0], [160, 120], (count, 2))
+    depth = rng.uniform(2, 6, count)
+    pixels[:2] = [[-5, 30], [200, 30]]
+    depth[2] = -3.0
+    points = SparsePoints(to_world(CAMERA.unproject(pixels, depth)), pixels, np.arange(count))
+    image = (rng.integers(0, 256, (120, 160, 3)) / 255).astype(np.float32)
+    return KeyframeStore().append(TrackedFrame(0, 0.0, "v", image, CAMERA, POSE, points, mask))
+
+
+class Wall:
+    """A depth estimator that knows a wall at depth 5, on the left half only."""
+
+    def estimate(self, view: Keyframe, neighbours, pixels: np.ndarray) -> DepthEstimate:
+        return DepthEstimate(np.full(len(pixels), 5.0), np.where(pixels[:, 0] < 80, 0.01, 1.0))
+
+
+def test_tracked_seeds_are_the_points_in_the_image_with_their_colour_and_size() -> None:
+    v = view()
+    seeds = tracked_seeds(v)
+    np.testing.assert_allclose(seeds.xyz, v.points.xyz[3:])
+    depth = (v.points.xyz[3:] @ POSE[2, :3]) + POSE[2, 3]
+    np.testing.assert_allclose(seeds.size, depth / 100.0)  # Eq. 1
+    column, row = v.points.pixels[3:].astype(int).T
+    np.testing.assert_allclose(seeds.colour, v.rgba[row, column, :3] / 255)
+
+
+def test_masked_pixels_seed_nothing() -> None:
+    mask = np.zeros((120, 160), dtype=bool)
+    mask[:60] = True
+    seeds = tracked_seeds(view(mask=mask))
+    pixels = CAMERA.project(seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3])
+    assert 0 < len(seeds) < 37
+    assert (pixels[:, 1] < 60).all()
+
+
+def test_dissimilarity_is_one_minus_ssim_of_grey_images() -> None:
+    import cv2
+
+    v = view()
+    render = np.clip(v.rgba[..., :3] / 255 + RNG.normal(0, 0.1, (120, 160, 3)), 0, 1).astype(np.float32)
+
+    def grey(image: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64), (5, 5), 0.5)
+
+    _, expected = structural_similarity(
+        grey(render), grey(v.rgba[..., :3]) / 255, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        data_range=1.0, full=True,
+    )  # fmt: skip
+    inside = (slice(8, -8), slice(8, -8))
+    np.testing.assert_allclose(dissimilarity(render, v.rgba)[inside], 1 - expected[inside], atol=2e-3)
+
+
+def test_a_masked_pixel_is_never_dissimilar() -> None:
+    mask = np.ones((120, 160), dtype=bool)
+    mask[30:90, 40:100] = False
+    v = view(mask=mask)
+    error = dissimilarity(np.full((120, 160, 3), 0.5, dtype=np.float32), v.rgba)
+    assert (error[~mask] == 0).all()
+    assert error[mask].mean() > 0.5
+
+
+def test_error_pixels_are_distinct_centres_of_high_error_without_a_tracked_point() -> None:
+    v = view()
+    error = np.zeros((120, 160), dtype=np.float32)
+    error[20:60, 30:90] = 0.5
+    pixels = error_pixels(v, error, DensifySettings(pixels=1600), np.random.default_rng(2))
+    assert len(pixels) == round(1600 * (160 * 120 / (640 * 480)) ** 0.75)
+    assert len(np.unique(pixels, axis=0)) == len(pixels)
+    np.testing.assert_array_equal(pixels % 1, 0.5)
+    column, row = pixels.astype(int).T
+    assert (error[row, column] > 0).all()
+    tracked = {tuple(p) for p in v.points.pixels[3:].astype(int)}
+    assert not tracked & set(zip(column.tolist(), row.tolist(), strict=True))
+
+
+def test_no_more_pixels_are_drawn_than_there_are() -> None:
+    error = np.zeros((120, 160), dtype=np.float32)
+    error[5, 5:9] = 1.0
+    assert len(error_pixels(view(), error, DensifySettings(), RNG)) <= 4
+    assert len(error_pixels(view(), np.zeros_like(error), DensifySettings(), RNG)) == 0
+
+
+def test_the_warm_up_draws_from_the_whole_image() -> None:
+    pixels = error_pixels(view(), None, DensifySettings(), np.random.default_rng(3))
+    assert pixels.min(axis=0).max() < 5
+    assert (pixels.max(axis=0) > [155, 115]).all()
+
+
+def test_pixel_seeds_lie_on_their_rays_at_the_estimated_depth_where_it_is_known() -> None:
+    pixels = np.array([[10.5, 20.5], [70.5, 100.5], [120.5, 60.5]])
+    seeds = pixel_seeds(view(), [], pixels, Wall(), 0.06)
+    local = seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3]
+    np.testing.assert_allclose(local[:, 2], 5.0)
+    np.testing.assert_allclose(CAMERA.project(local), pixels[:2])
+    np.testing.assert_allclose(seeds.size, 0.05)
+
+
+def test_every_pixel_may_have_a_limit_of_its_own() -> None:
+    pixels = np.array([[10.5, 20.5], [110.5, 100.5], [120.5, 60.5]])
+    seeds = pixel_seeds(view(), [], pixels, Wall(), np.array([0.001, 0.06, 2.0]))
+    local = seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3]
+    np.testing.assert_allclose(CAMERA.project(local), pixels[2:])
+
+
+@pytest.fixture(scope="module")
+def gaussians(taichi_on_the_cpu: None) -> GaussianField:
+    return GaussianField(1, max_gaussians=1024)
+
+
+def unlimited(gaussians: GaussianField) -> MemoryBudget:
+    return MemoryBudget(None, gaussians, KeyframeStore(), None, Safeguards())
+
+
+def test_gaussians_begin_as_the_paper_says(gaussians: GaussianField) -> None:
+    gaussians.remove(np.zeros(len(gaussians), dtype=bool))
+    settings = DensifySettings()
+    seeds = Seeds(np.array([[1.0, 2.0, 3.0]]), np.array([0.02]), np.array([[0.1, 0.5, 0.9]]))
+    assert grow(gaussians, seeds, None, 1.0, settings, unlimited(gaussians)) == 1
+    state = gaussians.to_numpy()
+    np.testing.assert_allclose(state["position"], [[1, 2, 3]])
+    np.testing.assert_allclose(state["log_scale"], np.log(0.5 * 0.02) + 0.5, rtol=1e-6)
+    np.testing.assert_array_equal(state["quaternion"], [[1, 0, 0, 0]])
+    assert gaussians.opacities() == pytest.approx(0.5)
+    np.testing.assert_allclose(0.5 + SH_C0 * state["sh"][0, 0], [0.1, 0.5, 0.9], rtol=1e-6)
+    assert (state["sh"][0, 1:] == 0).all()
+
+
+def test_voxels_keep_gaussians_from_crowding(gaussians: GaussianField) -> None:
+    gaussians.remove(np.zeros(len(gaussians), dtype=bool))
+    voxels = OccupancyVoxels(1.0, levels=4)
+    xyz = np.random.default_rng(4).uniform(0, 1, (400, 3)) * [1, 1, 0.05]
+    seeds = Seeds(xyz, np.full(400, 0.1), np.full((400, 3), 0.5))
+    budget = unlimited(gaussians)
+    added = grow(gaussians, seeds, voxels, 0.25, DensifySettings(), budget)
+    assert added == len(gaussians) == len(np.unique(np.floor(xyz / 0.25), axis=0))
+    assert grow(gaussians, seeds, voxels, 0.25, DensifySettings(), budget) == 0
+    assert grow(gaussians, seeds, voxels, 0.125, DensifySettings(), budget) > 0
+
+
+def test_a_full_pool_takes_what_it_can(gaussians: GaussianField) -> None:
+    gaussians.remove(np.zeros(len(gaussians), dtype=bool))
+    seeds = Seeds(np.random.default_rng(5).normal(size=(1100, 3)), np.full(1100, 0.1), np.full((1100, 3), 0.5))
+    budget = unlimited(gaussians)
+    assert grow(gaussians, seeds, None, 1.0, DensifySettings(), budget) == 1024
+    assert grow(gaussians, seeds, None, 1.0, DensifySettings(), budget) == 0
+    assert budget.safeguards.gaussians_without_room == 76 + 1100

@@ -1,0 +1,153 @@
+"""Exposure: the way back from an image to the scene's colours, the fit, the pull, and a whole run of changing light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.runtime.backend import initialise
+from pipelines.online import OnlineMapper
+from pipelines.optimise.exposure import ExposureRefinement, fitted_exposure, scene_colours
+from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.settings import ExposureSettings, MappingSettings
+from tests.pipelines.test_online import CAMERA, frame
+
+pytestmark = pytest.mark.slow
+
+EXPOSURE = IDENTITY + np.random.default_rng(1).normal(scale=0.1, size=(3, 4))
+
+
+def keyframe(image: NDArray, vignette: NDArray | None = None, exposure: NDArray | None = None) -> Keyframe:
+    tracked = replace(frame(0), image=image.astype(np.float32), vignette=vignette)
+    view = KeyframeStore().append(tracked)
+    view.exposure = exposure
+    return view
+
+
+def vignette(width: int = CAMERA.width, height: int = CAMERA.height) -> NDArray[np.float32]:
+    x, y = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
+    return np.repeat((1 - 0.35 * (x**2 + y[:, None] ** 2))[..., None], 3, axis=2).astype(np.float32)
+
+
+# ---- colours of new Gaussians ----------------------------------------------------------------------------------
+
+
+def test_the_colours_of_the_scene_are_those_that_develop_into_the_image() -> None:
+    scene = np.random.default_rng(2).uniform(0.2, 0.7, (CAMERA.height, CAMERA.width, 3))
+    image = (scene @ EXPOSURE[:, :3].T + EXPOSURE[:, 3]) * vignette()
+    pixels = np.stack(np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height)), axis=-1).reshape(-1, 2)
+    found = scene_colours(keyframe(image, vignette(), EXPOSURE), pixels)
+    # Half of a 256th, divided by the vignette and carried through the inverse of A.
+    assert np.abs(found.reshape(scene.shape) - scene).max() < 0.5 / 255 / vignette().min() * 1.7
+
+
+def test_a_level_of_the_pyramid_finds_its_place_in_the_vignette() -> None:
+    view = keyframe(0.6 * vignette(), vignette())
+    view.rgba = cv2.resize(view.rgba, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    corner_and_middle = np.array([[0, 0], [CAMERA.width // 4, CAMERA.height // 4]])
+    np.testing.assert_allclose(scene_colours(view, corner_and_middle), 0.6, atol=0.005)
+
+
+def test_colours_stay_within_bounds_where_the_exposure_cannot_be_undone() -> None:
+    image = np.ones((CAMERA.height, CAMERA.width, 3))
+    singular = np.array([[1e-9, 0, 0, 0.5], [0, 1e-9, 0, 0.5], [0, 0, 0, 0.5]])
+    colours = scene_colours(keyframe(image, exposure=singular), np.zeros((1, 2), dtype=int))
+    assert np.isfinite(colours).all()
+    assert ((colours >= 0) & (colours <= 2)).all()
+
+
+# ---- the fit and the pull --------------------------------------------------------------------------------------
+
+
+def test_the_fit_finds_an_exposure_behind_outliers() -> None:
+    rng = np.random.default_rng(3)
+    colours = rng.uniform(0, 1, (4000, 3))
+    image = colours @ EXPOSURE[:, :3].T + EXPOSURE[:, 3] + rng.normal(scale=0.005, size=(4000, 3))
+    image[:800] = rng.uniform(0, 1, (800, 3))
+    np.testing.assert_allclose(fitted_exposure(colours, image, IDENTITY, 1e-5), EXPOSURE, atol=0.02)
+
+
+def test_what_the_colours_do_not_tell_stays_as_in_the_last_keyframe() -> None:
+    """All of one colour: the image's is matched, by the exposure nearest to the prior."""
+    colours = np.tile([0.5, 0.4, 0.6], (500, 1))
+    found = fitted_exposure(colours, 1.2 * colours, EXPOSURE, 1e-6)
+    np.testing.assert_allclose(found @ [0.5, 0.4, 0.6, 1.0], 1.2 * colours[0], atol=1e-4)
+    direction = np.array([0.5, 0.4, 0.6, 1.0])
+    across = np.eye(4) - np.outer(direction, direction) / (direction @ direction)
+    np.testing.assert_allclose((found - EXPOSURE) @ across, 0.0, atol=1e-7)
+
+
+def test_without_news_from_the_image_the_exposure_returns_to_the_identity() -> None:
+    refinement = ExposureRefinement(ExposureSettings(enabled=True, learning_rate=0.01))
+    view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
+    for _ in range(200):
+        refinement.step(view, np.zeros((3, 4)))
+    np.testing.assert_allclose(view.exposure, IDENTITY, atol=0.01)
+
+
+def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
+    refinement = ExposureRefinement(ExposureSettings(enabled=True))
+    view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
+    refinement.step(view, np.full((3, 4), np.nan))
+    np.testing.assert_array_equal(view.exposure, EXPOSURE)
+
+
+# ---- whole runs on the wall of test_mapping --------------------------------------------------------------------
+
+GAINS = (1.0, 0.8, 1.15, 0.9, 0.7, 1.0, 0.85)
+
+
+def mapped(frames: list, **exposure: object) -> OnlineMapper:
+    settings = MappingSettings(
+        optimise={"steps": 20, "last_steps": 30},
+        densify={"warm_up": 2},
+        keyframes={"max_gap": 1},
+        exposure=exposure,
+        gate={"enabled": False},  # a scene of one colour looks the same from everywhere
+    )
+    initialise("cpu")  # one process does not hold all these maps
+    mapper = OnlineMapper(settings, CAMERA.width, CAMERA.height, seed=1)
+    for each in frames:
+        mapper.process(each)
+    mapper.finish()
+    return mapper
+
+
+def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None) -> None:
+    frames = [frame(i) for i in range(len(GAINS))]
+    frames = [replace(f, image=np.clip(g * f.image, 0, 1)) for f, g in zip(frames, GAINS, strict=True)]
+    mapper = mapped(frames, enabled=True)
+    assert len(mapper.keyframes) == len(GAINS)
+    np.testing.assert_array_equal(mapper.keyframes[0].exposure, IDENTITY)
+    for view, gain in zip(mapper.keyframes, GAINS, strict=True):
+        shown = view.exposure @ [0.5, 0.5, 0.5, 1.0]
+        np.testing.assert_allclose(shown, 0.5 * gain, atol=0.03)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_scene_of_one_colour_is_recovered_behind_a_known_vignette(taichi_on_the_cpu: None, known: bool) -> None:
+    colour = np.array([0.5, 0.6, 0.4])
+    frames = [
+        replace(frame(i), image=(colour * vignette()).astype(np.float32), vignette=vignette() if known else None)
+        for i in range(4)
+    ]
+    mapper = mapped(frames)
+    view = mapper.keyframes[1]
+    scene = mapper.renderer.render(view.camera, view.T_camera_world, 0.01)
+    solid = scene.opacity > 0.9
+    assert solid.mean() > 0.2
+    shown = (scene.colour / colour).mean(axis=2) / np.maximum(scene.opacity, 0.1)
+    light = vignette()[..., 0]
+    corners, middle = shown[solid & (light < 0.65)], shown[solid & (light > 0.9)]
+    assert min(len(corners), len(middle)) > 100
+    fall = corners.mean() / middle.mean()
+    # Without the vignette the map takes the dark corners for the scene's.
+    assert fall == pytest.approx(1.0, abs=0.03) if known else fall < 0.75
+    # Nobody asked for exposures.
+    assert all(view.exposure is None for view in mapper.keyframes)
+    assert mapper.keyframes.exposure_at(0) is None

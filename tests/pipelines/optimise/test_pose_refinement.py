@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import taichi as ti
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import exp_se3, inverse_se3, log_se3
+from fields.map.keyframes import Keyframe, KeyframeStore
+from pipelines.optimise.losses import PhotometricLoss
+from pipelines.optimise.pose_refinement import PoseRefinement, pixel_metric, reprojection
+from pipelines.render.renderer import Renderer
+from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
+
+DEPTH = 4.0
+
+
+def keyframe(image: NDArray, T: NDArray, camera: PinholeCamera = CAMERA) -> Keyframe:
+    """A view from T whose tracked points lie at DEPTH."""
+    pixels = np.array([[10.0, 10.0], [30.0, 20.0], [20.0, 30.0]])
+    T_world_camera = inverse_se3(T)
+    xyz = camera.unproject(pixels, np.full(3, DEPTH)) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    image = np.clip(image, 0, 1).astype(np.float32)
+    return KeyframeStore().append(
+        TrackedFrame(0, 0.0, "view", image, camera, T, SparsePoints(xyz, pixels, np.arange(3)))
+    )
+
+
+def black() -> Keyframe:
+    return keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), POSE)
+
+
+def difference(renderer: Renderer, view: Keyframe, T: NDArray) -> float:
+    """Mean absolute difference of the view's image and the map seen from T."""
+    return float(np.abs(renderer.render(CAMERA, T, NEAR).colour - view.rgba[..., :3] / 255).mean())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_moved_pose_comes_back_when_only_poses_are_stepped(renderers: Callable[..., Renderer], seed: int) -> None:
+    """Moved by 2 percent of the depth and 0.6 degrees a axis: some two pixels of 43."""
+    renderer = renderers(0, ti.f32)
+    renderer.gaussians.load(random_gaussians(150, seed=21, size=(2.0, 6.0)))
+    before = renderer.gaussians.to_numpy()
+    offset = np.random.default_rng(seed).choice([-1.0, 1.0], 6) * np.repeat([0.02 * DEPTH, 0.01], 3)
+    moved = exp_se3(offset) @ POSE
+    view = keyframe(renderer.render(CAMERA, POSE, NEAR).colour, moved)
+    loss = PhotometricLoss(renderer.images)
+    refinement = PoseRefinement()
+    for _ in range(80):
+        renderer.forward(CAMERA, view.T_camera_world, NEAR)
+        renderer.images.set_reference(view.rgba)
+        loss.forward()
+        loss.backward(0.2)
+        renderer.backward()
+        refinement.step(view, renderer.camera_gradient(), 0.05)
+    assert difference(renderer, view, view.T_camera_world) < 0.2 * difference(renderer, view, moved)
+    left = log_se3(view.T_camera_world @ inverse_se3(POSE))
+    assert np.linalg.norm(left[:3]) < 0.6 * np.linalg.norm(offset[:3])
+    assert np.linalg.norm(left[3:]) < 0.6 * np.linalg.norm(offset[3:])
+    for name, value in renderer.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(value, before[name])
+
+
+def tracked(pose: NDArray, n: int = 60, noise: float = 0.0, outliers: int = 0) -> Keyframe:
+    """A view said to be at `pose`, whose points were tracked from POSE."""
+    rng = np.random.default_rng(3)
+    pixels = rng.uniform([1, 1], [CAMERA.width - 1, CAMERA.height - 1], (n, 2))
+    T_world_camera = inverse_se3(POSE)
+    xyz = CAMERA.unproject(pixels, rng.uniform(2, 6, n)) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    pixels = pixels + noise * rng.normal(size=(n, 2))
+    pixels[:outliers] = rng.uniform(0, 35, (outliers, 2))
+    image = np.zeros((CAMERA.height, CAMERA.width, 3), dtype=np.float32)
+    return KeyframeStore().append(
+        TrackedFrame(0, 0.0, "v", image, CAMERA, pose, SparsePoints(xyz, pixels, np.arange(n)))
+    )
+
+
+def test_the_tracked_points_pull_by_the_derivative_of_their_error() -> None:
+    """Against central differences of Huber's loss, outliers among the points."""
+    view = tracked(exp_se3([0.05, -0.02, 0.04, 0.01, 0.02, -0.01]) @ POSE, outliers=6)
+    W = pixel_metric(view)
+
+    def loss(u: NDArray) -> float:
+        T = exp_se3(W @ u) @ view.T_camera_world
+        error = CAMERA.project(view.points.xyz @ T[:3, :3].T + T[:3, 3]) - view.points.pixels
+        r = np.linalg.norm(error, axis=1)
+        return float(np.where(r < 2.0, 0.5 * r**2, 2.0 * r - 2.0).mean())
+
+    expected = [(loss(1e-5 * e) - loss(-1e-5 * e)) / 2e-5 for e in np.eye(6)]
+    np.testing.assert_allclose(reprojection(view, W)[0], expected, rtol=1e-5, atol=1e-8)
+
+
+def test_a_wrong_pose_comes_back_by_its_tracked_points_in_spite_of_outliers() -> None:
+    """Two degrees and two percent of the depth an axis, a tenth of the points elsewhere."""
+    view = tracked(exp_se3(np.repeat([0.02 * DEPTH, np.radians(2.0)], 3)) @ POSE, noise=0.1, outliers=6)
+    before = np.linalg.norm(log_se3(POSE @ inverse_se3(view.T_camera_world)))
+    PoseRefinement().align(view)
+    assert np.linalg.norm(log_se3(POSE @ inverse_se3(view.T_camera_world))) < 0.2 * before
+
+
+def test_points_that_agree_with_the_pose_leave_it_where_it_is() -> None:
+    view = tracked(POSE)
+    PoseRefinement().align(view)
+    np.testing.assert_allclose(view.T_camera_world, POSE, atol=1e-9)
+
+
+def test_too_few_points_do_not_throw_a_pose_away() -> None:
+    view = tracked(exp_se3([0.02, 0, 0, 0, 0.01, 0]) @ POSE, n=1, noise=0.5)
+    PoseRefinement().align(view)
+    moved = np.linalg.solve(pixel_metric(view), log_se3(view.correction))
+    assert np.linalg.norm(moved) < 3.0  # pixels
+
+
+def test_a_unit_of_the_pixel_metric_moves_the_image_by_a_pixel() -> None:
+    view = black()
+    x, y = np.meshgrid((np.arange(5) + 0.5) / 5 * CAMERA.width, (np.arange(5) + 0.5) / 5 * CAMERA.height)
+    pixels = np.tile(np.stack([x.ravel(), y.ravel()], axis=1), (2, 1))
+    points = CAMERA.unproject(pixels, np.repeat([0.6 * DEPTH, 1.6 * DEPTH], 25))
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        u = 1e-5 * rng.normal(size=6)
+        T = exp_se3(pixel_metric(view) @ u)
+        moved = CAMERA.project(points @ T[:3, :3].T + T[:3, 3]) - pixels
+        assert np.sqrt((moved**2).sum(axis=1).mean()) == pytest.approx(np.linalg.norm(u), rel=1e-3)
+
+
+def test_the_metric_follows_the_scale_of_the_scene() -> None:
+    view, tenth = black(), black()
+    tenth.median_depth = 0.1 * DEPTH
+    np.testing.assert_allclose(pixel_metric(tenth)[:3], 0.1 * pixel_metric(view)[:3], atol=1e-12)
+    np.testing.assert_allclose(pixel_metric(tenth)[3:], pixel_metric(view)[3:], atol=1e-12)
+
+
+def test_steps_are_those_of_adam_in_the_metric_on_the_left_of_the_pose() -> None:
+    torch = pytest.importorskip("torch")
+    view = black()
+    W = pixel_metric(view)
+    u = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    oracle = torch.optim.Adam([u], lr=0.03, eps=1e-15)
+    expected, rng = POSE, np.random.default_rng(0)
+    for _ in range(10):
+        gradient = rng.normal(size=6)
+        PoseRefinement().step(view, gradient, 0.03)
+        start = u.detach().clone()
+        u.grad = torch.tensor(W.T @ gradient)
+        oracle.step()
+        expected = exp_se3(W @ (u.detach() - start).numpy()) @ expected
+    np.testing.assert_allclose(view.T_camera_world, expected, atol=1e-9)
+
+
+def test_a_pose_stays_rigid_over_many_steps() -> None:
+    view = black()
+    rng = np.random.default_rng(1)
+    for _ in range(500):
+        PoseRefinement().step(view, rng.normal(size=6), 0.5)
+    R = view.T_camera_world[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(view.T_camera_world[3], [0, 0, 0, 1])
+    np.testing.assert_array_equal(view.T_tracked, POSE)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_gradient_that_is_not_finite_moves_nothing(bad: float) -> None:
+    view = black()
+    PoseRefinement().step(view, np.array([0.1, 0, 0, bad, 0, 0]), 1.0)
+    np.testing.assert_array_equal(view.T_camera_world, POSE)
+    assert view.pose_steps == 0
+    assert np.isfinite(view.pose_m).all()

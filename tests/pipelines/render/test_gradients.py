@@ -1,0 +1,129 @@
+"""Gradients of the whole renderer in float64 against central finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import taichi as ti
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import exp_se3
+from pipelines.render.compositing_reference import ReferenceCompositing
+from pipelines.render.renderer import Renderer
+from tests.pipelines.differences import STEP, central_differences
+from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
+
+pytestmark = pytest.mark.slow
+
+
+def scene(degree: int) -> dict[str, NDArray[np.float64]]:
+    """Gaussians that reach across the whole picture above the cut at 1/255, so that the picture is smooth in all."""
+    return random_gaussians(5, seed=3, degree=degree, size=(14.0, 25.0), logit=(0.0, 1.5), beyond=-0.2)
+
+
+class Functional:
+    """A random linear functional of colour, depth and opacity."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        rng = np.random.default_rng(7)
+        shape = (CAMERA.height, CAMERA.width)
+        self.renderer = renderer
+        self.colour, self.depth, self.opacity = (
+            rng.normal(size=(*shape, 3)),
+            rng.normal(size=shape),
+            rng.normal(size=shape),
+        )
+
+    def value(self, state: dict[str, NDArray], pose: NDArray = POSE) -> float:
+        self.renderer.gaussians.load(state)
+        view = self.renderer.render(CAMERA, pose, NEAR)
+        return float(
+            (view.colour * self.colour).sum() + (view.depth * self.depth).sum() + (view.opacity * self.opacity).sum()
+        )
+
+    def gradients(self, state: dict[str, NDArray]) -> tuple[dict[str, NDArray], NDArray]:
+        """Of the Gaussians by name, and of the camera tangent (6,)."""
+        self.value(state)
+        self.renderer.images.set_gradients(self.colour, self.depth, self.opacity)
+        self.renderer.backward(with_depth=True)
+        return self.renderer.gaussians.gradients_to_numpy(), self.renderer.camera_gradient()
+
+
+def assert_agree(analytic: NDArray, numeric: NDArray) -> None:
+    """Relative to the largest entry: below 1e-4 everywhere."""
+    assert np.abs(numeric).max() > 1e-3  # the functional depends on it
+    assert np.abs(analytic - numeric).max() / np.abs(numeric).max() < 1e-4
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("name", ["position", "log_scale", "quaternion", "opacity_logit", "sh"])
+def test_the_gradient_of_every_parameter_is_that_of_finite_differences(
+    renderers: Callable[..., Renderer], degree: int, name: str
+) -> None:
+    functional = Functional(renderers(degree, ti.f64))
+    state = scene(degree)
+    analytic = functional.gradients(state)[0][name]
+    assert_agree(analytic, central_differences(functional.value, state, name))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_the_gradient_of_the_camera_tangent_is_that_of_finite_differences(
+    renderers: Callable[..., Renderer], degree: int
+) -> None:
+    functional = Functional(renderers(degree, ti.f64))
+    state = scene(degree)
+    analytic = functional.gradients(state)[1]
+    numeric = np.zeros(6)
+    for k in range(6):
+        xi = np.zeros(6)
+        xi[k] = STEP
+        values = [functional.value(state, exp_se3(sign * xi) @ POSE) for sign in (1, -1)]
+        numeric[k] = (values[0] - values[1]) / (2 * STEP)
+    assert_agree(analytic, numeric)
+
+
+def test_gradients_of_two_runs_are_bit_identical(renderers: Callable[..., Renderer]) -> None:
+    functional = Functional(renderers(0, ti.f32))
+    state = random_gaussians(600, seed=5)
+    first, first_camera = functional.gradients(state)
+    second, second_camera = functional.gradients(state)
+    assert all(np.abs(value).max() > 0 for value in first.values())
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name])
+    np.testing.assert_array_equal(first_camera, second_camera)
+
+
+def test_the_vectorised_compositing_is_that_of_its_plain_twin(renderers: Callable[..., Renderer]) -> None:
+    renderer = renderers(0, ti.f32)
+    twin = ReferenceCompositing(renderer.view, renderer.projected, renderer.pairs, renderer.images)
+    rng = np.random.default_rng(1)
+    shape = (CAMERA.height, CAMERA.width)
+    gradients = rng.normal(size=(*shape, 3)), np.zeros(shape), rng.normal(size=shape)
+    results = []
+    for compositing in (renderer.compositing, twin):
+        renderer.gaussians.load(random_gaussians(300, seed=8))
+        renderer.forward(CAMERA, POSE, NEAR)
+        compositing.forward()
+        picture = renderer.images.colour_to_numpy()
+        renderer.images.set_gradients(*gradients)
+        compositing.backward()
+        renderer.projection.backward()
+        results.append((picture, renderer.gaussians.gradients_to_numpy()))
+    (picture, gradient), (twin_picture, twin_gradient) = results
+    np.testing.assert_allclose(picture, twin_picture, rtol=0, atol=1e-5)
+    for name, value in gradient.items():
+        np.testing.assert_allclose(value, twin_gradient[name], rtol=0, atol=2e-4 * np.abs(value).max())
+
+
+def test_gaussians_out_of_view_get_no_gradient_and_no_mark(renderers: Callable[..., Renderer]) -> None:
+    functional = Functional(renderers(0, ti.f32))
+    state = random_gaussians(20, seed=9)
+    state["position"][::2] += 1000.0
+    gradients, _ = functional.gradients(state)
+    for value in gradients.values():
+        assert (value[::2] == 0).all()
+    marks = functional.renderer.gaussians.touched.to_numpy()[:20]
+    assert (marks[::2] == 0).all()
+    assert (marks[1::2] == 1).any()

@@ -1,0 +1,267 @@
+"""`rasterize` against the plain renderer, against finite differences, and as the renderer of a training loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import exp_se3, torch_exp_se3
+from fields.map.gaussians import SH_C0, GaussianField
+from fields.map.keyframes import Keyframe
+from fields.runtime.backend import initialise
+from pipelines.optimise.map_optimiser import MapOptimiser
+from pipelines.render.rasterize import RasterizedView, rasterize
+from pipelines.render.renderer import Renderer
+from pipelines.settings import MappingSettings
+from tests.pipelines import reference
+from tests.pipelines.optimise.test_map_optimiser import MOTION, store_of_views
+from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
+
+NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")
+BACKGROUND = (0.2, 0.5, 0.9)
+LARGE = PinholeCamera(80.0, 80.0, 50.0, 40.0, 100, 70)
+
+
+def tensors(state: dict[str, NDArray], kind: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    """The Gaussians as leaves that ask for gradients."""
+    return {name: torch.from_numpy(state[name]).to(kind).requires_grad_() for name in NAMES}
+
+
+def view(
+    gaussians: dict[str, Tensor], T: NDArray | Tensor = POSE, camera: PinholeCamera = CAMERA, **options: object
+) -> RasterizedView:
+    return rasterize(**gaussians, T_camera_world=torch.as_tensor(T), camera=camera, near=NEAR, **options)
+
+
+def gradients_of(picture: RasterizedView, inputs: dict[str, Tensor]) -> dict[str, NDArray]:
+    """Of a fixed functional of all three outputs."""
+    generator = torch.Generator().manual_seed(1)
+    weights = (torch.randn(output.shape, generator=generator, dtype=output.dtype) for output in picture)
+    loss = sum((output * weight).sum() for output, weight in zip(picture, weights, strict=True))
+    return dict(zip(inputs, (g.numpy() for g in torch.autograd.grad(loss, list(inputs.values()))), strict=True))
+
+
+@pytest.fixture
+def scene() -> dict[str, Tensor]:
+    return tensors(random_gaussians(60, seed=4, degree=1))
+
+
+@pytest.fixture
+def anew(taichi_on_the_cpu: None) -> Iterator[None]:
+    """Taichi without any fields, before and after: a process keeps those of two kinds of call."""
+    initialise("cpu")
+    yield
+    initialise("cpu")
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------
+
+
+def test_pictures_are_those_of_the_plain_renderer() -> None:
+    state = random_gaussians(60, seed=4, degree=1)
+    expected = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
+    picture = view(tensors(state), background=torch.tensor(BACKGROUND))
+    assert [tuple(output.shape) for output in picture] == [(35, 43, 3), (35, 43), (35, 43)]
+    for output, truth in zip(picture, (expected.colour, expected.depth, expected.opacity), strict=True):
+        assert output.dtype == torch.float32
+        np.testing.assert_allclose(output.detach(), truth, rtol=0, atol=2e-4)
+
+
+def test_no_gaussians_give_the_background() -> None:
+    nothing = tensors({name: value[:0] for name, value in random_gaussians(1, seed=1, degree=1).items()})
+    T = torch.from_numpy(POSE).requires_grad_()
+    picture = view(nothing, T, background=torch.tensor(BACKGROUND))
+    assert (picture.image == torch.tensor(BACKGROUND)).all()
+    gradients = gradients_of(picture, nothing | {"T_camera_world": T})
+    assert gradients["position"].shape == (0, 3) and (gradients["T_camera_world"] == 0).all()
+
+
+# ---- gradients ------------------------------------------------------------------------------------------------
+
+
+def test_the_gradient_of_a_pose_is_that_of_the_tangent_it_was_made_from(scene: dict[str, Tensor]) -> None:
+    """By way of the 4x4 matrix, as the renderer itself has it."""
+    xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    found = gradients_of(view(scene, torch_exp_se3(xi) @ torch.from_numpy(POSE)), {"xi": xi})["xi"]
+    T = torch.from_numpy(POSE).requires_grad_()
+    G = gradients_of(view(scene, T), {"T": T})["T"]
+    numeric = [((exp_se3(1e-6 * e) - exp_se3(-1e-6 * e)) / 2e-6 @ POSE * G).sum() for e in np.eye(6)]
+    assert np.abs(found).max() > 1
+    np.testing.assert_allclose(found, numeric, rtol=1e-6, atol=1e-6 * np.abs(found).max())
+
+
+def test_a_gradient_does_not_mind_pictures_drawn_in_between(scene: dict[str, Tensor]) -> None:
+    T = torch.from_numpy(POSE).requires_grad_()
+    inputs = scene | {"T": T}
+    expected = gradients_of(view(scene, T), inputs)
+    picture = view(scene, T)
+    view(tensors(random_gaussians(200, seed=9, degree=1)), exp_se3(MOTION) @ POSE)
+    view(tensors(random_gaussians(20, seed=9, degree=1)), camera=LARGE)
+    found = gradients_of(picture, inputs)
+    for name, value in expected.items():
+        assert np.abs(value).max() > 0
+        np.testing.assert_array_equal(found[name], value)
+
+
+def test_a_gradient_can_be_taken_again_and_by_parts(scene: dict[str, Tensor]) -> None:
+    picture = view(scene)
+    whole = torch.autograd.grad(picture.image.sum() + picture.depth.sum(), scene["position"], retain_graph=True)[0]
+    again = torch.autograd.grad(picture.image.sum() + picture.depth.sum(), scene["position"], retain_graph=True)[0]
+    parts = [torch.autograd.grad(part.sum(), scene["position"], retain_graph=True)[0] for part in picture[:2]]
+    np.testing.assert_array_equal(whole, again)
+    np.testing.assert_allclose(sum(parts), whole, atol=1e-5 * float(whole.abs().max()))
+
+
+# ---- what does not fit ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "complaint"),
+    [
+        ({"position": np.zeros((60, 3))}, TypeError, "position is a ndarray, expected a torch.Tensor"),
+        ({"sh": torch.zeros(60, 4, 3, dtype=torch.float16)}, TypeError, "sh is float16, expected float32 or float64"),
+        ({"log_scale": torch.zeros(60, 3).double()}, TypeError, "log_scale is float64, position float32"),
+        ({"log_scale": torch.zeros(60, 3, device="meta")}, ValueError, "log_scale lies on meta, the kernels run on"),
+        ({"position": torch.zeros(3)}, ValueError, r"position has shape \(3,\), expected \(3, 3\)"),
+        ({"quaternion": torch.ones(60, 3)}, ValueError, r"quaternion has shape \(60, 3\), expected \(60, 4\)"),
+        ({"opacity_logit": torch.ones(60, 1)}, ValueError, r"opacity_logit has shape \(60, 1\), expected \(60,\)"),
+        ({"sh": torch.ones(60, 5, 3)}, ValueError, r"sh has shape \(60, 5, 3\), expected \(60, K, 3\)"),
+        ({"background": torch.ones(4)}, ValueError, r"background has shape \(4,\), expected \(3,\)"),
+        ({"T_camera_world": torch.eye(3)}, ValueError, r"T_camera_world has shape \(3, 3\), expected \(4, 4\)"),
+        ({"T_camera_world": 1.1 * torch.eye(4)}, ValueError, "T_camera_world is no rigid motion: an entry is 0.1 off"),
+        ({"T_camera_world": -torch.eye(4)}, ValueError, "T_camera_world is no rigid motion"),
+        ({"log_scale": torch.full((60, 3), torch.nan)}, ValueError, "log_scale of Gaussian 0 is not finite"),
+        ({"quaternion": torch.eye(60, 4)}, ValueError, "quaternion of Gaussian 4 is zero"),
+        ({"colour": torch.ones(60, 3)}, TypeError, "either sh or colour"),
+    ],
+)
+def test_what_does_not_fit_is_told_in_one_line(
+    scene: dict[str, Tensor], changes: dict[str, object], error: type[Exception], complaint: str
+) -> None:
+    with pytest.raises(error, match=complaint) as told:
+        rasterize(**{**scene, "T_camera_world": torch.eye(4), "camera": CAMERA, **changes})
+    assert "\n" not in str(told.value)
+
+
+# ---- room, and Taichi started anew ----------------------------------------------------------------------------
+
+
+def test_a_third_set_of_fields_is_refused_with_the_way_out(anew: None, scene: dict[str, Tensor]) -> None:
+    view(scene)
+    view(scene, camera=LARGE)
+    with pytest.raises(RuntimeError, match=r"begin with the largest image, or call modp_ti\.initialise"):
+        view(scene | {"sh": scene["sh"][:, :1]})
+
+
+@pytest.mark.slow
+def test_a_gradient_outlives_a_new_start_of_taichi(anew: None, scene: dict[str, Tensor]) -> None:
+    expected = gradients_of(view(scene), scene)
+    picture = view(scene)
+    initialise("cpu", threads=1)
+    for found in (gradients_of(picture, scene), gradients_of(view(scene), scene)):
+        for name, value in expected.items():
+            np.testing.assert_array_equal(found[name], value)
+
+
+# ---- training -------------------------------------------------------------------------------------------------
+
+STEPS = 500
+SSIM_WEIGHT = 0.2
+
+
+def loss_in_torch(render: Tensor, keyframe: Keyframe) -> Tensor:
+    """(1 - w) L1 + w (1 - SSIM) over the valid pixels, as `losses.py` says it."""
+    rgba = torch.from_numpy(keyframe.rgba)
+    valid, truth = rgba[..., 3] > 0, rgba[..., :3] / 255.0
+    a, b = (x.permute(2, 0, 1) for x in (torch.where(valid[..., None], render, truth), truth))
+    weights = torch.exp(-0.5 * (torch.arange(-5.0, 6.0) / 1.5) ** 2)
+    window = torch.outer(weights, weights)[None, None] / weights.sum() ** 2
+    mu_a, mu_b, aa, bb, ab = conv2d(torch.cat([a, b, a * a, b * b, a * b])[:, None], window, padding=5).split(3)
+    variances, covariance = aa + bb - mu_a**2 - mu_b**2, ab - mu_a * mu_b
+    ssim = (2 * mu_a * mu_b + 1e-4) * (2 * covariance + 9e-4) / ((mu_a**2 + mu_b**2 + 1e-4) * (variances + 9e-4))
+    l1 = (a - b).abs()[:, valid].mean()
+    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim[:, 0][:, valid].mean())
+
+
+@pytest.mark.slow
+def test_a_plain_torch_loop_trains_as_our_own_does(anew: None) -> None:
+    """The same start, views, loss and rates: the curves lie on one another, though rounding parts the paths."""
+    store = store_of_views([POSE, exp_se3(MOTION) @ POSE, exp_se3(-np.array(MOTION)) @ POSE])
+    start = random_gaussians(200, seed=32, degree=1, size=(1.5, 5.0))
+    settings = MappingSettings(near=0.01, optimise={"aspect_weight": 0.0, "ssim_weight": SSIM_WEIGHT})
+
+    leaves = {name: value.detach() for name, value in tensors(start).items() if name != "sh"}
+    sh = torch.from_numpy(start["sh"]).float()
+    leaves |= {"constant": sh[:, :1].clone(), "directional": sh[:, 1:].clone()}
+    o, depth = settings.optimise, store.scene_depth
+    rates = (o.position_rate * depth, o.scale_rate, o.rotation_rate, o.opacity_rate, o.colour_rate, o.colour_rate / 20)
+    groups = [{"params": [v.requires_grad_()], "lr": r} for v, r in zip(leaves.values(), rates, strict=True)]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    torch_curve = []
+    for step in range(STEPS):
+        keyframe = store[step % 3]
+        picture = rasterize(
+            *(leaves[name] for name in NAMES[:4]),
+            torch.cat([leaves["constant"], leaves["directional"]], dim=1),
+            T_camera_world=torch.from_numpy(keyframe.T_camera_world),
+            camera=keyframe.camera,
+            near=settings.near * depth,
+        )
+        loss = loss_in_torch(picture.image, keyframe)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        torch_curve.append(loss.item())
+
+    renderer = Renderer(GaussianField(1, max_gaussians=1 << 16), 64, 64)
+    renderer.gaussians.load(start)
+    optimiser = MapOptimiser(renderer.gaussians, renderer, settings)
+    our_curve = []
+    for step in range(STEPS):
+        values = optimiser.compare(store[step % 3], depth)
+        our_curve.append((1 - SSIM_WEIGHT) * values.l1 + SSIM_WEIGHT * (1 - values.ssim))
+        optimiser.step(store, [step % 3], optimiser.rates(depth), pose_rate=0.0)
+
+    np.testing.assert_allclose(torch_curve[:3], our_curve[:3], rtol=1e-4)
+    beginnings, ends = (
+        [np.mean(curve[part]) for curve in (torch_curve, our_curve)] for part in (slice(9), slice(-9, None))
+    )
+    print(f"loss of the torch loop {beginnings[0]:.4f} -> {ends[0]:.4f}, of ours {beginnings[1]:.4f} -> {ends[1]:.4f}")
+    assert ends[1] < 0.75 * beginnings[1]
+    assert ends[0] == pytest.approx(ends[1], rel=0.02)
+
+
+# ---- in float64 ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_gradcheck_in_float64_by_every_input(anew: None) -> None:
+    """All sixteen numbers of the pose too, the background, and each of the three outputs."""
+    camera = PinholeCamera(9.0, 8.0, 4.2, 2.8, 9, 6)
+    # Across the whole picture above the cut at 1/255, so that it is smooth in all.
+    state = random_gaussians(3, seed=3, degree=1, camera=camera, size=(4.0, 8.0), logit=(0.0, 1.5), beyond=-0.2)
+    inputs = tensors(state, torch.float64)
+    T, background = (
+        torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (POSE.tolist(), BACKGROUND)
+    )
+
+    def outputs(*values: Tensor) -> tuple[Tensor, ...]:
+        gaussians = dict(zip(NAMES, values, strict=False))
+        return tuple(view(gaussians, values[5], camera, background=values[6]))
+
+    assert torch.autograd.gradcheck(outputs, (*inputs.values(), T, background))
+
+
+def test_a_colour_is_the_constant_harmonic(anew: None, scene: dict[str, Tensor]) -> None:
+    sh = scene["sh"][:, :1]
+    colour = 0.5 + SH_C0 * sh[:, 0]
+    geometry = {name: value for name, value in scene.items() if name != "sh"}
+    plain = view(geometry, colour=colour)
+    np.testing.assert_allclose(plain.image.detach(), view(geometry | {"sh": sh}).image.detach(), atol=1e-6)

@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import taichi as ti
+from numpy.typing import NDArray
+
+from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
+from fields.geometry.camera import PinholeCamera
+from pipelines.render.renderer import RenderedView, Renderer
+from tests.pipelines import reference
+from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
+
+BACKGROUND = (0.2, 0.5, 0.9)
+
+
+def render(
+    renderer: Renderer,
+    state: dict[str, NDArray],
+    camera: PinholeCamera = CAMERA,
+    pose: NDArray = POSE,
+    background: tuple[float, float, float] = BACKGROUND,
+) -> RenderedView:
+    renderer.gaussians.load(state)
+    return renderer.render(camera, pose, NEAR, background)
+
+
+def assert_same_picture(view: RenderedView, picture: reference.Picture, tolerance: float = 1e-5) -> None:
+    np.testing.assert_allclose(view.colour, picture.colour, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(view.opacity, picture.opacity, rtol=0, atol=tolerance)
+    # Depth in units of the farthest one, so that the same digits count.
+    np.testing.assert_allclose(view.depth, picture.depth, rtol=0, atol=tolerance * max(picture.depth.max(), 1.0))
+
+
+def assert_bit_identical(a: RenderedView, b: RenderedView) -> None:
+    np.testing.assert_array_equal(a.colour, b.colour)
+    np.testing.assert_array_equal(a.depth, b.depth)
+    np.testing.assert_array_equal(a.opacity, b.opacity)
+
+
+def only(state: dict[str, NDArray], which: NDArray | slice) -> dict[str, NDArray]:
+    return {name: value[which] for name, value in state.items()}
+
+
+def joined(*states: dict[str, NDArray]) -> dict[str, NDArray]:
+    return {name: np.concatenate([s[name] for s in states]) for name in states[0]}
+
+
+# ---- against the plain renderer -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_float64_picture_is_that_of_the_reference(renderers: Callable[..., Renderer], degree: int) -> None:
+    state = random_gaussians(60, seed=degree, degree=degree)
+    picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
+    assert picture.opacity.max() > 0.8  # the scene says something
+    assert_same_picture(render(renderers(degree, ti.f64), state), picture, 1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_float32_picture_is_that_of_the_reference(renderers: Callable[..., Renderer], degree: int, seed: int) -> None:
+    state = random_gaussians(40, seed=10 * seed + degree, degree=degree)
+    state = {name: value.astype(np.float32) for name, value in state.items()}
+    picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
+    assert picture.margin > 1e-5, "choose another seed: rounding decides a threshold"
+    assert_same_picture(render(renderers(degree, ti.f32), state), picture)
+
+
+def test_needles_and_discs_are_those_of_the_reference(renderers: Callable[..., Renderer]) -> None:
+    """Axes of 0.03 to 30 pixels: thin as lines, and long beyond several tiles."""
+    state = random_gaussians(40, seed=5, size=(0.03, 30.0), logit=(0.0, 4.0))
+    picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
+    assert_same_picture(render(renderers(0, ti.f64), state), picture, 1e-6)
+
+
+def test_gaussians_far_outside_the_image_are_linearised_at_its_margin(renderers: Callable[..., Renderer]) -> None:
+    """Large Gaussians beside the camera: without the limit their ellipses would blow up."""
+    state = random_gaussians(40, seed=6, depth=(0.2, 2.0), size=(3.0, 30.0), beyond=1.5)
+    picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
+    assert_same_picture(render(renderers(0, ti.f64), state), picture, 1e-6)
+
+
+@pytest.mark.parametrize("opacity_logit", [2.0, 9.0])
+def test_a_tile_stops_behind_opaque_layers(renderers: Callable[..., Renderer], opacity_logit: float) -> None:
+    """Sixty layers that cover the picture; at a logit of 9 alpha is clamped to 0.99."""
+    state = random_gaussians(60, seed=7, size=(40.0, 60.0), logit=(opacity_logit, opacity_logit), beyond=-0.3)
+    picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
+    assert picture.opacity.min() > 1 - 1e-5
+    renderer = renderers(0, ti.f64)
+    assert_same_picture(render(renderer, state), picture, 2e-5)
+    tiles = -(-CAMERA.width // TILE_WIDTH) * -(-CAMERA.height // TILE_HEIGHT)
+    reached, count = renderer.pairs.reached.to_numpy()[:tiles], renderer.pairs.tile_count.to_numpy()[:tiles]
+    assert (reached < count).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 17), (16, 16), (17, 16), (31, 33), (48, 32), (64, 64)])
+def test_any_image_size_is_rendered_whole(renderers: Callable[..., Renderer], size: tuple[int, int]) -> None:
+    camera = PinholeCamera(40.0, 40.0, 0.45 * size[0], 0.55 * size[1], *size)
+    state = random_gaussians(30, seed=8, camera=camera)
+    view = render(renderers(0, ti.f64), state, camera)
+    assert view.colour.shape == (size[1], size[0], 3)
+    assert view.depth.shape == view.opacity.shape == (size[1], size[0])
+    assert_same_picture(view, reference.render(state, camera, POSE, NEAR, BACKGROUND), 1e-6)
+
+
+def test_equal_depths_are_composited_in_the_order_of_the_gaussians(renderer: Renderer) -> None:
+    state = random_gaussians(12, seed=9, pose=np.eye(4), depth=(3.0, 3.0), size=(4.0, 9.0), logit=(1.0, 2.0))
+    state["position"][:, 2] = 3.0  # to the bit
+    picture = reference.render(state, CAMERA, np.eye(4), NEAR, BACKGROUND)
+    swapped = reference.render(only(state, slice(None, None, -1)), CAMERA, np.eye(4), NEAR, BACKGROUND)
+    assert np.abs(picture.colour - swapped.colour).max() > 0.05  # the order matters here
+    assert_same_picture(render(renderer, state, pose=np.eye(4)), picture)
+
+
+def test_expected_depth_is_that_of_the_surface_and_zero_where_the_map_is_thin(renderer: Renderer) -> None:
+    state = random_gaussians(1, seed=3, depth=(4.0, 4.0), size=(6.0, 6.0), logit=(4.0, 4.0), beyond=-0.4)
+    view = render(renderer, state)
+    depth = view.expected_depth()
+    solid = view.opacity >= 0.5
+    assert solid.any()
+    assert not solid.all()
+    np.testing.assert_allclose(depth[solid], 4.0, rtol=1e-5)
+    assert (depth[~solid] == 0).all()
+
+
+# ---- invariants -----------------------------------------------------------------------------------------------
+
+
+def test_no_gaussians_give_the_background(renderer: Renderer) -> None:
+    view = render(renderer, only(random_gaussians(1, seed=1), slice(0, 0)))
+    np.testing.assert_array_equal(view.colour, np.broadcast_to(np.float32(BACKGROUND), view.colour.shape))
+    assert (view.depth == 0).all()
+    assert (view.opacity == 0).all()
+
+
+def test_gaussians_that_the_view_does_not_see_change_no_bit(renderer: Renderer) -> None:
+    state = random_gaussians(50, seed=2)
+    alone = render(renderer, state)
+    behind = random_gaussians(20, seed=3, depth=(-6.0, -0.5))
+    behind["log_scale"] = np.full((20, 3), -1.0)
+    too_near = random_gaussians(20, seed=4, depth=(0.2 * NEAR, 0.9 * NEAR))
+    outside = random_gaussians(20, seed=5)
+    outside["position"] += 30 * POSE[0, :3]  # along the camera's x axis
+    transparent = random_gaussians(20, seed=6, logit=(-9.0, -6.0))
+    assert_bit_identical(render(renderer, joined(behind, state, too_near, outside, transparent)), alone)
+
+
+def test_a_gaussian_behind_the_camera_alone_gives_the_background(renderer: Renderer) -> None:
+    state = random_gaussians(1, seed=2, size=(20.0, 20.0))
+    state["position"] = -state["position"] - 2 * POSE[:3, :3].T @ POSE[:3, 3]  # mirrored in the camera's centre
+    view = render(renderer, state)
+    assert (view.opacity == 0).all()
+
+
+def test_two_renders_are_bit_identical(renderer: Renderer) -> None:
+    state = random_gaussians(400, seed=11)
+    assert_bit_identical(render(renderer, state), render(renderer, state))
+
+
+def test_a_picture_does_not_depend_on_those_before_it(renderer: Renderer) -> None:
+    """A small image after a large one, one Gaussian after many: nothing of the earlier picture is left."""
+    small = PinholeCamera(30.0, 30.0, 9.0, 7.0, 19, 13)
+    first = render(renderer, random_gaussians(3, seed=12), small)
+    large = PinholeCamera(60.0, 60.0, 32.0, 32.0, 64, 64)
+    render(renderer, random_gaussians(300, seed=13, camera=large), large)
+    assert_bit_identical(render(renderer, random_gaussians(3, seed=12), small), first)
+
+
+def test_saving_and_loading_gives_the_same_picture(renderer: Renderer) -> None:
+    first = render(renderer, random_gaussians(100, seed=14))
+    saved = renderer.gaussians.to_numpy()
+    render(renderer, random_gaussians(10, seed=15))
+    assert_bit_identical(render(renderer, saved), first)
+
+
+def test_the_length_of_a_quaternion_does_not_matter(renderer: Renderer) -> None:
+    state = random_gaussians(30, seed=16)
+    first = render(renderer, state)
+    state["quaternion"] *= -2.0  # a power of two: no rounding
+    assert_bit_identical(render(renderer, state), first)
+
+
+def test_an_image_beyond_the_buffers_is_refused(renderer: Renderer) -> None:
+    with pytest.raises(ValueError, match="65x64 exceeds the buffers made for 64x64"):
+        renderer.forward(PinholeCamera(50.0, 50.0, 32.0, 32.0, 65, 64), np.eye(4), NEAR)

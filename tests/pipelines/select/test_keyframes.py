@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from fields.map.keyframes import KeyframeStore
+from pipelines.select.keyframes import KeyframeSelector, SeenPoints, covisibility
+from pipelines.settings import KeyframeSettings
+
+CAMERA = PinholeCamera(10.0, 10.0, 10.0, 10.0, 20, 20)  # sees |x| < z and |y| < z
+IMAGE = np.zeros((20, 20, 3), dtype=np.float32)
+
+
+def pose(x: float = 0.0, yaw: float = 0.0) -> np.ndarray:
+    """Camera at (x, 0, 0), turned by yaw degrees."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("y", yaw, degrees=True).as_matrix()
+    T[:3, 3] = -T[:3, :3] @ [x, 0, 0]
+    return T
+
+
+def frame(index: int, x: float = 0.0, yaw: float = 0.0, points: int = 30) -> TrackedFrame:
+    T = pose(x, yaw)
+    rng = np.random.default_rng(3)
+    local = rng.uniform([-0.5, -0.5, 1.0], [0.5, 0.5, 1.0], (points, 3))
+    local[:1] = [0.0, 0.0, 5.0]  # nothing of the others is beyond the farthest point
+    xyz = (local - T[:3, 3]) @ T[:3, :3]
+    sparse = SparsePoints(xyz, CAMERA.project(local), np.arange(points))
+    return TrackedFrame(index, index / 30, str(index), IMAGE, CAMERA, T, sparse)
+
+
+def decisions(frames: list[TrackedFrame], **settings: float) -> list[bool]:
+    """What becomes of every frame of a stream."""
+    selector, store = KeyframeSelector(KeyframeSettings(**settings)), KeyframeStore()
+    result = []
+    for f in frames:
+        result.append(selector.is_keyframe(f, store[len(store) - 1] if len(store) else None))
+        if result[-1]:
+            store.append(f)
+    return result
+
+
+def view(xyz: list[list[float]], x: float = 0.0) -> SeenPoints:
+    return SeenPoints(CAMERA, pose(x), np.array(xyz, dtype=np.float64).reshape(-1, 3))
+
+
+def test_covisibility_is_the_shared_part() -> None:
+    # Both see the two in the middle; each has one that the other does not see.
+    a = view([[0, 0, 2], [0.5, 0, 2], [-1.9, 0, 2]])
+    b = view([[0, 0, 2], [0.5, 0, 2], [2.9, 0, 2]], x=1.0)
+    assert a.count(b.xyz) == b.count(a.xyz) == 2
+    assert covisibility(a, b) == pytest.approx(2 / (2 + 1 + 1))
+
+
+def test_points_beyond_the_farthest_are_not_seen() -> None:
+    a = view([[0, 0, 2]])
+    assert a.count(np.array([[0, 0, 2.0], [0, 0, 2.5], [0, 0, -1.0], [5, 0, 2]])) == 1
+
+
+def test_a_view_covers_itself_and_nothing_covers_no_points() -> None:
+    a = view([[0, 0, 2], [0.5, 0, 2]])
+    assert covisibility(a, a) == 1.0
+    assert covisibility(a, view([])) == 0.1
+
+
+def test_the_first_frame_with_points_is_a_keyframe() -> None:
+    assert decisions([frame(0, points=3), frame(1), frame(2)]) == [False, True, False]
+
+
+def test_a_standing_camera_gives_a_keyframe_after_the_largest_gap() -> None:
+    assert decisions([frame(i) for i in range(9)], max_gap=3) == [True, False, False, False, True] + [False] * 3 + [
+        True
+    ]
+
+
+def test_losing_sight_of_points_makes_a_keyframe() -> None:
+    # Points up to 27 degrees off the axis, borders at 45: they begin to leave after some 20 degrees.
+    turning = [frame(i, yaw=8 * i) for i in range(5)]
+    assert decisions(turning, baseline=10.0, max_gap=9) == [True, False, False, True, False]
+
+
+def test_moving_makes_a_keyframe_although_all_points_stay_in_view() -> None:
+    assert decisions([frame(0), frame(1, x=0.01), frame(2, x=0.04)], covisibility=0.0) == [True, False, True]
+
+
+def test_a_sudden_turn_is_no_keyframe_where_the_picture_is_blurred() -> None:
+    rng = np.random.default_rng(0)
+    sharp = cv2.GaussianBlur(rng.uniform(0, 1, (20, 20, 3)).astype(np.float32), None, 0.7)
+    blurred = cv2.blur(sharp, (5, 1))
+    steady = [replace(frame(i, x=0.1 * i, yaw=i), image=sharp) for i in range(4)]
+    for picture, becomes_one in ((sharp, True), (blurred, False)):
+        assert decisions([*steady, replace(frame(4, x=0.4, yaw=20), image=picture)]) == [True] * 4 + [becomes_one]
+
+
+def test_a_steady_camera_may_blur() -> None:
+    """By the focus, or in the dark: other pictures there are not."""
+    rng = np.random.default_rng(0)
+    sharp = rng.uniform(0, 1, (20, 20, 3)).astype(np.float32)
+    frames = [replace(frame(0), image=sharp), replace(frame(1, x=0.1, yaw=5), image=cv2.blur(sharp, (5, 5)))]
+    assert decisions(frames) == [True, True]

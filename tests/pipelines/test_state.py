@@ -1,0 +1,113 @@
+"""A mapper that goes on from its state is the one that never stopped, byte for byte."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.geometry.se3 import exp_se3
+from fields.runtime.backend import initialise
+from pipelines.online import OnlineMapper
+from pipelines.refinement import refine
+from pipelines.settings import ExposureSettings, RefineSettings
+from pipelines.state import MapState
+from tests.pipelines.test_online import SETTINGS
+from tests.pipelines.wall import frame
+
+pytestmark = pytest.mark.slow
+
+FRAMES = 6
+REFINE = RefineSettings(steps=12)
+MIDDLE = 7
+EXPOSED = SETTINGS.model_copy(update={"exposure": ExposureSettings(enabled=True)})
+Step = Callable[[OnlineMapper], object]
+
+
+def correction(mapper: OnlineMapper) -> None:
+    ends = np.stack([exp_se3([0.2, 0, 0.1, 0, 0.03 * j, 0]) @ frame(j).T_camera_world for j in (0, 3)])
+    assert mapper.correct(PoseCorrection(np.array([0, 3]), ends)).moved
+
+
+STEPS: list[Step] = [
+    *(lambda mapper, i=i: mapper.process(frame(i)) for i in range(4)),
+    correction,
+    *(lambda mapper, i=i: mapper.process(frame(i)) for i in range(4, FRAMES)),
+    OnlineMapper.finish,
+]
+
+
+def assert_same(a: MapState, b: MapState) -> None:
+    assert a.numbers == b.numbers
+    assert list(a.arrays) == list(b.arrays)
+    for name, array in a.arrays.items():
+        assert array.dtype == b.arrays[name].dtype and array.tobytes() == b.arrays[name].tobytes(), name
+
+
+def copied(state: MapState) -> MapState:
+    """As a file would give it back."""
+    return MapState({n: a.copy() for n, a in state.arrays.items()}, json.loads(json.dumps(state.numbers)))
+
+
+def fresh(seed: int, settings=SETTINGS) -> OnlineMapper:
+    initialise("cpu")  # a process has room for one map
+    return OnlineMapper(settings, 64, 48, seed=seed)
+
+
+def restored(state: MapState, settings=SETTINGS) -> OnlineMapper:
+    mapper = fresh(99, settings)
+    mapper.restore(state, (frame(i) for i in range(FRAMES)))
+    return mapper
+
+
+@pytest.fixture(scope="module")
+def states() -> dict[str, MapState]:
+    """States of one map, whose colours are exposed: after so many steps, in the middle of refinement, at the end."""
+    mapper = fresh(5, EXPOSED)
+    states = {}
+    for step in STEPS:
+        step(mapper)
+        states[str(len(states) + 1)] = copied(mapper.state())
+    refine(mapper, REFINE, lambda s, _: states.update(middle=copied(mapper.state())) if s == MIDDLE else None)
+    states["end"] = mapper.state()
+    assert len(mapper.gaussians) > 300 and len(mapper.keyframes) > 3
+    return states
+
+
+@pytest.mark.parametrize("done", [3, 5, len(STEPS)])
+def test_a_map_restored_at_any_time_ends_as_the_one_that_went_on(states: dict[str, MapState], done: int) -> None:
+    mapper = restored(states[str(done)], EXPOSED)
+    assert_same(mapper.state(), states[str(done)])
+    for step in STEPS[done:]:
+        step(mapper)
+    refine(mapper, REFINE)
+    assert_same(mapper.state(), states["end"])
+
+
+def test_a_refinement_goes_on_in_its_middle(states: dict[str, MapState]) -> None:
+    mapper = restored(states["middle"], EXPOSED)
+    refine(mapper, REFINE, done=MIDDLE)
+    assert_same(mapper.state(), states["end"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("gaussians.position", np.zeros((3, 3), np.float32)),
+        ("gaussians.sh_m", np.full((1, 4, 3), np.nan, np.float32)),
+        ("gaussians.anchor", None),
+        ("keyframes.ids", np.zeros(3, np.int64)),
+        ("keyframes.T_camera_world", np.zeros((1, 3, 4))),
+        ("voxels.places", np.full((1, 4), 1 << 30, np.int32)),
+        ("anchors.keyframe", np.full(1, 77)),
+        ("keyframes.index", np.full(1, 77)),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(states: dict[str, MapState], name: str, value: np.ndarray | None) -> None:
+    state = states["1"]
+    arrays = {n: a for n, a in state.arrays.items() if n != name} | ({} if value is None else {name: value})
+    with pytest.raises((KeyError, ValueError, IndexError)):
+        restored(MapState(arrays, state.numbers), EXPOSED)
