@@ -46,6 +46,7 @@ def affinities(folder: Path, threads: int, workers: int) -> tuple[list[list[int]
     program.write_text(PROGRAM)
     command = [sys.executable, program, str(threads), str(workers)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment.pop("TI_CPU_MAX_NUM_THREADS", None)  # which `--spread` sets
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     placed, first = done.stdout.splitlines()[-2:]
     return json.loads(placed), json.loads(first)
