@@ -93,7 +93,7 @@ def _keep(site: tuple[str, int, str], slack: float) -> None:
 def _caller() -> tuple[str, int]:
     """File below the project, and line, of the nearest frame of a test."""
     frame = sys._getframe(2)
-    while (frame and "/tests/" not in frame.f_code.co_filename) or frame.f_code.co_filename == __file__:
+    while "/tests/" not in frame.f_code.co_filename or frame.f_code.co_filename == __file__:
         frame = frame.f_back
     return frame.f_code.co_filename.rpartition("/tests/")[2], frame.f_lineno
 
@@ -117,7 +117,6 @@ def _recording_allclose(actual, desired, rtol=1e-7, atol=0, *arguments, **option
 
 def _record_approx() -> None:
     ApproxScalar = type(pytest.approx(1.0))
-
     compare = ApproxScalar.__eq__
 
     def recording(self: object, actual: object) -> bool:
