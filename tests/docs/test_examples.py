@@ -12,6 +12,7 @@ import pytest
 
 from modp_ti.outputs.formats.splats_ply import read_splats
 
+pytestmark = pytest.mark.slow
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 
 

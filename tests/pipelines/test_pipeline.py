@@ -13,6 +13,8 @@ from pipelines.settings import OfflineSettings, RefineSettings
 from pipelines.state import MapState
 from tests.pipelines.wall import frame
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def mapper(taichi_on_the_cpu: None) -> Mapper:

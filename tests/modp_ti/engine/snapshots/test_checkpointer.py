@@ -46,9 +46,10 @@ class Run:
         self.checkpointer.after_frame()
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    run = Run(tmp_path_factory.mktemp("run"))
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    initialise("cpu")
+    run = Run(tmp_path)
     for i in range(FRAMES):
         run.take(i)
     return run
@@ -99,6 +100,7 @@ def test_a_full_disk_keeps_the_snapshot_before_and_says_so_once(run: Run, monkey
 
 
 def test_another_input_is_refused(run: Run) -> None:
+    assert run.checkpointer.keep()
     snapshot = Snapshot.read(run.checkpointer.path)
     count = snapshot.position.events
     events = [frame(i, held_out=i == 1) for i in range(count)]

@@ -233,7 +233,7 @@ def test_settings_that_this_version_does_not_have_are_refused(stopped: Path) -> 
 def test_a_snapshot_with_the_keys_of_all_trackers_as_0_1_0_wrote_it_is_taken(stopped: Path) -> None:
     arrays, about = read_arrays(stopped / FILE)
     del about["version"]
-    about["settings"]["tracker"] |= {"path": None, "camera": "camera-rgb", "patience": 120.0}
+    about["settings"]["tracker"] |= {"points": None, "camera": "camera-rgb", "patience": 120.0}
     write_arrays(stopped / FILE, arrays, about)
     assert load_resumed(stopped, None, [])[0] == load_resumed(stopped, stopped.parent / "scene.yaml", [])[0]
 
