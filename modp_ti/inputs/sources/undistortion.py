@@ -117,7 +117,7 @@ class Undistorter:
         size = (self.camera.width, self.camera.height)
         if size != (self.raw.width, self.raw.height):
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        # At about one sample per pixel, a linear filter blurs by an amount that varies over the image. Cubic does not.
+        # Cubic, because at about one sample per pixel a linear filter blurs by an amount that varies over the image.
         return self._remapped(image, cv2.INTER_CUBIC)
 
     def _remapped(self, image: NDArray, interpolation: int) -> NDArray:
