@@ -1,1 +1,1 @@
-"""Everything that ends in a `TrackedFrame`: images, trackers, and the geometry that they share."""
+"""Image sources, trackers and the geometry they share: everything that produces a `TrackedFrame`."""

@@ -1,4 +1,4 @@
-"""What a run keeps of every frame that its tracker delivered."""
+"""The record that a run keeps of every frame delivered by its tracker."""
 
 from __future__ import annotations
 
@@ -18,9 +18,17 @@ __all__ = ["DeliveredFrames"]
 
 @dataclass
 class DeliveredFrames:
-    """Name, time, camera and tracked pose of every frame in their order, and the points that it saw.
+    """Metadata, tracked poses and observed points of all delivered frames, in order. Images are not kept.
 
-    held_out: whether a frame was only for evaluation. corrections: how many came, and how many of them moved the map.
+    Attributes:
+        index: Index of each frame, as in `TrackedFrame.index`.
+        name: Image name of each frame.
+        timestamp: Time of each frame [s].
+        camera: Camera of each frame.
+        held_out: Whether each frame is only for evaluation.
+        T_tracked: Tracked pose T_camera_world (4, 4) of each frame, including all corrections so far.
+        points: Points and the frames that observed them.
+        corrections: Number of pose corrections received, and of those that moved the map.
     """
 
     index: list[int] = field(default_factory=list)
@@ -36,7 +44,12 @@ class DeliveredFrames:
         return len(self.index)
 
     def add(self, frame: TrackedFrame, with_points: bool = True) -> None:
-        """Keep the next frame, but for its image. with_points: whether also which points it saw where."""
+        """Record the next frame without its image.
+
+        Args:
+            frame: The next frame.
+            with_points: Whether to record its point observations too.
+        """
         self.index.append(frame.index)
         self.name.append(frame.name)
         self.timestamp.append(frame.timestamp)
@@ -49,9 +62,15 @@ class DeliveredFrames:
             self.points.leave_out(frame)
 
     def correct(self, correction: PoseCorrection, motion: WorldMotion, moved: bool) -> None:
-        """Take over the poses and points that the tracker names; the others go with the world around them.
+        """Apply a pose correction.
 
-        moved: whether the map did.
+        Frames and points named in the correction take the corrected values. All others move with the world around
+        them.
+
+        Args:
+            correction: The correction from the tracker.
+            motion: Motion of frames and world that the correction implies.
+            moved: Whether the correction moved the map.
         """
         named = {int(i): T for i, T in zip(correction.index, correction.T_camera_world, strict=True)}
         around = [motion.of(index, T) for index, T in zip(self.index, self.T_tracked, strict=True)]

@@ -1,4 +1,4 @@
-"""What a tracker is."""
+"""The `Tracker` base class."""
 
 from __future__ import annotations
 
@@ -19,61 +19,61 @@ if TYPE_CHECKING:
 __all__ = ["Progress", "Tracker"]
 
 Progress = Callable[[str, int, int], None]
-"""Called as progress(what, done, total) while a tracker prepares."""
+"""Progress callback, called as progress(what, done, total) while a tracker prepares."""
 
 
 class Tracker(ABC):
-    """Delivers frames in order, each decoded when it is asked for.
+    """Base class of trackers: delivers frames in order and decodes each one on demand.
 
-    Every tracker has `notes` and can be iterated over. What only some can do has a default here: a tracker that
-    revises poses overrides `events`, one that holds a camera or a socket open overrides `close`, and so on. Whoever
-    uses a tracker asks for nothing beyond this class.
+    Subclasses must implement `notes` and `__iter__`. Every other method has a default. For example, a tracker that
+    revises poses overrides `events`, and a tracker that holds a camera or a socket open overrides `close`. Callers use
+    this interface only.
     """
 
     reads_ahead: ClassVar[bool] = False
-    """Whether a thread may iterate over the tracker beside the mapper. It must not start Taichi's kernels then, which
-    one thread alone may do."""
+    """Whether a second thread may iterate over the tracker while the mapper runs. Such a tracker must not launch
+    Taichi kernels, because only one thread may do so."""
 
     @property
     @abstractmethod
     def notes(self) -> list[str]:
-        """One-line remarks for the user, known when the tracker is opened, such as frames that were skipped.
+        """One-line remarks for the user, such as how many frames were skipped.
 
-        A live tracker may have more of them once its frames have ended.
+        They are available once the tracker is open. More may be added by the time the last frame has been delivered.
         """
 
     @abstractmethod
     def __iter__(self) -> Iterator[TrackedFrame]:
-        """The frames in their order.
+        """Iterate over the frames in order.
 
-        Where poses were revised, these are the poses that the frames had last.
+        If the tracker revised poses, each frame has its latest pose.
 
         Raises:
-            InputError: Where an input turns out bad.
+            InputError: If the input is invalid.
         """
 
     def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
-        """The frames and, between them, corrections of frames before; a live tracker delivers them once."""
+        """Iterate over frames, interleaved with corrections of earlier frames. A live tracker delivers them once."""
         return iter(self)
 
     @property
     def frame_count(self) -> int | None:
-        """How many frames the tracker delivers; None where it does not know, as with a live camera."""
+        """Number of frames that the tracker delivers, or None if it is unknown, as for a live camera."""
         return None
 
     @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
-        """Images that were left out because they are damaged, with what is wrong, as far as they have been come to."""
+        """Damaged images skipped so far, by name, with the error for each."""
         return {}
 
     @property
     def undistorter(self) -> Undistorter | None:
-        """What frees the first frame's image from the distortion of its lens; None where the tracker does not say."""
+        """Undistorter of the first frame's image, or None if the tracker does not provide one."""
         return None
 
     def ground_truth(self) -> list[NDArray[np.float64]]:
-        """True T_camera_world (4, 4) of every frame, in metres; empty where it is not known."""
+        """Return the ground-truth T_camera_world (4, 4) of every frame, in metres; empty if unknown."""
         return []
 
     def close(self) -> None:  # noqa: B027 - most trackers hold nothing open
-        """Let go of what the tracker holds open: a camera, a file, a socket."""
+        """Release open resources, such as a camera, a file or a socket."""

@@ -1,4 +1,4 @@
-"""Replays poses and points that were tracked before, decoding each image when its turn comes."""
+"""Replay of recorded poses and points. Images are decoded on demand."""
 
 from __future__ import annotations
 
@@ -28,16 +28,23 @@ __all__ = [
     "unreadable_note",
 ]
 
-# A rotation this far from orthonormal was not meant as one; below it lies the rounding of text files.
+# Largest deviation of R^T R from the identity. Rounding in text files stays below it.
 MAX_ROTATION_DEFECT = 1e-2
 
 FARTHEST = 1e12
-"""A place [scene units] beyond this is none: its squares must fit the map's float32."""
+"""Largest valid coordinate [scene units]. Squared coordinates must fit the map's float32."""
 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image of the source with its pose and its points, in pixels of the delivered image."""
+    """An image of the source with its pose and observed points.
+
+    Attributes:
+        name: Name of the image in the source.
+        undistorter: Undistorter of the image; holds the camera of the delivered image.
+        T_camera_world: Pose (4, 4), world to camera.
+        points: Observed points, with pixels in the delivered (undistorted) image.
+    """
 
     name: str
     undistorter: Undistorter
@@ -49,10 +56,16 @@ class PosedImage:
 
 
 class ReplayedTracker(Tracker):
-    """A `Tracker` over posed images, in the order given. Points on masked pixels are left out.
+    """A `Tracker` that replays posed images in the given order.
 
-    So are images that turn out damaged, if they are few. Which frames are held out goes by their place among all that
-    were given.
+    Points on masked pixels are dropped. Damaged images are skipped, up to a share `FEW` of all images. Whether a frame
+    is held out depends on its position among all given images, including damaged ones.
+
+    Args:
+        reader: Reads and undistorts the images.
+        frames: The images with their poses and points.
+        source: Source settings; `holdout` is used.
+        notes: Remarks for the user, followed by those of the image source.
     """
 
     reads_ahead: ClassVar[bool] = True
@@ -91,7 +104,7 @@ class ReplayedTracker(Tracker):
         return self.frames[0].undistorter if self.frames else None
 
     def close(self) -> None:
-        """Let go of what the source of the images has open."""
+        """Close the image source."""
         self._reader.images.close()
 
     def __iter__(self) -> Iterator[TrackedFrame]:
@@ -122,19 +135,24 @@ class ReplayedTracker(Tracker):
 
 
 def require_few(unreadable: Sequence[UnreadableImageError], count: int) -> None:
-    """Raises the first of them where they are more than a few of `count` images."""
+    """Raise the first error if more than a share `FEW` of `count` images are unreadable."""
     if len(unreadable) > FEW * count:
         raise unreadable[0]
 
 
 def unreadable_note(unreadable: Sequence[UnreadableImageError], count: int) -> str:
-    """A remark on images that were left out."""
+    """Return a remark on the images that were skipped."""
     first = str(unreadable[0]).partition(";")[0]
     return f"{len(unreadable)} of {count} images are damaged: left out (the first: {first})"
 
 
 def unmasked(points: SparsePoints, mask: NDArray[np.bool_] | None) -> SparsePoints:
-    """The points, all of them inside the image, whose pixels are valid."""
+    """Return the points whose pixels are valid.
+
+    Args:
+        points: Points; all pixels must lie inside the image.
+        mask: Validity (H, W) of the pixels, or None if all are valid.
+    """
     if mask is None:
         return points
     column, row = np.floor(points.pixels).astype(int).T
@@ -143,12 +161,22 @@ def unmasked(points: SparsePoints, mask: NDArray[np.bool_] | None) -> SparsePoin
 
 
 def is_held_out(index: int, source: SourceSettings) -> bool:
-    """Whether the frame delivered as number `index` is only for evaluation."""
+    """Return whether the frame at position `index` is only for evaluation."""
     return source.holdout is not None and index % source.holdout == 0
 
 
 def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
-    """The rigid (4, 4) matrix next to the given one. Raises InputError that starts with `what` for others."""
+    """Validate a pose (4, 4) and return the nearest rigid motion.
+
+    The rotation is projected onto SO(3) by SVD; the translation is kept.
+
+    Args:
+        matrix: Pose (4, 4).
+        what: Start of the error message, such as file and line.
+
+    Raises:
+        InputError: If the matrix contains NaN, Inf or values beyond `FARTHEST`, or is not a rigid motion.
+    """
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
     if not np.isfinite(matrix).all():
         raise InputError(f"{what}: the pose holds NaN or infinite numbers")
@@ -172,10 +200,18 @@ def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
 
 
 def require_fitting_sizes(images: ImageSource, frames: Sequence[tuple[str, Undistorter]], intrinsics: str) -> None:
-    """Raises InputError for the first image that is not of its camera's size, and where many are unreadable.
+    """Check that the size of each image matches its camera.
 
-    intrinsics: where the cameras come from, for the message. Reads the headers only, so that a run fails at
-    its start.
+    Only image headers are read, so that a run with wrong intrinsics fails at its start.
+
+    Args:
+        images: The image source.
+        frames: Name and undistorter of each image.
+        intrinsics: Origin of the cameras, for the error message.
+
+    Raises:
+        InputError: If an image differs from its camera in size.
+        UnreadableImageError: If more than a share `FEW` of the images are unreadable.
     """
     unreadable = []
     for name, undistorter in frames:
@@ -211,7 +247,15 @@ def points_inside(
     undistorter: Undistorter,
     T_camera_world: NDArray[np.float64],
 ) -> SparsePoints:
-    """The points before the camera whose pixels (N, 2) are known and inside the delivered image."""
+    """Return the points in front of the camera whose pixels are finite and inside the delivered image.
+
+    Args:
+        xyz: World points (N, 3).
+        pixels: Their pixels (N, 2) in the delivered image; NaN if unknown.
+        ids: Their ids (N,).
+        undistorter: Holds the camera of the delivered image.
+        T_camera_world: Pose (4, 4), world to camera.
+    """
     depth = xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
     known = np.isfinite(pixels).all(axis=1) & np.isfinite(xyz).all(axis=1)
     kept = known & (depth > 0)

@@ -1,4 +1,4 @@
-"""The tracked points of a run and where its frames saw them: what is kept for the exports."""
+"""The tracked points of a run and their observations, kept for the exports."""
 
 from __future__ import annotations
 
@@ -15,19 +15,23 @@ from pipelines.memory_budget import OBSERVATION
 
 __all__ = ["TrackedPoints"]
 
-# Of a point that only held-out frames saw: their pictures must not come into what is trained on elsewhere.
+# Colour of a point seen only by held-out frames. Held-out pixels must not leak into data that others train on.
 UNSEEN = (128, 128, 128)
-# Bytes of a point.
+# Memory of a point [bytes].
 POINT = 64
-# Rows and pixels of a frame that saw none.
+# Rows and pixels of a frame without observations.
 NOTHING = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
 
 
 class TrackedPoints:
-    """Points by the tracker's ids; 12 bytes an observation, 64 a point.
+    """Points by tracker id, with the observations of each frame.
 
-    `rows[i]` (N,) int32 and `pixels[i]` (N, 2) float32 are the points that frame i saw, as rows of `xyz`, and their
-    pixels; none of a frame whose observations found no room.
+    An observation takes 12 bytes, a point 64.
+
+    Attributes:
+        rows: Per frame, rows (N,) int32 of `xyz` of the points that the frame observed. Empty if the frame was added
+            with `leave_out`.
+        pixels: Per frame, the pixels (N, 2) float32 of these points.
     """
 
     def __init__(self) -> None:
@@ -36,8 +40,8 @@ class TrackedPoints:
         self._held_out: list[bool] = []
         self._row_of: dict[int, int] = {}
         self._xyz = np.zeros((0, 3))
-        self._colours = np.zeros((0, 4))  # sums of red, green, blue, and of how many
-        self._last = np.zeros((0, 1), dtype=np.int64)  # the frame that saw it last
+        self._colours = np.zeros((0, 4))  # sums of red, green and blue, and the number of samples
+        self._last = np.zeros((0, 1), dtype=np.int64)  # the last frame that observed the point
         self._observations = 0
 
     def __len__(self) -> int:
@@ -45,11 +49,11 @@ class TrackedPoints:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of points and observations."""
+        """Memory of points and observations [bytes]."""
         return self._observations * OBSERVATION + len(self) * POINT
 
     def add(self, frame: TrackedFrame) -> None:
-        """Keep what the next frame saw. A point is where the last frame says that it is."""
+        """Record the observations of the next frame. A point takes the position given by the latest frame."""
         points = frame.points
         of = self._row_of
         rows = np.array([of.setdefault(i, len(of)) for i in points.ids.tolist()], dtype=np.int32)
@@ -64,7 +68,7 @@ class TrackedPoints:
         self._append(rows, points.pixels.astype(np.float32), frame.held_out)
 
     def leave_out(self, frame: TrackedFrame) -> None:
-        """Keep nothing of what the next frame saw."""
+        """Record the next frame without its observations."""
         self._append(*NOTHING, frame.held_out)
 
     def _append(self, rows: NDArray[np.int32], pixels: NDArray[np.float32], held_out: bool) -> None:
@@ -74,9 +78,15 @@ class TrackedPoints:
         self._observations += len(rows)
 
     def correct(self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Sequence[NDArray[np.float64]]) -> None:
-        """The tracker has revised its map: points `ids` (N,) are at xyz (N, 3) now, as far as frames saw them.
+        """Apply a correction of the tracker's map.
 
-        The others move with the frame that saw them last. motions: S_after_before (4, 4) of the world around a frame.
+        Ids that no frame observed are ignored. Points that are not in `ids` move with the last frame that observed
+        them.
+
+        Args:
+            ids: Ids (N,) of the corrected points.
+            xyz: Their new world positions (N, 3).
+            motions: Per frame, the similarity S_after_before (4, 4) of the world around it.
         """
         last, places = self._last[: len(self), 0], self.xyz
         for frame in np.unique(last):
@@ -86,7 +96,7 @@ class TrackedPoints:
         places[rows[rows >= 0]] = xyz[rows >= 0]
 
     def state(self) -> dict[str, NDArray]:
-        """All of it as arrays, for `restore`."""
+        """Return the complete state as arrays, for `restore`."""
         return {
             "counts": np.array([len(rows) for rows in self.rows], dtype=np.int64),
             "rows": np.concatenate([*self.rows, NOTHING[0]]),
@@ -98,9 +108,15 @@ class TrackedPoints:
         }
 
     def restore(self, state: Mapping[str, NDArray], held_out: Sequence[bool]) -> None:
-        """Become what `state` was taken of. held_out: which frames are.
+        """Restore a state returned by `state`.
 
-        Raises KeyError or ValueError for what is no such state.
+        Args:
+            state: The arrays.
+            held_out: Whether each frame is held out.
+
+        Raises:
+            KeyError: If an array is missing.
+            ValueError: If an array has the wrong shape or contains invalid indices.
         """
         count, frames = len(state["ids"]), len(held_out)
         shapes = {"xyz": (count, 3), "colours": (count, 4), "last": (count, 1), "counts": (frames,)}
@@ -131,17 +147,17 @@ class TrackedPoints:
 
     @property
     def ids(self) -> NDArray[np.int64]:
-        """The tracker's ids (P,)."""
+        """Tracker ids (P,) of the points."""
         return np.fromiter(self._row_of, np.int64, len(self))
 
     @property
     def xyz(self) -> NDArray[np.float64]:
-        """Places (P, 3) in the world."""
+        """World positions (P, 3)."""
         return self._xyz[: len(self)]
 
     @property
     def colours(self) -> NDArray[np.uint8]:
-        """Mean colours (P, 3) in the frames that are not held out."""
+        """Mean colours (P, 3) over valid pixels of the frames that are not held out; `UNSEEN` where there are none."""
         sums = self._colours[: len(self)]
         mean = np.round(sums[:, :3] / np.maximum(sums[:, 3:], 1)).astype(np.uint8)
         mean[sums[:, 3] == 0] = UNSEEN
@@ -150,9 +166,15 @@ class TrackedPoints:
     def reprojection_error(
         self, cameras: list, poses: list[NDArray[np.float64]], places: NDArray[np.float64] | None = None
     ) -> float | None:
-        """Mean distance [px] of the points from their pixels in cameras at T_camera_world (4, 4), frame by frame.
+        """Compute the mean reprojection error [px] over all observations in front of the camera.
 
-        Over all observations before the camera; None where there is none. places: (P, 3), others than `xyz`.
+        Args:
+            cameras: Camera of each frame.
+            poses: T_camera_world (4, 4) of each frame.
+            places: World positions (P, 3) to use instead of `xyz`.
+
+        Returns:
+            The mean error, or None if there are no observations in front of the camera.
         """
         xyz = self.xyz if places is None else places
         total, count = 0.0, 0
@@ -164,7 +186,18 @@ class TrackedPoints:
         return total / count if count else None
 
     def placed_anew(self, cameras: list, poses: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Places (P, 3) of the points under other poses than the tracker's: where frames not held out see them."""
+        """Triangulate the points again for given poses, using only frames that are not held out.
+
+        A point keeps its position if fewer than two of these frames observe it, or if the new position does not reduce
+        its robust reprojection error.
+
+        Args:
+            cameras: Camera of each frame.
+            poses: T_camera_world (4, 4) of each frame.
+
+        Returns:
+            World positions (P, 3).
+        """
         if len(self) == 0:
             return self.xyz
         rays = [

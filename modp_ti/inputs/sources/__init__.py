@@ -1,4 +1,4 @@
-"""Where images come from: one file per source, decoded frame by frame."""
+"""Image sources, one file per kind. Images are decoded frame by frame."""
 
 from __future__ import annotations
 
@@ -40,9 +40,13 @@ __all__ = [
 
 
 def open_source(source: SourceSettings) -> ImageSource:
-    """The images that the configuration names, with `source.intrinsics` where they are given.
+    """Open the configured images. `source.intrinsics` override the source's own camera.
 
-    Raises InputError where there are none, or the intrinsics are those of another size.
+    Args:
+        source: Settings of the images.
+
+    Raises:
+        InputError: If there are no images, or the intrinsics belong to another image size.
     """
     if source.stream is not None:
         from modp_ti.inputs.sources.live import LiveSource
@@ -77,11 +81,11 @@ _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
     "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
     "vrs": _open_vrs,
 }
-"""What opens a path, by `source.kind`."""
+"""Functions that open a path, by `source.kind`."""
 
 
 def _with_camera(images: ImageSource, source: SourceSettings) -> ImageSource:
-    """The source with the user's intrinsics, or its own where they are of the images' size."""
+    """Set the user's intrinsics, or drop the source's own with a note if they are of another image size."""
     if source.intrinsics.given:
         images.intrinsics = given_intrinsics(source.intrinsics, *images.frame_size)
         return images

@@ -27,18 +27,25 @@ RGB = "camera-rgb"
 
 
 class AriaRecording(KnownFrames):
-    """An `ImageSource` of a VRS file's `camera-rgb`. Frame n is called `<file's name without suffix>_<n, six digits>`.
+    """An `ImageSource` of the stream `camera-rgb` of a VRS file. Frame n is called `<file stem>_<n, six digits>`.
 
-    The images are those of a pinhole camera in the place of the fisheye, with its axes: Aria's RGB camera is mounted
-    on its side, so that the scene's "up" is the image's left. Times are those of capture on the device's clock [s],
-    which MPS trajectories use as well.
+    Images are resampled to a pinhole camera with the position and axes of the fisheye camera. Aria's RGB camera is
+    mounted on its side, so that the scene's "up" is the image's left. Times are those of capture on the device clock
+    [s], as in MPS trajectories.
 
-    T_device_camera (4, 4): where the camera is on the device, OpenCV axes, by the recording's calibration. vignette
-    (H, W, 3): how much light reaches each part of the pinhole image, 0 where the fisheye does not look; None where
-    nothing is known and it looks everywhere. mask: Aria's vignetting mask, of the recorded image.
+    Args:
+        path: The VRS file.
+        pinhole: Size and focal length of the pinhole images.
+        mask: Aria's vignetting mask of the recorded image.
 
-    Raises InputError where projectaria-tools is not installed, for a file that is missing, no recording, without RGB
-    images or their calibration, and for a mask that is not of the recorded size.
+    Attributes:
+        T_device_camera: Pose (4, 4), camera to device, OpenCV axes, from the recording's calibration.
+        vignette: Share of the light (H, W, 3) that reaches each part of the pinhole image, 0 outside the fisheye's
+            field of view. None if there is no mask and the field of view covers the whole image.
+
+    Raises:
+        InputError: If projectaria-tools is not installed, the file is missing or not a recording, it has no RGB images
+            or no calibration of them, or the mask does not have the recorded size.
     """
 
     def __init__(self, path: Path, pinhole: VrsSettings, mask: Path | None = None) -> None:
@@ -54,7 +61,7 @@ class AriaRecording(KnownFrames):
         try:
             with _quiet():
                 provider = data_provider.create_vrs_data_provider(str(path))
-        except RuntimeError:  # as for a file that ends before its configuration
+        except RuntimeError:  # for example, the file ends before its configuration
             provider = None
         if provider is None:
             raise InputError(f"{path}: not a VRS recording, or it is cut off before its first image; copy it again")
@@ -88,7 +95,7 @@ class AriaRecording(KnownFrames):
         camera = calibration.get_linear_camera_calibration(pinhole.width, pinhole.height, pinhole.focal)
         self._rectification = _Rectification(calibration.distort_by_calibration, camera, fisheye)
         fx, fy = (float(value) for value in camera.get_focal_lengths())
-        cx, cy = (float(value) for value in camera.get_principal_point())  # of pixel centres at whole numbers
+        cx, cy = (float(value) for value in camera.get_principal_point())  # with pixel centres at whole numbers
         self.intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, pinhole.width, pinhole.height))
         self.vignette = self._light(mask, width, height)
         self.add_note(
@@ -102,14 +109,15 @@ class AriaRecording(KnownFrames):
             )
 
     def size(self, name: str) -> tuple[int, int]:
-        """(width, height) of the pinhole images."""
+        """Return the size (width, height) of the pinhole images."""
         assert name in self._position and self.intrinsics is not None, name
         return self.intrinsics.camera.width, self.intrinsics.camera.height
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """Pinhole image (H, W, 3) uint8 RGB; black where the fisheye does not look.
+        """Decode a pinhole image (H, W, 3) uint8 RGB, black outside the fisheye's field of view.
 
-        Raises InputError where it cannot be decoded.
+        Raises:
+            InputError: If the recorded image cannot be decoded.
         """
         return self._rectification(self._recorded(self._position[name]))
 
@@ -119,7 +127,7 @@ class AriaRecording(KnownFrames):
             self._provider = None
 
     def _recorded(self, index: int) -> NDArray[np.uint8]:
-        """The fisheye image (H, W, 3) uint8 RGB."""
+        """Decode the fisheye image (H, W, 3) uint8 RGB."""
         with self._lock:
             try:
                 data, _ = self._provider.get_image_data_by_index(self._stream, index)
@@ -131,7 +139,7 @@ class AriaRecording(KnownFrames):
         return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
     def _light(self, mask: Path | None, width: int, height: int) -> NDArray[np.float32] | None:
-        """`vignette`."""
+        """Compute the attribute `vignette`."""
         covered = self._rectification.covered
         if mask is None:
             return None if covered.all() else np.repeat(covered[..., None], 3, axis=2).astype(np.float32)
@@ -145,16 +153,18 @@ class AriaRecording(KnownFrames):
 
 
 class _Rectification:
-    """Takes fisheye images (H0, W0, 3) of uint8 or float32 to those of the pinhole camera (H, W, 3).
+    """Resamples fisheye images (H0, W0, 3), uint8 or float32, to the pinhole camera (H, W, 3).
 
-    covered: (H, W), where the fisheye looks. distort: projectaria-tools' `distort_by_calibration`, which says where
-    each pixel looks; from there on a lookup serves, ten times as fast, and with what a smaller image needs against
-    aliasing.
+    projectaria-tools' `distort_by_calibration` is called once to fill a lookup table. Resampling with the table is ten
+    times as fast, and the image can be shrunk first to avoid aliasing.
+
+    Attributes:
+        covered: Pixels (H, W) inside the fisheye's field of view.
     """
 
     def __init__(self, distort, camera, fisheye) -> None:
         width, height = (int(value) for value in fisheye.get_image_size())
-        # Images of the coordinates, from 1 on: the library writes 0 where a pixel sees nothing.
+        # Images of the coordinates, starting at 1, because the library writes 0 outside the field of view.
         x, y = np.meshgrid(np.arange(1, width + 1, dtype=np.float32), np.arange(1, height + 1, dtype=np.float32))
         x, y = (np.asarray(distort(np.ascontiguousarray(plane), camera, fisheye)) for plane in (x, y))
         self.covered: NDArray[np.bool_] = (x > 0) & (y > 0)
@@ -176,7 +186,7 @@ class _Rectification:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps the library from telling what it opens: it writes past Python, to the process's own output."""
+    """Silence the library, which writes to the process's file descriptors 1 and 2 directly."""
     kept = [os.dup(1), os.dup(2)]
     nothing = os.open(os.devnull, os.O_WRONLY)
     try:

@@ -1,4 +1,4 @@
-"""Which entries of two lists of time stamps belong together: the nearest-time association of the TUM tools."""
+"""Association of two lists of time stamps by nearest time, as in the TUM benchmark's tools."""
 
 from __future__ import annotations
 
@@ -8,20 +8,29 @@ from numpy.typing import ArrayLike, NDArray
 __all__ = ["MAX_DIFFERENCE", "associate"]
 
 MAX_DIFFERENCE = 0.02
-"""Seconds by which the TUM benchmark lets the times of a pair differ."""
+"""Largest time difference of a pair [s], as in the TUM benchmark."""
 
 
-# Pairs within reach up to which all are compared, and how many to each side of a time are beyond.
+# Above MANY_PAIRS candidate pairs, only the NEAREST candidates on each side of a time are compared, to bound memory.
 MANY_PAIRS = 4_000_000
 NEAREST = 64
 
 
 def associate(times_a: ArrayLike, times_b: ArrayLike, max_difference: float = MAX_DIFFERENCE) -> NDArray[np.int64]:
-    """Pairs (M, 2) of places in `times_a` (N,) and `times_b` (K,), increasing in the first.
+    """Associate two lists of times greedily: the pair with the smallest difference is taken first.
 
-    Times in seconds, in any order. No pair differs by more than `max_difference`, nothing is in two pairs, and of all
-    pairs that are left the one with the smallest difference is taken next (the earlier places where two are equal).
-    Raises ValueError for a time that is not finite.
+    Each time is in at most one pair. If two differences are equal, the pair with the lower indices is taken first.
+
+    Args:
+        times_a: Times (N,) [s], in any order.
+        times_b: Times (K,) [s], in any order.
+        max_difference: Largest difference of a pair [s].
+
+    Returns:
+        Pairs (M, 2) of indices into `times_a` and `times_b`, sorted by the first.
+
+    Raises:
+        ValueError: If a time is not finite.
     """
     a, b = np.asarray(times_a, dtype=np.float64).ravel(), np.asarray(times_b, dtype=np.float64).ravel()
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
@@ -29,11 +38,11 @@ def associate(times_a: ArrayLike, times_b: ArrayLike, max_difference: float = MA
     order = np.argsort(b, kind="stable")
     first = np.searchsorted(b[order], a - max_difference, side="left")
     behind = np.searchsorted(b[order], a + max_difference, side="right")
-    if (behind - first).sum() > MANY_PAIRS:  # such times would take all memory: the nearest ones of each will do
+    if (behind - first).sum() > MANY_PAIRS:
         at = np.searchsorted(b[order], a)
         first, behind = np.maximum(first, at - NEAREST), np.minimum(behind, at + NEAREST)
     count = np.maximum(behind - first, 0)
-    # All pairs within reach: entry i of a with order[first[i]], order[first[i] + 1], ...
+    # All candidate pairs: entry i of a with order[first[i]], order[first[i] + 1], ...
     of_a = np.repeat(np.arange(len(a)), count)
     step = np.arange(len(of_a)) - np.repeat(np.cumsum(count) - count, count)
     of_b = order[np.repeat(first, count) + step]

@@ -18,15 +18,21 @@ TABLE_SIZE = 4096
 
 @dataclass(frozen=True)
 class Distortion:
-    """Maps ideal pinhole coordinates (x / z, y / z) to those where the lens puts them.
+    """Lens distortion, a map from ideal pinhole coordinates (x / z, y / z) to distorted ones.
 
     With r^2 = x^2 + y^2, the radial part multiplies (x, y) by
 
         perspective  (1 + n1 r^2 + n2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
         fisheye      theta (1 + n1 theta^2 + n2 theta^4 + ...) / r,   theta = atan(r)
 
-    and the tangential part (p1, p2) adds (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y), all as
-    in OpenCV.
+    and the tangential part (p1, p2) adds (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y). The conventions
+    are those of OpenCV.
+
+    Attributes:
+        numerator: Coefficients n1, n2, ...
+        denominator: Coefficients d1, d2, ... Not used for fisheye lenses.
+        tangential: Coefficients (p1, p2).
+        fisheye: Whether the radial part is the fisheye model.
     """
 
     numerator: tuple[float, ...] = ()
@@ -39,7 +45,7 @@ class Distortion:
         return not (self.fisheye or any(self.numerator) or any(self.denominator) or any(self.tangential))
 
     def distort(self, points: Points) -> Points:
-        """Distorted coordinates (..., 2) of ideal ones (..., 2)."""
+        """Map ideal coordinates (..., 2) to distorted ones (..., 2)."""
         x, y = points[..., 0], points[..., 1]
         r2 = x * x + y * y
         factor = self._radial_factor(np.sqrt(r2))
@@ -61,9 +67,9 @@ class Distortion:
         return polynomial.polyval(r2, (1.0, *self.numerator)) / polynomial.polyval(r2, (1.0, *self.denominator))
 
     def valid_radius(self, limit: float) -> float:
-        """Radius of ideal coordinates up to which the radial part grows, at most `limit`.
+        """Return the ideal radius up to which the distorted radius increases, at most `limit`.
 
-        Beyond it a polynomial folds back: two rays would land on one pixel, and only the inner one is real.
+        Beyond it the polynomial folds back: two rays would project to one pixel, and only the inner one is real.
         """
         r, distorted = self._radial_table(limit)
         falling = np.flatnonzero(np.diff(distorted) <= 0)
@@ -74,10 +80,14 @@ class Distortion:
         return r, r * self._radial_factor(r)
 
     def undistort(self, points: Points, limit: float) -> Points:
-        """Ideal coordinates (N, 2) of distorted ones (N, 2), searched for up to radius `limit`.
+        """Map distorted coordinates to ideal ones, by Newton's method starting from the inverse of the radial part.
 
-        NaN where no ideal point of that radius lands there. Newton's method from the inverse of the radial
-        part.
+        Args:
+            points: Distorted coordinates (N, 2).
+            limit: Largest ideal radius to search.
+
+        Returns:
+            Ideal coordinates (N, 2); NaN if there is no solution within the valid radius.
         """
         points = np.asarray(points, dtype=np.float64)
         if self.is_identity or len(points) == 0:
@@ -95,13 +105,13 @@ class Distortion:
         return np.where(found[:, None], ideal, np.nan)
 
     def _jacobian(self, points: Points) -> NDArray[np.float64]:
-        """Jacobians (N, 2, 2) by central differences; Newton's method needs no more than that."""
+        """Compute Jacobians (N, 2, 2) by central differences, which are accurate enough for Newton's method."""
         step = 1e-6
         dx, dy = np.array([step, 0.0]), np.array([0.0, step])
         columns = [(self.distort(points + d) - self.distort(points - d)) / (2 * step) for d in (dx, dy)]
         jacobian = np.stack(columns, axis=-1)
         singular = ~np.isfinite(jacobian).all(axis=(1, 2)) | (np.abs(np.linalg.det(jacobian)) < 1e-9)
-        jacobian[singular] = np.eye(2)  # these points fail the check at the end
+        jacobian[singular] = np.eye(2)  # these points fail the final check in `undistort`
         return jacobian
 
 
@@ -109,7 +119,15 @@ NO_DISTORTION = Distortion()
 
 
 def colmap_intrinsics(model: str, params: Sequence[float]) -> tuple[float, float, float, float, Distortion] | None:
-    """(fx, fy, cx, cy, distortion) of a COLMAP camera model; None for a model that is not supported."""
+    """Convert a COLMAP camera to (fx, fy, cx, cy, distortion).
+
+    Args:
+        model: Name of the camera model.
+        params: Its parameters, in COLMAP's order.
+
+    Returns:
+        The intrinsics, or None if the model is not supported.
+    """
     p = [float(value) for value in params]
     one_focal = model in (
         "SIMPLE_PINHOLE",

@@ -1,4 +1,4 @@
-"""What a photograph's EXIF header says of the lens."""
+"""Focal length from EXIF headers."""
 
 from __future__ import annotations
 
@@ -13,15 +13,12 @@ __all__ = ["focal_length_35mm"]
 
 
 def focal_length_35mm(path: Path) -> float | None:
-    """Focal length [mm] that a camera of 24x36 mm film would need for the same view; None where the file says nothing.
-
-    JPEG files only.
-    """
+    """Read the focal length in 35 mm equivalent [mm] from a JPEG file, or return None if it is not stated."""
     try:
         with open_file(path) as file:
             tiff = JpegHeader(HeaderReader(file)).info["exif"].removeprefix(b"Exif\0\0")
         inner = read_tiff_directory(tiff)[ExifTags.IFD.Exif]
         value = read_tiff_directory(tiff, inner)[ExifTags.Base.FocalLengthIn35mmFilm]
-    except HEADER_ERRORS:  # also without EXIF or without the tag
+    except HEADER_ERRORS:  # also raised if EXIF or the tag is missing
         return None
     return float(value) if isinstance(value, int) and value > 0 else None

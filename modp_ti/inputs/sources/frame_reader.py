@@ -1,4 +1,4 @@
-"""What a source knows of a frame: its undistorted image, which of its pixels count, how much light reached them."""
+"""Reading of frames: undistorted image, validity mask and vignette."""
 
 from __future__ import annotations
 
@@ -20,13 +20,19 @@ if TYPE_CHECKING:
 
 __all__ = ["FrameReader", "Picture"]
 
-# A vignette is resized to its camera's image, and no further from its shape than rounding brings it.
+# Largest relative difference of the aspect ratios of vignette and image, which allows for rounding after resizing.
 ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Picture:
-    """image (H, W, 3) float32 in [0, 1]; mask (H, W) bool and vignette (H, W, 3) as in `TrackedFrame`."""
+    """An undistorted image at the working size.
+
+    Attributes:
+        image: Image (H, W, 3) float32 in [0, 1].
+        mask: Valid pixels (H, W), or None if all are valid; as in `TrackedFrame`.
+        vignette: Vignette (H, W, 3), or None; as in `TrackedFrame`.
+    """
 
     image: NDArray[np.float32]
     mask: NDArray[np.bool_] | None
@@ -34,10 +40,17 @@ class Picture:
 
 
 class FrameReader:
-    """Reads frames of a source with what `source.masks`, `mask_colour` and `vignette` add to them.
+    """Reads frames of a source and applies `source.masks`, `source.mask_colour` and `source.vignette`.
 
-    A vignette that the source itself has comes first: it is made of `source.vignette` where that is given.
-    Raises InputError for a folder of masks or a vignette that cannot be used.
+    If the image source has a vignette of its own, that one is used: such sources have already taken `source.vignette`
+    into account.
+
+    Args:
+        images: The image source.
+        source: Settings of the images.
+
+    Raises:
+        InputError: If the mask folder or the vignette cannot be used.
     """
 
     def __init__(self, images: ImageSource, source: SourceSettings) -> None:
@@ -50,9 +63,16 @@ class FrameReader:
         self._of_camera: dict[Undistorter, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
 
     def require_fitting(self, frames: Sequence[tuple[str, Undistorter]]) -> None:
-        """Raises InputError for the first image whose mask is missing or misfits, or a vignette of another shape.
+        """Check that masks exist and match the images, and that the vignette has their aspect ratio.
 
-        Reads the headers only, so that a run fails at its start.
+        Only headers of the masks are read, so that a run with wrong masks fails at its start.
+
+        Args:
+            frames: Name and undistorter of each image.
+
+        Raises:
+            InputError: For the first image whose mask is missing or of the wrong size, or if the vignette does not
+                match.
         """
         for name, undistorter in frames:
             raw = undistorter.raw
@@ -68,9 +88,15 @@ class FrameReader:
                     )
 
     def read(self, name: str, undistorter: Undistorter, raw: NDArray[np.uint8] | None = None) -> Picture:
-        """The frame as the mapper takes it; raw: its stored image, where that is decoded already.
+        """Read a frame, undistorted and at the working size.
 
-        Raises InputError for an image or a mask that is unreadable.
+        Args:
+            name: Name of the image.
+            undistorter: Undistorter of its camera.
+            raw: The stored image (H0, W0, 3), if it is already decoded.
+
+        Raises:
+            InputError: If the image or its mask is unreadable.
         """
         raw = self.images.read(name) if raw is None else raw
         image, mask = undistorter.image(raw, self.valid(name, raw))
@@ -80,7 +106,7 @@ class FrameReader:
         return Picture(image, _both(mask, lit), vignette)
 
     def valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-        """Which pixels of the stored image count; None where all do."""
+        """Return the valid pixels (H0, W0) of the stored image `raw`, or None if all are valid."""
         valid = _both(None if self._masks is None else self._masks.read(name), self.images.valid(name))
         if self._source.mask_colour is not None:
             valid = _both(valid, differs_from_colour(raw, self._source.mask_colour, self._source.mask_tolerance))
@@ -89,10 +115,7 @@ class FrameReader:
     def _light(
         self, undistorter: Undistorter, stored: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """The vignette of the camera's delivered images, and where it leaves enough light. One for all its frames.
-
-        stored: the vignette (H, W, 3) of the stored images.
-        """
+        """Return the vignette of a camera's delivered images and the pixels with enough light, cached per camera."""
         if undistorter not in self._of_camera:
             vignette = undistorter.smooth(stored)
             lit = vignette.min(axis=2) >= LEAST_LIGHT

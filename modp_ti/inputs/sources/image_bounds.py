@@ -1,4 +1,4 @@
-"""What an encoded image says of its size, held against its bytes and the memory before a decoder believes it."""
+"""Plausibility check of an encoded image's stated size against its bytes and the memory, before decoding."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from modp_ti.inputs.sources.image_header import HEADER_ERRORS, HeaderReader, Jpe
 __all__ = ["MAX_IMAGE_PIXELS", "why_undecodable"]
 
 MAX_IMAGE_PIXELS = 1 << 27
-"""Of an image; the largest cameras have about 150 million, and the map works on far fewer."""
+"""Largest number of pixels of an image. The largest cameras have about 150 million; the map works on far fewer."""
 
-# Bytes a pixel while it is decoded: the colours of up to 16 bits a channel, and the copy in the order of ours.
+# Memory per pixel during decoding: up to 16 bits per channel, and the copy in RGB order.
 DECODED_BYTES = 12
-# Deflate makes 1032 bytes of one at most; JPEG spends a bit at least on a block of 64 pixels, in the channel that has
-# the most of them, which is at least a quarter of the image's size.
+# Deflate expands a byte to at most 1032. JPEG spends at least one bit on a block of 64 pixels of the largest channel,
+# whose size is at least a quarter of the image's.
 MOST_INFLATED = 1032
 INFLATED_AT_A_TIME = 1 << 18
-PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's kind of colour
-MOST_JPEG_PIXELS = 2048  # a byte
-# Least bits per pixel of the PNM formats: text has a digit and a separator per value, except in bitmaps.
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
+MOST_JPEG_PIXELS = 2048  # per byte
+# Smallest number of bits per pixel of the PNM formats: text has a digit and a separator per value, except in bitmaps.
 PNM_BITS = {b"1": 8, b"2": 16, b"3": 48, b"4": 1, b"5": 8, b"6": 24}
 
 
 @dataclass(frozen=True)
 class _Claim:
-    """width, height [px]; least: bytes that the file must have for that."""
+    """Size stated in a header [px], and the smallest file size [bytes] (`least`) that it requires."""
 
     width: int
     height: int
@@ -42,9 +42,10 @@ class _Claim:
 
 
 def why_undecodable(data: bytes) -> str | None:
-    """Why a decoder should not be let near these bytes, in words; None where it may be.
+    """Return why these bytes should not be decoded, or None if they may be.
 
-    JPEG, PNG, BMP, TIFF, WebP and PNM are let through, with a size that memory and the file's length allow.
+    Accepted are JPEG, PNG, BMP, TIFF, WebP and PNM images whose stated size is compatible with the file's length and
+    fits into memory.
     """
     read = next((reader for magic, reader in FORMATS if re.match(magic, data[:16], re.DOTALL)), None)
     if read is None:
@@ -77,7 +78,7 @@ def _png(data: bytes) -> _Claim:
 
 
 def _inflates(data: bytes) -> bool:
-    """Whether a PNG's content unpacks to all of its rows. The decoder would find out too, and write to the terminal."""
+    """Return whether a PNG's data inflates to all of its rows. The decoder would report this to the terminal."""
     width, height, depth, kind, _, _, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
     wanted = 0 if interlaced else height * (1 + (width * PNG_CHANNELS[kind] * depth + 7) // 8)
     inflater, found, at = zlib.decompressobj(), 0, 8
@@ -113,7 +114,7 @@ def _pnm(data: bytes) -> _Claim:
 
 
 def _webp(data: bytes) -> _Claim:
-    """Without Pillow, whose reader allocates two canvases of the declared size."""
+    """Read a WebP header without Pillow, whose reader allocates two canvases of the stated size."""
     kind = data[12:16]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 26)
@@ -128,7 +129,7 @@ def _webp(data: bytes) -> _Claim:
 
 
 def _tiff(data: bytes) -> _Claim:
-    """Of the first image in the file. A tile may be larger than the image, and is decoded as a whole."""
+    """Read the size of the first image in the file. A tile may be larger than the image and is decoded as a whole."""
     found = read_tiff_directory(data)
     sizes = found[IMAGEWIDTH], found[IMAGELENGTH], found.get(TILEWIDTH, 1), found.get(TILELENGTH, 1)
     if not all(isinstance(size, int) for size in sizes):

@@ -1,4 +1,4 @@
-"""A folder of images, listed in natural order."""
+"""Source `images`: a folder of images in natural order."""
 
 from __future__ import annotations
 
@@ -17,18 +17,24 @@ __all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key"]
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sort key that counts numbers as numbers: frame2 before frame10, whatever the zeros before them."""
+    """Return a sort key that compares digits by value, ignoring leading zeros: frame2 comes before frame10."""
     parts = re.split(r"([0-9]+)", name.casefold())
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part], name
 
 
 class ImageFolder(ListedImages):
-    """The images under one folder, subfolders included, hidden files left out.
+    """The images in a folder and its subfolders, without hidden files.
 
-    Names are relative to the folder, with forward slashes. Raises InputError where there is no such folder or
-    no image. fps: images a second, where their place is all that is known of their time: names that are time stamps, as
-    in EuRoC's and TUM's folders, tell it themselves. setting: the key that named
-    the folder, for messages.
+    Names are relative to the folder, with forward slashes. If all names are time stamps, as in EuRoC's and TUM's
+    folders, they give the times.
+
+    Args:
+        path: The folder.
+        fps: Images per second, used if the names are not time stamps.
+        setting: The setting that named the folder, for error messages.
+
+    Raises:
+        InputError: If the folder does not exist or has no images.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float = 30.0, setting: str = "source.path") -> None:

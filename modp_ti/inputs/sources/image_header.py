@@ -24,11 +24,11 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"IEND\xaeB`\x82"
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
-# Limit on what is read of a header: these bytes plus half of the file; each call adds so many.
+# A header may read HEADER_BYTES plus half of the file. Each call counts as CALL_BYTES in addition.
 HEADER_BYTES, CALL_BYTES = 1 << 23, 1 << 7
 
 HEADER_ERRORS = (SyntaxError, OSError, LookupError, TypeError, ValueError, ArithmeticError, struct.error)
-"""What Pillow raises for malformed headers."""
+"""Exceptions that Pillow raises for malformed headers."""
 
 # Pillow warns of malformed tags. The filter is global because `warnings.catch_warnings` is not safe with threads.
 warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.TiffImagePlugin")
@@ -36,10 +36,12 @@ warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.TiffImageP
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What a file's structure tells.
+    """Size and completeness of an image file.
 
-    width, height: stored size in pixels, before any EXIF orientation; 0 where the header is damaged. complete: the end
-    marker is there.
+    Attributes:
+        width: Stored width [px], before any EXIF rotation; 0 if the header is damaged.
+        height: Stored height [px], likewise.
+        complete: Whether the end marker is present.
     """
 
     width: int
@@ -48,7 +50,7 @@ class ImageHeader:
 
 
 class HeaderReader(io.BufferedIOBase):
-    """A file object that raises OSError once more than a header has been read through it."""
+    """A file object that raises OSError once more data has been read than a valid header needs."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -71,17 +73,20 @@ class HeaderReader(io.BufferedIOBase):
 
 
 class JpegHeader(JpegImagePlugin.JpegImageFile):
-    """Pillow's JPEG reader: once it is constructed, the file stands at the first coded byte. Raises `HEADER_ERRORS`."""
+    """Pillow's JPEG reader. After construction the file is positioned at the first coded byte.
+
+    Raises `HEADER_ERRORS` for malformed headers.
+    """
 
     def _read_dpi_from_exif(self) -> None:
-        """Not needed: Pillow would unpack all of EXIF, which costs memory."""
+        """Disabled, because Pillow would unpack all of EXIF here, which costs memory."""
 
 
 def read_image_header(file: BinaryIO) -> ImageHeader | None:
-    """The header of an opened JPEG or PNG file; None for other formats and for files that are neither."""
+    """Read the header of an open JPEG or PNG file. Returns None for all other files."""
     signature = file.read(8)
     if signature == PNG_SIGNATURE:
-        # Without Pillow, which would unpack the texts and the colour profile that follow: the size has a fixed place.
+        # Pillow would also unpack the texts and the colour profile that follow. The size is at a fixed offset.
         chunk = file.read(16)
         if len(chunk) < 16 or chunk[4:8] != b"IHDR":
             return ImageHeader(0, 0, complete=False)
@@ -100,9 +105,14 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
 
 
 def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlugin.ImageFileDirectory_v2:
-    """Tags of the directory at `offset` of a TIFF structure, by default of its first one.
+    """Read the tags of a directory in a TIFF structure. Raises `HEADER_ERRORS` for malformed data.
 
-    Of a directory that is damaged or too large, only the tags before that place. Raises `HEADER_ERRORS`.
+    Args:
+        data: The TIFF structure.
+        offset: Offset of the directory [bytes]; the first directory if None.
+
+    Returns:
+        The tags. If the directory is damaged or too large, only those before that position.
     """
     file = HeaderReader(io.BytesIO(data))
     # The byte order is passed separately: Pillow recognises BigTIFF in little-endian order only.
@@ -114,7 +124,7 @@ def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlug
 
 
 def _ends_with(file: BinaryIO, marker: bytes) -> bool:
-    """Whether the marker closes the file or comes before something appended to it (motion photos)."""
+    """Return whether the marker ends the file, or precedes data appended to it, as in motion photos."""
     here = file.tell()
     end = file.seek(0, 2)
     if end - here < len(marker):

@@ -16,21 +16,24 @@ if TYPE_CHECKING:
 __all__ = ["MAX_SIDE", "Intrinsics", "given_intrinsics", "require_plausible"]
 
 MAX_SIDE = 1 << 16
-"""Pixels on a side of an image; no camera has more."""
-# Numbers of a camera beyond these were damaged on their way: focal lengths and centres [px], coefficients of a lens.
+"""Largest side of an image [px]. No camera has more."""
+# Larger values come from damaged files: focal lengths and principal points [px], and lens coefficients.
 MAX_PIXELS_OF_FOCUS = 1e7
 MAX_COEFFICIENT = 1e6
 
-# A principal point this far from the middle, as a share of the image's side, is more likely of another image size.
-# Intrinsics of twice or half the size put it at 1 or at 0.25.
+# A principal point this far from the middle, as a share of the image's side, probably belongs to another image size.
+# Intrinsics of twice or half the size put it at 1 or 0.25 of the side.
 OFF_CENTRE = 0.2
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """camera: pinhole part at the stored size, pixel centres at +0.5. distortion: the lens.
+    """Intrinsics of stored images.
 
-    note: what the user should know where they are relied upon.
+    Attributes:
+        camera: Pinhole camera at the stored size, with pixel centres at +0.5.
+        distortion: Lens distortion.
+        note: Remark for the user, shown if these intrinsics are used.
     """
 
     camera: PinholeCamera
@@ -38,14 +41,20 @@ class Intrinsics:
     note: str | None = None
 
     def undistorter(self, scale: float) -> Undistorter:
-        """What takes the stored images to the working size."""
+        """Create the undistorter that takes stored images to the working size, scaled by `scale`."""
         return Undistorter(self.camera, self.distortion, scale)
 
 
 def given_intrinsics(given: IntrinsicsSettings, width: int, height: int) -> Intrinsics:
-    """`source.intrinsics`, which are given, for stored images of this size.
+    """Convert the user's `source.intrinsics` for stored images of this size.
 
-    Raises InputError where they belong to another size.
+    Args:
+        given: The settings; `fx` must be set.
+        width: Width of the stored images [px].
+        height: Height of the stored images [px].
+
+    Raises:
+        InputError: If the intrinsics belong, or seem to belong, to another image size.
     """
     assert given.fx is not None
     if given.width is not None and (given.width, given.height) != (width, height):
@@ -66,7 +75,16 @@ def given_intrinsics(given: IntrinsicsSettings, width: int, height: int) -> Intr
 
 
 def require_plausible(camera: PinholeCamera, lens: Distortion, what: str) -> tuple[PinholeCamera, Distortion]:
-    """The camera and its lens as a file states them. Raises InputError that starts with `what` where they cannot be."""
+    """Check that a camera read from a file is plausible, and return it with its lens.
+
+    Args:
+        camera: The camera.
+        lens: Its lens distortion.
+        what: Start of the error message.
+
+    Raises:
+        InputError: If size, focal lengths, principal point or lens coefficients are out of range.
+    """
     if max(camera.width, camera.height) > MAX_SIDE:
         raise InputError(f"{what}: images of {camera.width:.6g}x{camera.height:.6g} pixels: at most {MAX_SIDE} a side")
     if not (camera.fx > 1 / MAX_PIXELS_OF_FOCUS and camera.fy > 1 / MAX_PIXELS_OF_FOCUS):

@@ -1,4 +1,4 @@
-"""Frames that are all known when a source is opened: their names, places and times."""
+"""Base class of sources whose frames are all known when they are opened."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".p
 
 
 class KnownFrames(ImageSource):
-    """What every source does alike that is no live one. path: of the source. times [s]: of each name."""
+    """Base class of all sources that are not live.
+
+    Args:
+        path: Location of the source.
+        names: Names of the frames, in order.
+        times: Time of each frame [s].
+    """
 
     def __init__(self, path: Path, names: Sequence[str], times: Sequence[float] | NDArray[np.float64]) -> None:
         super().__init__(path)
@@ -30,19 +36,23 @@ class KnownFrames(ImageSource):
         return self._names
 
     def position(self, name: str) -> int:
-        """Place of a frame in the order, from 0."""
+        """Return the position of a frame, from 0."""
         return self._position[name]
 
     def timestamp(self, name: str) -> float:
-        """When the frame was taken [s]."""
+        """Return the time at which the frame was taken [s]."""
         return float(self._times[self._position[name]])
 
     def find(self, name: str) -> str | None:
-        """The frame that a tracker's file name means, or None: see `find_frame`."""
+        """Find the frame that a tracker's file name refers to, or return None; see `find_frame`."""
         return find_frame(name, self._position)
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        """Names at positions start, start + step, ... before stop; raises InputError where that is none."""
+        """Return the names at positions start, start + step, ... before stop.
+
+        Raises:
+            InputError: If there are none.
+        """
         names = self.names[start:stop:step]
         if not names:
             raise InputError(
@@ -53,10 +63,17 @@ class KnownFrames(ImageSource):
 
 
 def find_frame(name: str, frames: Container[str]) -> str | None:
-    """The frame of that name, whatever folders before it and image suffix behind it; None for any other name.
+    """Find a frame by name, ignoring folders and an image suffix.
 
-    For sources that name their frames themselves. A number alone finds nothing: programs that extract frames count
-    from 0 or from 1.
+    This is for sources that name their frames themselves. A number alone does not match, because programs that extract
+    frames differ in counting from 0 or from 1.
+
+    Args:
+        name: File name from a tracker.
+        frames: Names of the frames.
+
+    Returns:
+        The frame's name, or None if there is no match.
     """
     path = PurePosixPath(name.replace("\\", "/"))
     tail = path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name

@@ -1,4 +1,4 @@
-"""Image files that lie in a folder, known by name and in their order, decoded one at a time."""
+"""A given list of image files in a folder, decoded one at a time."""
 
 from __future__ import annotations
 
@@ -20,11 +20,15 @@ __all__ = ["ListedImages", "decoded"]
 
 
 class ListedImages(KnownFrames):
-    """An `ImageSource` of files under one folder.
+    """An `ImageSource` of files in one folder.
 
-    names: relative to the folder, with forward slashes, each once. times [s]: of each. intrinsics: what the data set
-    says of its camera, where it does. vignette (H, W, 3) of maximum 1: the light that reaches each part of the stored
-    image, where the data set brings it. notes: remarks for the user.
+    Args:
+        path: The folder.
+        names: Unique file names relative to the folder, with forward slashes.
+        times: Time of each image [s].
+        intrinsics: Camera of the data set, if known.
+        notes: Remarks for the user.
+        vignette: Share of the light (H, W, 3), with maximum 1, that reaches each part of the stored image, if known.
     """
 
     def __init__(
@@ -45,27 +49,31 @@ class ListedImages(KnownFrames):
             self._by_stem.setdefault(str(PurePosixPath(name).with_suffix("")), name)
 
     def find(self, name: str) -> str | None:
-        """The image that a tracker's file name means, or None.
+        """Find the image that a tracker's file name refers to, or return None.
 
-        The name may be a path from elsewhere (`./train/0001.png` is `0001.png` here, where the folder is
-        `train`) and may lack its suffix.
+        Leading folders may be missing in this source (`./train/0001.png` matches `0001.png` if the source is the folder
+        `train`), and the name may lack its suffix.
         """
         parts = PurePosixPath(name.replace("\\", "/")).parts
         for first in range(len(parts)):
             tail = "/".join(parts[first:])
             if tail in self._position:
                 return tail
-            # Only a name without an image suffix may take another's: `a.png` is not `a.jpg`.
+            # Only a name without an image suffix may match any suffix: `a.png` is not `a.jpg`.
             if not tail.lower().endswith(IMAGE_SUFFIXES) and tail in self._by_stem:
                 return self._by_stem[tail]
         return None
 
     def with_stem(self, stem: str) -> str | None:
-        """The image with this path without its suffix, or None."""
+        """Return the image whose path without suffix is `stem`, or None."""
         return self._by_stem.get(stem)
 
     def size(self, name: str) -> tuple[int, int]:
-        """(width, height) as stored. Raises UnreadableImageError for one that is unreadable or cut off."""
+        """Return the size (width, height) of the stored image.
+
+        Raises:
+            UnreadableImageError: If the image is unreadable or truncated.
+        """
         try:
             with open_file(self.path / name) as file:
                 header = read_image_header(file)
@@ -81,9 +89,10 @@ class ListedImages(KnownFrames):
         return header.width, header.height
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """Decoded image (H, W, 3) uint8 RGB, without EXIF rotation: intrinsics belong to the stored pixels.
+        """Decode an image (H, W, 3) uint8 RGB. EXIF rotation is not applied: intrinsics belong to the stored pixels.
 
-        Raises UnreadableImageError for one that is unreadable or cut off.
+        Raises:
+            UnreadableImageError: If the image is unreadable or truncated.
         """
         try:
             data = read_bytes(self.path / name)
@@ -107,11 +116,11 @@ class ListedImages(KnownFrames):
 
 
 def decoded(data: bytes) -> NDArray[np.uint8] | None:
-    """The image (H, W, 3) uint8 RGB in an encoded file, as stored; None where it is none."""
+    """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation; None if that fails."""
     import cv2
 
     log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:  # silent: the one line that the user gets is ours
+    try:  # OpenCV is silenced because the error is reported by the caller
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         image = None

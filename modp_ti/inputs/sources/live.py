@@ -1,6 +1,6 @@
-"""Source `live`: a camera or a network stream, through OpenCV, frame by frame as they come.
+"""Source `live`: a camera or a network stream, read with OpenCV as frames arrive.
 
-Not through PyAV, as `video_file`: OpenCV finds cameras by number with the drivers of each operating system.
+`video_file` uses PyAV. Live sources use OpenCV because it finds cameras by number on every operating system.
 """
 
 from __future__ import annotations
@@ -27,24 +27,30 @@ from modp_ti.inputs.sources.protocol import ImageSource
 
 __all__ = ["LiveSource"]
 
-# Frames that wait to be taken: a second of hesitation at 8 frames a second. Of more, the oldest are dropped.
+# Capacity of the queue of arrived frames: one second at 8 frames per second. If it is full, the oldest are dropped.
 WAITING = 8
-# A stream that sends nothing for so long [s] has ended, and one that does not open within it is not there.
+# Timeout of a network stream [s], for opening it and for each frame.
 PATIENCE = 10.0
 
 
 class LiveSource(ImageSource):
-    """A source that is still being taken. Frame n that was delivered is called `live_<n with six digits>`.
+    """A source that is still recording. The n-th delivered frame is called `live_<n, six digits>`.
 
-    stream: number of a camera, or URL. A thread takes frames from it all the time; up to `WAITING` wait to be asked
-    for by `arriving`, and of more the oldest are dropped and counted. A frame that is delivered is written, without
-    loss, into a temporary folder, from which it is read again; `close` removes it. Times are those of arrival, in
-    seconds of the Unix clock.
+    A thread captures frames continuously. Up to `WAITING` frames are queued for `arriving`; if more arrive, the oldest
+    are dropped and counted. Each delivered frame is stored without loss in a temporary folder, from which `read`
+    decodes it again; `close` removes the folder. Times are those of arrival [s], on the Unix clock.
 
-    It ends when the stream does, when `arriving` comes to its `stop`, with `finish`, and with the first Ctrl-C (where
-    it was opened in the main thread): the frames until then are all there are. After the end Ctrl-C interrupts.
+    The recording ends when the stream ends, when `arriving` reaches its `stop`, when `finish` is called, or on the
+    first Ctrl-C if the source was opened in the main thread. After that, Ctrl-C interrupts as usual.
 
-    Raises InputError where the stream cannot be opened or sends no frame.
+    Args:
+        stream: Number of a camera, or URL.
+
+    Attributes:
+        dropped: Number of dropped frames.
+
+    Raises:
+        InputError: If the stream cannot be opened or sends no frame.
     """
 
     def __init__(self, stream: int | str) -> None:
@@ -60,7 +66,7 @@ class LiveSource(ImageSource):
         self._delivering = threading.Lock()
         self._ended = False
         self._capture = _open(stream)
-        # The clock of the computer may be set while frames come; distances between them are those of a steady one.
+        # The system clock may be adjusted during the recording, so times advance with the monotonic clock.
         self._clock = time.time() - time.monotonic()
         first = self._grab()
         if first is None:
@@ -69,8 +75,8 @@ class LiveSource(ImageSource):
         self._frame_size = (first[1].shape[1], first[1].shape[0])
         self._waiting.append(first)
         self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
-        # A daemon, so that a stalled stream does not hold the process; and an end before Python's own, which would
-        # break the thread off inside the decoder.
+        # A daemon, so that a stalled stream does not keep the process alive. `close` is registered with atexit because
+        # Python would otherwise kill the thread inside the decoder at shutdown.
         self._thread = threading.Thread(target=self._take, name=f"frames of {self.path}", daemon=True)
         self._thread.start()
         atexit.register(self.close)
@@ -93,25 +99,26 @@ class LiveSource(ImageSource):
 
     @property
     def names(self) -> Sequence[str]:
-        """Of the frames that were delivered so far."""
+        """Names of the frames delivered so far."""
         return self._names
 
     def position(self, name: str) -> int:
-        """Number of the frame among those delivered, from 0."""
+        """Return the position of the frame among those delivered, from 0."""
         return self._position[name]
 
     def timestamp(self, name: str) -> float:
-        """When the frame arrived [s], on the Unix clock."""
+        """Return the time at which the frame arrived [s], on the Unix clock."""
         return self._times[self._position[name]]
 
     def find(self, name: str) -> str | None:
-        """The frame of that name, whatever folders before it and image suffix behind it; None for any other name."""
+        """Find the frame of that name, ignoring folders and an image suffix, or return None."""
         return find_frame(name, self._position)
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        """Of the frames so far, those at positions start, start + step, ... before stop.
+        """Return the names of delivered frames at positions start, start + step, ... before stop.
 
-        Raises InputError where that is none, as it is before any frame has been taken.
+        Raises:
+            InputError: If there are none, which is always the case before the first frame is delivered.
         """
         names = self._names[start:stop:step]
         if not names:
@@ -119,7 +126,7 @@ class LiveSource(ImageSource):
         return names
 
     def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        """Names at positions start, start + step, ... before stop, as soon as each frame is there."""
+        """Yield the names at positions start, start + step, ... before stop, as soon as each frame has arrived."""
         position = start
         while stop is None or position < stop:
             if not self._delivered(position):
@@ -133,12 +140,16 @@ class LiveSource(ImageSource):
         return self._frame_size
 
     def size(self, name: str) -> tuple[int, int]:
-        """(width, height) of the stream's frames."""
+        """Return the size (width, height) of the stream's frames."""
         assert name in self._position, name
         return self._frame_size
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """The frame (H, W, 3) uint8 RGB, exactly as it came. Raises InputError where it cannot be read again."""
+        """Read a delivered frame (H, W, 3) uint8 RGB, exactly as it arrived.
+
+        Raises:
+            InputError: If the stored frame is missing or damaged.
+        """
         file = self._file(self._position[name])
         try:
             image = decoded(file.read_bytes())
@@ -149,23 +160,23 @@ class LiveSource(ImageSource):
         return image
 
     def finish(self) -> None:
-        """Take no more frames; those that wait are dropped."""
+        """End the recording. Queued frames are dropped."""
         with self._changed:
             self._ended = True
             self._waiting.clear()
             self._changed.notify_all()
 
     def close(self) -> None:
-        """End the thread, let the camera go and remove the frames that were kept."""
+        """End the recording, release the camera and remove the stored frames."""
         self.finish()
-        # A thread that waits for a stream which has stalled ends when it is tired of that; nothing depends on it.
+        # If the stream has stalled, the thread ends after its own timeout. Nothing depends on it.
         self._thread.join(1.0)
         self._give_back_interrupt()
         self._kept.cleanup()
         atexit.unregister(self.close)
 
     def _grab(self) -> tuple[float, NDArray[np.uint8]] | None:
-        """The next frame (BGR) with the time of its arrival; None at the end of the stream."""
+        """Capture the next frame (BGR) with its time of arrival; None at the end of the stream."""
         import cv2
 
         try:
@@ -177,7 +188,7 @@ class LiveSource(ImageSource):
         return (self._clock + arrived, image) if more else None
 
     def _take(self) -> None:
-        """What the thread does until the end."""
+        """Capture frames until the recording ends; runs in the thread."""
         while not self._ended:
             frame = self._grab()
             with self._changed:
@@ -192,7 +203,7 @@ class LiveSource(ImageSource):
         self._capture.release()
 
     def _delivered(self, position: int) -> bool:
-        """Whether the frame is there, once it is or no more will come."""
+        """Wait until the frame at `position` is delivered or the recording has ended; return whether it exists."""
         with self._delivering:
             while len(self._names) <= position:
                 with self._changed:
@@ -228,7 +239,7 @@ class LiveSource(ImageSource):
         self._give_back_interrupt()
         if self._ended:
             raise KeyboardInterrupt
-        # In a thread of its own: the interrupted one may hold the lock.
+        # In a separate thread, because the interrupted one may hold the lock.
         threading.Thread(target=self.finish, daemon=True).start()
 
     def _give_back_interrupt(self) -> None:
@@ -238,21 +249,24 @@ class LiveSource(ImageSource):
 
 
 def _shown(stream: int | str) -> str:
-    """The stream as messages call it: no password, and no `//`, which a path would lose."""
+    """Return the stream's name for messages.
+
+    User, password and query of a URL are removed, and so is its scheme, because a `Path` would turn `//` into `/`.
+    """
     if isinstance(stream, int):
         return f"camera {stream}"
     return re.sub(r"^[a-z0-9+.-]+://(?:[^/@]*@)?", "", stream, flags=re.IGNORECASE).partition("?")[0]
 
 
 def _open(stream: int | str):
-    """The capture. Raises InputError where there is none."""
+    """Open the capture. Raises InputError if that fails."""
     import cv2
 
     if isinstance(stream, str) and Path(stream).is_file():
         raise InputError(f"{stream}: is a file (source.stream): give it as source.path")
     with _quiet_decoder():
         try:
-            if isinstance(stream, int) or "://" not in stream:  # a camera, by its number or its path
+            if isinstance(stream, int) or "://" not in stream:  # a camera, by number or device path
                 capture = cv2.VideoCapture(stream)
             else:
                 patience = int(1000 * PATIENCE)
@@ -268,7 +282,7 @@ def _open(stream: int | str):
 
 @contextmanager
 def _quiet_decoder() -> Iterator[None]:
-    """Keeps OpenCV and its FFmpeg from writing to the terminal: the user gets one line, from us."""
+    """Silence OpenCV and its FFmpeg on the terminal. Errors are reported by the caller."""
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first stream is opened

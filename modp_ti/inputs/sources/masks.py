@@ -1,4 +1,4 @@
-"""Which pixels of a stored image count: a folder of masks, a colour that stands for "nothing here", or both."""
+"""Masks of stored images: a folder of mask images, and a colour that marks invalid pixels."""
 
 from __future__ import annotations
 
@@ -16,17 +16,27 @@ VALID_FROM = 128  # grey value
 
 
 class MaskFolder:
-    """One mask an image, white where it is valid and black where it is to be ignored.
+    """One mask per image, white where it is valid and black where it is ignored.
 
-    A mask has the image's path below the folder, or only its name, with any image suffix in the place of the image's
-    own or behind it (`0001.png` or `0001.jpg.png` for `0001.jpg`). Raises InputError where there is no such folder.
+    A mask has the image's path relative to the folder, or only its name. Its suffix replaces the image's own or is
+    appended to it: `0001.png` or `0001.jpg.png` for `0001.jpg`.
+
+    Args:
+        path: The folder of masks.
+
+    Raises:
+        InputError: If the folder does not exist or has no images.
     """
 
     def __init__(self, path: Path) -> None:
         self._images = ImageFolder(path, setting="source.masks")
 
     def find(self, name: str) -> str:
-        """The mask of the image `name`. Raises InputError where there is none."""
+        """Return the file name of the mask of the image `name`.
+
+        Raises:
+            InputError: If there is none.
+        """
         parts = PurePosixPath(name).parts
         for first in range(len(parts)):
             tail = PurePosixPath(*parts[first:])
@@ -40,7 +50,11 @@ class MaskFolder:
         )
 
     def require_size(self, name: str, width: int, height: int) -> None:
-        """Raises InputError where the image's mask is missing, unreadable or not of the stored image's size."""
+        """Check that the mask of the image `name` has the size of the stored image.
+
+        Raises:
+            InputError: If the mask is missing, unreadable or of another size.
+        """
         mask = self.find(name)
         found = self._images.size(mask)
         if found != (width, height):
@@ -50,11 +64,15 @@ class MaskFolder:
             )
 
     def read(self, name: str) -> NDArray[np.bool_]:
-        """True (H, W) where the image `name` is valid. Raises InputError for a mask that is missing or unreadable."""
+        """Read the validity mask (H, W) of the image `name`.
+
+        Raises:
+            InputError: If the mask is missing or unreadable.
+        """
         return self._images.read(self.find(name)).max(axis=2) >= VALID_FROM
 
 
 def differs_from_colour(image: NDArray[np.uint8], colour: tuple[int, int, int], tolerance: int) -> NDArray[np.bool_]:
-    """True (H, W) where a channel of the image (H, W, 3) is more than `tolerance` away from `colour`."""
+    """Return a mask (H, W), True where a channel of the image (H, W, 3) differs from `colour` by over `tolerance`."""
     difference = np.abs(image.astype(np.int16) - np.array(colour, dtype=np.int16))
     return (difference > tolerance).any(axis=2)

@@ -1,4 +1,4 @@
-"""Time stamps that images are called by: nanoseconds in EuRoC's folders, seconds with a fraction in TUM's."""
+"""Time stamps in image names, such as nanoseconds in EuRoC's folders and fractional seconds in TUM's."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 __all__ = ["times_of_names"]
 
-# Whole numbers by their digits, since 2001: milliseconds, microseconds, nanoseconds. Ten digits are no time: whole
-# seconds would not tell the frames of a video apart.
+# Unit of a whole number by its digits, for times since 2001: milliseconds, microseconds, nanoseconds. Ten digits are
+# not accepted: whole seconds would not distinguish the frames of a video.
 UNITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}
 SECONDS = re.compile(r"[0-9]{10}\.[0-9]{2,}")
 
 
 def times_of_names(names: Sequence[str]) -> NDArray[np.float64] | None:
-    """Seconds (N,) of images that are all called by rising time stamps; None where they are not."""
+    """Return the times (N,) [s] of images whose names are strictly increasing time stamps, otherwise None."""
     stems = [PurePosixPath(name).stem for name in names]
     if all(SECONDS.fullmatch(stem) for stem in stems):
         times = np.array([float(stem) for stem in stems])

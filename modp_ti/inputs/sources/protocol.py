@@ -1,4 +1,4 @@
-"""What a source of images is, and its camera for those who need one."""
+"""The `ImageSource` base class."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ __all__ = ["ImageSource", "require_intrinsics"]
 
 
 class ImageSource(ABC):
-    """Images by name, in the order in which they were taken, each decoded when it is asked for.
+    """Base class of image sources: images by name, in the order in which they were taken, decoded on demand.
 
-    path: where they are, for messages. intrinsics: what the user or else the source itself says of its camera, None
-    where nobody says anything. vignette: how much light reaches each part of the stored image's field of view,
-    (H, W, 3) float32 of at most 1, None where the source does not know. T_device_camera: (4, 4), where the camera sits
-    on a device with other sensors, OpenCV axes, None for a camera by itself.
+    Attributes:
+        path: Location of the images, for messages.
+        intrinsics: Camera of the stored images, from the user or else from the source. None if unknown.
+        vignette: Share of the light (H, W, 3) float32, at most 1, that reaches each part of the stored image's field of
+            view. None if unknown.
+        T_device_camera: Pose (4, 4) of the camera on a device with other sensors, camera to device, OpenCV axes. None
+            for a camera alone.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,69 +36,83 @@ class ImageSource(ABC):
 
     @property
     def notes(self) -> list[str]:
-        """One-line remarks for the user; a live source has more of them at its end."""
+        """One-line remarks for the user. A live source may add more by its end."""
         return self._notes
 
     def add_note(self, note: str, first: bool = False) -> None:
-        """Add a remark, behind the others or before them."""
+        """Add a remark after the others, or before them if `first`."""
         self._notes.insert(0 if first else len(self._notes), note)
 
     @property
     @abstractmethod
     def names(self) -> Sequence[str]:
-        """Names of all images; those of a live source grow while it runs."""
+        """Names of all images. The names of a live source grow while it runs."""
 
     def __len__(self) -> int:
         return len(self.names)
 
     @abstractmethod
     def position(self, name: str) -> int:
-        """Place of an image among `names`, from 0."""
+        """Return the position of an image in `names`, from 0."""
 
     @abstractmethod
     def timestamp(self, name: str) -> float:
-        """When it was taken [seconds]."""
+        """Return the time at which the image was taken [s]."""
 
     @abstractmethod
     def find(self, name: str) -> str | None:
-        """The image that a tracker's file name means, or None."""
+        """Find the image that a tracker's file name refers to, or return None."""
 
     @abstractmethod
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        """Names at positions start, start + step, ... before stop. Raises InputError where that is none."""
+        """Return the names at positions start, start + step, ... before stop.
+
+        Raises:
+            InputError: If there are none.
+        """
 
     def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        """The same names one by one, each as soon as its image is there. Ends when no more will come."""
+        """Yield the names of `selected` as soon as their images are available. Ends when no more will come."""
         return iter(self.selected(start, stop, step))
 
     @property
     def frame_size(self) -> tuple[int, int]:
-        """(width, height) of the first image, which a live source knows before it has delivered any."""
+        """Size (width, height) of the first image. A live source knows it before it has delivered any."""
         return self.size(self.names[0])
 
     @abstractmethod
     def size(self, name: str) -> tuple[int, int]:
-        """(width, height) as stored. Raises InputError for an image that is unreadable."""
+        """Return the size (width, height) of the stored image.
+
+        Raises:
+            InputError: If the image is unreadable.
+        """
 
     @abstractmethod
     def read(self, name: str) -> NDArray[np.uint8]:
-        """Decoded image (H, W, 3) uint8 RGB as stored. Raises InputError for an image that is unreadable.
+        """Decode the stored image (H, W, 3) uint8 RGB.
 
-        May be called for any name at any time after it has arrived, more than once and from one other thread.
+        This may be called for any image that has arrived, repeatedly, and from one other thread.
+
+        Raises:
+            InputError: If the image is unreadable.
         """
 
     def valid(self, name: str) -> NDArray[np.bool_] | None:
-        """Which pixels (H, W) the image itself says to count; None where it says nothing."""
+        """Return the validity mask (H, W) that comes with the image itself, or None."""
         return None
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing open
-        """Let go of what is open: a camera, a file."""
+        """Release open resources, such as a camera or a file."""
 
 
 def require_intrinsics(images: ImageSource) -> Intrinsics:
-    """The camera of the source, for a tracker that brings none; its note goes to the source's.
+    """Return the camera of the source, for trackers that do not provide one.
 
-    Raises InputError where it is not known.
+    The note of the intrinsics is added to the notes of the source.
+
+    Raises:
+        InputError: If the camera is unknown.
     """
     if images.intrinsics is None:
         raise InputError(

@@ -1,4 +1,4 @@
-"""`source.kind: auto`: what a path is, from what lies there."""
+"""Detection of the source kind from a path, for `source.kind: auto`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ __all__ = ["recognised_kind"]
 
 
 def recognised_kind(path: Path) -> str:
-    """The `source.kind` of a file or folder; `images` for a folder of no known layout, and for what is not there.
+    """Return the `source.kind` of a file or folder.
 
-    Raises InputError for a file of another sort.
+    Folders of unknown layout and paths that do not exist give `images`.
+
+    Args:
+        path: The file or folder.
+
+    Raises:
+        InputError: If the path is a file of an unknown type.
     """
     suffix = path.suffix.lower()
     if not path.is_dir():

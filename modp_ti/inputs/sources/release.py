@@ -1,4 +1,4 @@
-"""Source `release`: an Aria sequence as the authors of the paper publish it, undistorted to pinhole images."""
+"""Source `release`: an Aria sequence as published by the authors of the paper, undistorted to pinhole images."""
 
 from __future__ import annotations
 
@@ -17,9 +17,15 @@ CAMERA = PinholeCamera(400.0, 400.0, 400.0, 400.0, 800, 800)
 
 
 def open_release(path: Path, fps: float, own_vignette: bool) -> ImageFolder:
-    """The images of `rectified/`, with `vignette.png` where it is there and wanted. Time = position / fps.
+    """Open the images of `rectified/`.
 
-    Raises InputError where there is no image, or the vignette cannot be used.
+    Args:
+        path: Folder of the sequence.
+        fps: Images per second; the time of an image is position / fps, unless the names are time stamps.
+        own_vignette: Whether to use `vignette.png` of the sequence, if it exists.
+
+    Raises:
+        InputError: If there are no images, or the vignette cannot be used.
     """
     if not (path / IMAGES).is_dir():
         raise InputError(

@@ -1,4 +1,4 @@
-"""Source `replica`: a Replica sequence as NICE-SLAM packs it."""
+"""Source `replica`: a Replica sequence in the layout of NICE-SLAM."""
 
 from __future__ import annotations
 
@@ -14,17 +14,25 @@ from modp_ti.inputs.sources.listed_images import ListedImages
 
 __all__ = ["find_replica_images", "open_replica"]
 
-# fx = fy = 600, cx 599.5, cy 339.5 with pixel centres at whole numbers: the middle of the image.
+# The data set states cx 599.5 and cy 339.5 with pixel centres at whole numbers, which is the middle of the image.
 CAMERA = PinholeCamera(600.0, 600.0, 600.0, 340.0, 1200, 680)
 
 
 def find_replica_images(path: Path) -> list[Path]:
-    """`results/frame*.jpg` of a folder, in natural order (`depth*.png` lies beside them)."""
+    """Return `results/frame*.jpg` of a folder in natural order. The folder has `depth*.png` too."""
     return sorted((path / "results").glob("frame[0-9]*.jpg"), key=lambda file: natural_key(file.name))
 
 
 def open_replica(path: Path, fps: float) -> ListedImages:
-    """The colour images of the sequence; time = position / fps. Raises InputError where there is none."""
+    """Open the colour images of a sequence.
+
+    Args:
+        path: Folder of the sequence.
+        fps: Images per second; the time of an image is position / fps.
+
+    Raises:
+        InputError: If there are no images.
+    """
     files = find_replica_images(path)
     if not files:
         raise InputError(

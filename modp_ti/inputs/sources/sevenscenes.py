@@ -14,12 +14,16 @@ __all__ = ["find_sevenscenes_images", "open_sevenscenes"]
 
 FRAME = re.compile(r"frame-([0-9]+)\.color\.(?:png|jpg|jpeg)")
 
-# The data set calibrates its depth camera alone (f = 585); this is what colour images of that sensor have, about.
+# The data set calibrates only its depth camera (f = 585). These are approximate values for the sensor's colour camera.
 CAMERA = PinholeCamera(525.0, 525.0, 320.0, 240.0, 640, 480)
 
 
 def find_sevenscenes_images(path: Path) -> dict[int, Path]:
-    """The colour images by frame number, of the folder or of `images` in it; empty where there are none."""
+    """Return the colour images by frame number, from the folder or its subfolder `images`.
+
+    Raises:
+        InputError: If two files have the same frame number.
+    """
     for folder in (path, path / "images"):
         found: dict[int, Path] = {}
         for file in sorted(folder.glob("frame-*.color.*")):
@@ -36,9 +40,14 @@ def find_sevenscenes_images(path: Path) -> dict[int, Path]:
 
 
 def open_sevenscenes(path: Path, fps: float) -> ListedImages:
-    """The colour images of the sequence; time = frame number / fps, so that missing frames leave gaps.
+    """Open the colour images of a sequence.
 
-    Raises InputError where there is none.
+    Args:
+        path: Folder of the sequence.
+        fps: Frames per second; the time of an image is frame number / fps, so that missing frames leave gaps.
+
+    Raises:
+        InputError: If there are no images, or two with the same frame number.
     """
     files = find_sevenscenes_images(path)
     if not files:

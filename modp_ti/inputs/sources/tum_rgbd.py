@@ -1,4 +1,4 @@
-"""Source `tum_rgbd`: a folder of the TUM RGB-D benchmark, listed with its time stamps in `rgb.txt`."""
+"""Source `tum_rgbd`: a sequence of the TUM RGB-D benchmark, whose images and times are listed in `rgb.txt`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ __all__ = ["open_tum_rgbd", "read_listing"]
 
 WIDTH, HEIGHT = 640, 480
 
-# What the benchmark publishes for its three cameras: fx, fy, cx, cy with pixel centres at whole numbers, and the lens
-# (the images of the third are undistorted).
+# Published calibrations of the benchmark's three cameras: fx, fy, cx, cy with pixel centres at whole numbers, and the
+# lens. The images of the third camera are already undistorted.
 CAMERAS = {
     1: (517.3, 516.5, 318.6, 255.3, Distortion((0.2624, -0.9531, 1.1633), tangential=(-0.0054, 0.0026))),
     2: (520.9, 521.0, 325.1, 249.7, Distortion((0.2312, -0.7849, 0.9172), tangential=(-0.0033, -0.0001))),
@@ -29,9 +29,14 @@ CAMERA_NAME = re.compile(r"(?:freiburg|fr)[-_ ]?([123])(?![0-9])", re.IGNORECASE
 
 
 def open_tum_rgbd(path: Path) -> ListedImages:
-    """The images that `rgb.txt` lists and that are there. Times are the listing's.
+    """Open the images that `rgb.txt` lists and that exist, with the times of the listing.
 
-    Raises InputError (with file and line) for a listing that is missing, malformed, unordered, or without any image.
+    Args:
+        path: Folder of the sequence.
+
+    Raises:
+        InputError: If the listing is missing, malformed or unordered (the message names the line), or no listed image
+            exists.
     """
     listing = path / "rgb.txt"
     entries = read_listing(listing)
@@ -53,16 +58,24 @@ def open_tum_rgbd(path: Path) -> ListedImages:
         )
     else:
         fx, fy, cx, cy, distortion = CAMERAS[number]
-        # Their pixel centres lie at whole numbers, ours at +0.5.
+        # The benchmark has pixel centres at whole numbers, this project at +0.5.
         intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, WIDTH, HEIGHT), distortion)
         notes.append(f"the camera is taken to be the benchmark's freiburg{number}")
     return ListedImages(path, [name for _, name in there], [time for time, _ in there], intrinsics, notes)
 
 
 def read_listing(file: Path) -> list[tuple[float, str]]:
-    """(time [s], path) of each line of a listing such as `rgb.txt`; `#` starts a comment.
+    """Read a listing such as `rgb.txt`, with a time [s] and a path per line. `#` starts a comment.
 
-    Raises InputError for a listing that is missing, empty or malformed, times out of order, a path listed twice.
+    Args:
+        file: The listing.
+
+    Returns:
+        Time [s] and path of each entry.
+
+    Raises:
+        InputError: If the listing is missing, empty or malformed, times are not strictly increasing, or a path is
+            listed twice.
     """
     entries: list[tuple[float, str]] = []
     first_line: dict[str, int] = {}
@@ -100,7 +113,7 @@ def _lines(file: Path) -> Iterator[str]:
 
 
 def _camera_number(path: Path, listing: Path) -> int | None:
-    """1, 2 or 3, from the folder's name, else from the recording that the listing's comments name."""
+    """Return the camera, 1, 2 or 3, from the folder's name or else from the comments of the listing."""
     found = CAMERA_NAME.search(path.resolve().name)
     if found is None:
         comments = [line for line in _lines(listing) if line.startswith("#")]

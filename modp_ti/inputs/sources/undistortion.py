@@ -1,4 +1,4 @@
-"""From stored images to pinhole images at the working size."""
+"""Undistortion of stored images to pinhole images at the working size."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 
 __all__ = ["Undistorter"]
 
-# Ideal points are searched for up to this multiple of the image corner's radius; beyond it they are far
-# outside.
+# The inverse of the lens model is searched up to this multiple of the image corner's radius.
 SEARCH_MARGIN = 1.5
 
 
 class Undistorter:
-    """Takes a camera's images and pixels to those of a pinhole camera of the same focal length, scaled.
+    """Maps images and pixels of a camera to a pinhole camera with the same intrinsics, scaled.
 
-    raw: intrinsics and size of the stored images. scale: factor on width and height; the size is rounded to
-    whole pixels and each axis of the intrinsics follows its exact ratio. `camera` is the camera of the
-    result.
+    Args:
+        raw: Intrinsics and size of the stored images.
+        distortion: Lens distortion of the stored images.
+        scale: Factor on width and height. The size is rounded to whole pixels, and the intrinsics of each axis are
+            scaled by its exact ratio.
+
+    Attributes:
+        raw: As the argument.
+        distortion: As the argument.
+        camera: Pinhole camera of the result.
     """
 
     def __init__(self, raw: PinholeCamera, distortion: Distortion = NO_DISTORTION, scale: float = 1.0) -> None:
@@ -33,9 +39,9 @@ class Undistorter:
         self._limit = SEARCH_MARGIN * float(np.linalg.norm(_normalised(raw, corners), axis=1).max())
 
     def points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pixels (N, 2) of the result for pixels (N, 2) of the stored image.
+        """Map pixels (N, 2) of the stored image to pixels (N, 2) of the result.
 
-        NaN where the lens model has no inverse.
+        The result is NaN where the lens model has no inverse.
         """
         if self.distortion.is_identity:
             size, out = (self.raw.width, self.raw.height), (self.camera.width, self.camera.height)
@@ -45,11 +51,19 @@ class Undistorter:
     def image(
         self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
-        """Undistorted, scaled image (H, W, 3) float32 in [0, 1] of a stored one (H0, W0, 3) uint8.
+        """Undistort and scale a stored image.
 
-        With it the mask (H, W) of the pixels that the stored image covers, None where it covers all. valid: (H0, W0),
-        False for pixels of the stored image to be ignored: nothing of them comes into the image, and a pixel that more
-        than half consists of them is masked.
+        Args:
+            raw: Stored image (H0, W0, 3) uint8.
+            valid: Valid pixels (H0, W0) of the stored image, or None if all are valid. Invalid pixels do not contribute
+                to the result. A pixel of the result is masked if more than half of its weight is invalid.
+
+        Returns:
+            The image (H, W, 3) float32 in [0, 1], and the mask (H, W) of its valid pixels. The mask is None if `valid`
+            is None and the stored image covers all pixels.
+
+        Raises:
+            ValueError: If the size or dtype of the image, or the size of `valid`, is wrong.
         """
         if raw.shape != (self.raw.height, self.raw.width, 3) or raw.dtype != np.uint8:
             raise ValueError(f"image is {raw.shape} {raw.dtype}, the camera {self.raw.width}x{self.raw.height}")
@@ -67,9 +81,16 @@ class Undistorter:
     def grey(
         self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-        """Grey image (H, W) uint8, undistorted and scaled, of a stored one, for features; its mask as for `image`.
+        """Undistort and scale a stored image to grey, for feature detection.
 
-        Ignored pixels keep their grey: no feature may be where the mask is False.
+        Invalid pixels keep their values. Callers must not place features where the mask is False.
+
+        Args:
+            raw: Stored image (H0, W0, 3) uint8.
+            valid: As for `image`.
+
+        Returns:
+            The grey image (H, W) uint8, and the mask as for `image`.
         """
         import cv2
 
@@ -81,7 +102,7 @@ class Undistorter:
         return grey, kept if mask is None else kept & mask
 
     def smooth(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A smooth picture of the stored image's field of view (H1, W1, 3), as it is in the delivered one (H, W, 3)."""
+        """Resample a smooth picture (H1, W1, 3) of the stored image's field of view to the result's (H, W, 3)."""
         import cv2
 
         size = (self.camera.width, self.camera.height)
@@ -90,13 +111,13 @@ class Undistorter:
         return self._remapped(picture, cv2.INTER_LINEAR)
 
     def _resampled(self, image: NDArray) -> NDArray:
-        """A stored image, or one such channel, at the working size and undistorted."""
+        """Scale a stored image, or a single channel of it, to the working size and undistort it."""
         import cv2
 
         size = (self.camera.width, self.camera.height)
         if size != (self.raw.width, self.raw.height):
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        # Cubic: at about one sample a pixel the linear filter blurs by an amount that depends on the place.
+        # Cubic, because at about one sample per pixel a linear filter blurs by an amount that varies over the image.
         return self._remapped(image, cv2.INTER_CUBIC)
 
     def _remapped(self, image: NDArray, interpolation: int) -> NDArray:
@@ -109,7 +130,7 @@ class Undistorter:
 
     @cached_property
     def _lookup(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_] | None] | None:
-        """Where each pixel looks in the scaled image, x and y in cv2's coordinates, and the mask."""
+        """Lookup maps x and y (H, W) into the scaled image, in cv2's coordinates, and the mask."""
         if self.distortion.is_identity:
             return None
         camera = self.camera
@@ -121,7 +142,7 @@ class Undistorter:
         inside &= camera.contains(source.reshape(-1, 2)).reshape(inside.shape)
         mask = None if inside.all() else inside
         if mask is not None:
-            mask.flags.writeable = False  # one array serves every frame
+            mask.flags.writeable = False  # shared by all frames
         lookup = (source - 0.5).astype(np.float32)
         return np.ascontiguousarray(lookup[..., 0]), np.ascontiguousarray(lookup[..., 1]), mask
 

@@ -1,7 +1,7 @@
-"""Whether a video file is all there, from the lengths that its container states, without decoding it.
+"""Detection of truncated video files from the lengths stated in the container, without decoding.
 
-Decoders play a file that was cut off up to where it ends, and say nothing. MP4 and its kin, AVI, and Matroska (WebM)
-state the length of each of their parts; for other containers the answer is None.
+Decoders read a truncated file up to its end without an error. MP4 and QuickTime, AVI, and Matroska (WebM) state the
+length of each of their parts. Other containers are not supported.
 """
 
 from __future__ import annotations
@@ -15,14 +15,21 @@ __all__ = ["missing_bytes"]
 
 EBML = b"\x1aE\xdf\xa3"
 MATROSKA_SEGMENT = b"\x18S\x80g"
-# Boxes that are followed; a recording has a handful at its top, a fragmented one two for each second.
+# Largest number of boxes to visit. A recording has a few at its top level, a fragmented one two per second.
 MAX_BOXES = 1_000_000
-# What an MP4 or QuickTime file may begin with.
+# Types of the first box of an MP4 or QuickTime file.
 MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 
 
 def missing_bytes(file: Path) -> int | None:
-    """How many bytes the file lacks to what its container states, 0 for a whole one; None where that is not known."""
+    """Return how many bytes a video file lacks according to its container.
+
+    Args:
+        file: The video file.
+
+    Returns:
+        The number of missing bytes, 0 for a complete file, or None if the container does not tell.
+    """
     size = file.stat().st_size
     with open_file(file) as stream:
         start = stream.read(12)
@@ -38,7 +45,11 @@ def missing_bytes(file: Path) -> int | None:
 
 
 def _end_of_boxes(stream: BinaryIO, size: int) -> int:
-    """Where the last box ends: 4 bytes of length, 4 of type, 8 of length where the first is 1; 0 is up to the end."""
+    """Return the end of the last box.
+
+    A box starts with 4 bytes of length and 4 of type. Length 1 means that 8 bytes of length follow, 0 that the box
+    extends to the end of the file.
+    """
     here = 0
     for _ in range(MAX_BOXES):
         if here >= size:
@@ -59,7 +70,10 @@ def _end_of_boxes(stream: BinaryIO, size: int) -> int:
 
 
 def _end_of_riff(stream: BinaryIO, size: int) -> int:
-    """Where the last RIFF chunk ends (files of more than a gigabyte have several): 4 letters, 4 bytes of length."""
+    """Return the end of the last RIFF chunk. Files of more than a gigabyte have several.
+
+    A chunk starts with 4 letters and 4 bytes of length.
+    """
     here = end = 0
     while here < size:
         stream.seek(here)
@@ -70,14 +84,14 @@ def _end_of_riff(stream: BinaryIO, size: int) -> int:
         if len(head) < 8:
             return here + 8
         if length == 0:
-            return size  # its writer did not come to state it
+            return size  # the writer was interrupted before it stored the length
         end = here + 8 + length
-        here = end + length % 2  # padding, which the last one may lack
+        here = end + length % 2  # padding, which the last chunk may lack
     return end
 
 
 def _end_of_matroska(stream: BinaryIO, size: int) -> int | None:
-    """Where the segment ends; None where its length is left open, as in a recorded stream."""
+    """Return the end of the segment, or None if its length is unknown, as in a recorded stream."""
     stream.seek(len(EBML))
     header, _ = _variable_length(stream)
     if header is None:
@@ -92,7 +106,10 @@ def _end_of_matroska(stream: BinaryIO, size: int) -> int | None:
 
 
 def _variable_length(stream: BinaryIO) -> tuple[int | None, bool]:
-    """A length of Matroska: as many leading zero bits as further bytes. And whether it is one: all ones means open."""
+    """Read a Matroska length: the number of leading zero bits is the number of further bytes.
+
+    Returns the length, or None if it is invalid, and whether it is known: all ones means unknown.
+    """
     first = stream.read(1)
     if not first or first[0] == 0:
         return None, False

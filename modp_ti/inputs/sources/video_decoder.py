@@ -14,14 +14,13 @@ from modp_ti.inputs.sources.image_bounds import MAX_IMAGE_PIXELS
 
 __all__ = ["VideoDecoder"]
 
-# FFmpeg's names of the formats that may be opened: video containers, but no playlists, which refer to other files.
+# FFmpeg's names of the accepted formats: video containers, but not playlists, which refer to other files.
 CONTAINERS = (
     "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo,h264,hevc,vvc,m4v,mjpeg,asf,flv,ogg,"
     "ivf,obu,av1,dv,gxf,mxf,nut,rm,wtv,yuv4mpegpipe,gif,apng"
 )
-# Options of the decoder.
 LIMITS = {"max_pixels": str(MAX_IMAGE_PIXELS)}
-# What PyAV raises for malformed files.
+# Exceptions that PyAV raises for malformed files.
 DECODING_ERRORS = (av.FFmpegError, OSError, ValueError, ArithmeticError, MemoryError)
 
 
@@ -35,7 +34,7 @@ class VideoDecoder:
 
     Attributes:
         index: Index of the frame that was decoded last, -1 before the first.
-        form: As the argument, set when the first image is taken.
+        form: As the argument; if None, it is set when the first image is converted.
 
     Raises:
         OSError: FFmpeg does not recognise the file as a video.
@@ -58,7 +57,7 @@ class VideoDecoder:
             self._stream.codec_context.thread_count = 1
         self._unit = float(self._stream.time_base or 0)  # [s]
         self._start = self._stream.start_time or 0
-        self._reformatter = VideoReformatter()  # kept: a new one prepares its tables for each frame
+        self._reformatter = VideoReformatter()  # reused, because a new one computes its tables again
         self._frame: av.VideoFrame | None = None
         self._frames = self._decoded()
         self.form = form
@@ -66,13 +65,13 @@ class VideoDecoder:
 
     @property
     def shown(self) -> float:
-        """Time stamp of the frame [ms] from the start of the stream; 0 where the container has none."""
+        """Time stamp of the current frame [ms] from the start of the stream; 0 if the container has none."""
         if self._frame is None or self._frame.pts is None:
             return 0.0
         return (self._frame.pts - self._start) * self._unit * 1000.0
 
     def advance(self) -> bool:
-        """Decode the next frame; False at the end."""
+        """Decode the next frame. Returns False at the end."""
         self._frame = next(self._frames, None)
         self.index += self._frame is not None
         return self._frame is not None
@@ -84,16 +83,20 @@ class VideoDecoder:
         return self.index == index
 
     def seek(self, milliseconds: float) -> float | None:
-        """Seek to about this time and decode a frame: its time stamp, or None at the end. `index` is invalid then."""
+        """Seek to about this time [ms] and decode a frame. `index` is invalid afterwards.
+
+        Returns:
+            Time stamp of the frame [ms], or None at the end or if seeking fails.
+        """
         try:
             self._container.seek(self._start + round(milliseconds / 1000.0 / self._unit), stream=self._stream)
-        except (*DECODING_ERRORS, AssertionError):  # the last if the container is closed
+        except (*DECODING_ERRORS, AssertionError):  # AssertionError: the container is closed
             return None
         self._frames = self._decoded()
         return self.shown if self.advance() else None
 
     def image(self) -> NDArray[np.uint8] | None:
-        """The frame that was decoded last, (H, W, 3) RGB; None if it cannot be converted."""
+        """Convert the frame that was decoded last to (H, W, 3) uint8 RGB; None if that fails."""
         if self._frame is None:
             return None
         if self.form is None:
@@ -101,7 +104,7 @@ class VideoDecoder:
             self.form = self._frame.width, self._frame.height, quarters % 4 * 90 if rest <= 2 else 0
         width, height, turned = self.form
         try:
-            # BGR and this filter make frames bit-identical to those of OpenCV's reader; direct RGB not always.
+            # Conversion to BGR with this filter gives the same bits as OpenCV's reader. Direct RGB does not always.
             shown = self._reformatter.reformat(self._frame, width, height, "bgr24", interpolation="BICUBIC")
             image = shown.to_ndarray()[..., ::-1]
         except DECODING_ERRORS:
@@ -113,7 +116,7 @@ class VideoDecoder:
         self._container.close()
 
     def _decoded(self) -> Iterator[av.VideoFrame]:
-        """The frames from here on. Packets that cannot be decoded are skipped, as `ffmpeg` does."""
+        """Yield the remaining frames. Packets that cannot be decoded are skipped, as `ffmpeg` does."""
         for packet in self._packets():
             try:
                 yield from self._stream.decode(packet)
@@ -121,7 +124,7 @@ class VideoDecoder:
                 continue
 
     def _packets(self) -> Iterator[av.Packet | None]:
-        """The packets from here on; after a read error None, which flushes the decoder."""
+        """Yield the remaining packets. After a read error, None flushes the decoder."""
         try:
             yield from self._container.demux(self._stream)
         except DECODING_ERRORS:

@@ -1,4 +1,4 @@
-"""Source `video`: the frames of a video file, in any order."""
+"""Source `video`: the frames of a video file, readable in any order."""
 
 from __future__ import annotations
 
@@ -25,25 +25,30 @@ VIDEO_SUFFIXES = (
     *(".wmv", ".flv", ".3gp", ".ogv", ".h264", ".h265", ".hevc", ".mjpg", ".mjpeg"),
 )
 
-# Up to this many frames ahead are decoded and passed over; further ones are sought, which decodes from the last
-# keyframe of the stream, some 250 frames away at most.
+# Frames up to this many ahead are reached by decoding, farther ones by seeking. A seek decodes from the previous
+# keyframe of the stream, usually at most 250 frames back.
 PASSED_OVER = 60
-# How long before the wanted frame [s] to seek; the next one is tried if a seek lands behind the frame.
+# Margins before the wanted frame [s] for seeking. The next one is tried if a seek lands after the frame.
 SEEK_MARGINS = (0.0, 1.0, 10.0, 100.0)
 
 
 class VideoFile(KnownFrames):
-    """An `ImageSource` of a video file. Frame n, from 0, is called `<file's name without suffix>_<n with six digits>`.
+    """An `ImageSource` of a video file. Frame n, from 0, is called `<file stem>_<n, six digits>`.
 
-    The file is decoded once when it is opened, as only that tells how many frames it has and when they are shown;
-    with `stop`, up to there. Frames are turned as the file asks (phones record portraits lying). Times are the
-    container's; fps: where it has none.
+    The file is decoded once when it is opened, because only that gives the number of frames and their times. Frames are
+    rotated as the file requests: phones store portrait videos in landscape.
 
-    A frame is the same whenever and in whatever order it is read: new ones come from a decoder that goes forward from
-    the first, older ones from a second one, which seeks, and whose frames are compared with a checksum of the first
-    reading. May be read from several threads.
+    A frame is the same whenever and in whatever order it is read. New frames come from a decoder that runs forward from
+    the first frame. Earlier frames come from a second decoder that seeks; each of its frames is compared with a
+    checksum from the first reading. Frames may be read from several threads.
 
-    Raises InputError for a file that is missing, no video, without a frame, or cut off before `stop`.
+    Args:
+        path: The video file.
+        fps: Frames per second, used if the container has no frame times.
+        stop: Number of frames to use; all if None.
+
+    Raises:
+        InputError: If the file is missing, not a video, has no frames, or is truncated before `stop`.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float = 30.0, stop: int | None = None) -> None:
@@ -96,12 +101,16 @@ class VideoFile(KnownFrames):
         self._front = self._decoder(missing)
 
     def size(self, name: str) -> tuple[int, int]:
-        """(width, height) of the frames."""
+        """Return the size (width, height) of the frames."""
         assert name in self._position, name
         return self._size
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """Decoded frame (H, W, 3) uint8 RGB. Raises InputError where it cannot be decoded."""
+        """Decode a frame (H, W, 3) uint8 RGB.
+
+        Raises:
+            InputError: If the frame cannot be decoded.
+        """
         with self._lock:
             index = self._position[name]
             image = self._new(index) if index > self._front.index else self._old(index)
@@ -116,7 +125,7 @@ class VideoFile(KnownFrames):
                 decoder.close()
 
     def _new(self, index: int) -> NDArray[np.uint8] | None:
-        """A frame behind all that were read: decoding goes on to there."""
+        """Decode a frame after the front decoder's position."""
         if not self._front.advance_to(index):
             return None
         image = self._front.image()
@@ -125,7 +134,7 @@ class VideoFile(KnownFrames):
         return image
 
     def _old(self, index: int) -> NDArray[np.uint8] | None:
-        """A frame from before the front, checked against its checksum where it was read then."""
+        """Decode a frame at or before the front decoder's position and compare it with its checksum, if known."""
         known = self._checksums.get(index)
         if self._back is None:
             self._back = self._decoder()
@@ -134,7 +143,7 @@ class VideoFile(KnownFrames):
             image = self._back.image()
             if image is not None and _checksum(image) == known:
                 return image
-            self._seeks = False  # this container's times do not find frames
+            self._seeks = False  # seeking by time does not work for this container
         if index <= self._back.index or not self._seeks:
             self._back.close()
             self._back = self._decoder()
@@ -146,12 +155,12 @@ class VideoFile(KnownFrames):
         if known is None:
             self._checksums[index] = _checksum(image)
         elif _checksum(image) != known and self._seeks:
-            self._seeks = False  # frames were lost behind a place that was sought
+            self._seeks = False  # decoding after a seek has skipped frames
             return self._old(index)
         return image
 
     def _seek(self, index: int) -> bool:
-        """Whether the second decoder stands at the frame after a search by its time."""
+        """Seek the second decoder to a frame by its time. Returns whether that succeeded."""
         assert self._back is not None
         for margin in SEEK_MARGINS:
             landed = self._back.seek(float(self._shown[index]) - 1000.0 * margin)
@@ -159,7 +168,7 @@ class VideoFile(KnownFrames):
             if len(found) == 1 and found[0] <= index:
                 self._back.index = int(found[0])
                 return self._back.advance_to(index)
-        self._back.index = len(self.names)  # somewhere: what comes next begins anew
+        self._back.index = len(self.names)  # unknown position: the next read reopens the file
         return False
 
     def _decoder(self, missing: int | None = None, in_threads: bool = False) -> VideoDecoder:
@@ -182,9 +191,11 @@ class VideoFile(KnownFrames):
 
 
 def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.float64], bool]:
-    """Times [s] that increase, of the times [ms] that a container says; and whether they are the container's.
+    """Compute increasing frame times [s] from a container's time stamps [ms].
 
-    Some containers leave the last frames without one: they follow at the usual distance.
+    Some containers have no time stamps for the last frames. Those follow at the median distance.
+
+    Returns the times, and whether they come from the container rather than from `fps`.
     """
     falls = np.flatnonzero(np.diff(shown) <= 0)
     good = int(falls[0]) + 1 if len(falls) else len(shown)

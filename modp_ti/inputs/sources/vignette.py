@@ -1,4 +1,4 @@
-"""A lens's vignette, photographed: how much of the light reaches each pixel."""
+"""Reading of vignette images: the share of the light that reaches each pixel."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from modp_ti.inputs.sources.image_bounds import why_undecodable
 
 __all__ = ["LEAST_LIGHT", "read_vignette"]
 
-# Where less of the light than this arrives, a pixel holds more noise than picture: it counts as masked.
+# Pixels that get a smaller share of the light than this are mostly noise and are masked.
 LEAST_LIGHT = 0.05
 
 
 def read_vignette(path: Path) -> NDArray[np.float32]:
-    """Vignette image (H, W, 3) float32 of maximum 1, from a grey or colour image of 8 or 16 bits.
+    """Read a vignette (H, W, 3) float32, normalised to a maximum of 1.
 
-    Raises InputError where it is unreadable or black.
+    Args:
+        path: A grey or colour image of 8 or 16 bits.
+
+    Raises:
+        InputError: If the image is unreadable or black.
     """
     import cv2
 
@@ -33,7 +37,7 @@ def read_vignette(path: Path) -> NDArray[np.float32]:
         raise InputError(f"{path}: the vignette is no image that can be used: {reason} (source.vignette)")
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:  # silent: the one line that the user gets is ours
+    try:  # OpenCV is silenced because the error is reported below
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error:
         image = None

@@ -1,6 +1,6 @@
-"""Where poses and sparse points come from: one file per kind, each giving `TrackedFrame`s in order.
+"""Readers of poses and sparse points, one file per kind. Each delivers `TrackedFrame`s in order.
 
-`openers` has the kinds; their settings are in `modp_ti.config.tracker_settings`.
+The registry of kinds is in `openers`; their settings are in `modp_ti.config.tracker_settings`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ __all__ = ["Progress", "Tracker", "open_tracker"]
 
 
 def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:
-    """The tracker that the configuration asks for, its input checked as far as possible without decoding.
+    """Open the configured tracker. Its input is checked as far as possible without decoding all images.
 
     Args:
-        config: The scene; its source, its tracker and its seed count.
-        progress: Called while a tracker prepares (triangulates).
+        config: The scene configuration. Only `source`, `tracker` and `seed` are used.
+        progress: Called while the tracker prepares, for example while it triangulates points.
 
     Raises:
-        InputError: For bad input.
+        InputError: If the input is invalid.
     """
     return OPENERS[type(config.tracker)](config.tracker, Opening(config.source, config.seed, progress))

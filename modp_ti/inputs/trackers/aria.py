@@ -1,4 +1,4 @@
-"""Tracker `aria`: poses, calibration and points that Project Aria's machine perception services (MPS) wrote."""
+"""Tracker `aria`: poses, calibration and points from Project Aria's machine perception services (MPS)."""
 
 from __future__ import annotations
 
@@ -34,19 +34,30 @@ CALIBRATION = "online_calibration.jsonl"
 POINTS = ("semidense_points.csv.gz", "semidense_points.csv", "global_points.csv.gz", "global_points.csv")
 OBSERVATIONS = ("semidense_observations.csv.gz", "semidense_observations.csv")
 
-# The tracking cameras take ten pictures a second: one of them lies this near in time [s] to every frame between.
+# Largest time difference [s] between a frame and an observation of the tracking cameras, which run at 10 Hz.
 SEEN_WITHIN = 0.11
 
 
 def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress | None = None) -> ReplayedTracker:
-    """The images that have a device pose within `tracker.max_difference` of their time, in the source's order.
+    """Open the images that have a device pose within `tracker.max_difference` of their time, in the source's order.
 
-    tracker.path: MPS's folder, or its `slam` or `trajectory` folder, or one of the two trajectories. The closed loop is
-    taken before the open one. T_world_camera = T_world_device T_device_camera, the latter from the online calibration
-    nearest in time. Points certain enough are shown to the frames that they project into; with observations only
-    those that the tracking cameras saw around the frame's time. Without points, or with the open loop, whose world is
-    not theirs, features are tracked and triangulated. Raises InputError for what is missing and cannot be done
-    without, for malformed files, and for images that do not fit the camera or the times.
+    The closed-loop trajectory is preferred to the open-loop one. Poses are
+    T_world_camera = T_world_device T_device_camera, with T_device_camera from the online calibration nearest in time.
+    If that file is missing, the calibration stored in the VRS recording is used.
+
+    Each frame gets the sufficiently certain points that project into it. If there are observations, only points that
+    the tracking cameras saw within `SEEN_WITHIN` of the frame's time are used. Without points, features are tracked and
+    triangulated. The same happens with the open loop, because the points belong to the closed loop's world.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is the MPS folder, its `slam` or `trajectory` folder, or one of the two
+            trajectory files.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: If a required file is missing, a file is malformed, or the images do not match the camera or the
+            times.
     """
     place = source.require_path()
     folder, file = _trajectory_file(tracker.path, place)
@@ -85,7 +96,7 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
 
 
 def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
-    """MPS's folder and the trajectory in it."""
+    """Return the MPS folder and the trajectory file in it."""
     if given is not None and given.is_file():
         if given.name not in (CLOSED_LOOP, OPEN_LOOP):
             raise InputError(f"{given}: tracker.path must be MPS's folder, {CLOSED_LOOP} or {OPEN_LOOP}")
@@ -106,7 +117,7 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
 
 
 def _recorded_mount(images: ImageSource, file: Path, label: str) -> tuple[CameraMounts, list[str]]:
-    """Where a VRS recording says that its camera sits, in place of the calibration over time, and a remark on that."""
+    """Return the camera mount stored in a VRS recording, for use without the online calibration, and a remark."""
     mount = images.T_device_camera
     lost = f"{file} is missing: it would have brought where the camera {label} sits on the device (T_device_camera)"
     if mount is None:
@@ -139,7 +150,7 @@ def _with_points(
     xyz: NDArray[np.float64],
     limit: int,
 ) -> tuple[list[PosedImage], list[str]]:
-    """The frames, taken at these device times (F,), with the points that they see, and remarks on that."""
+    """Return the frames, taken at device times (F,), with the points that they observe, and remarks for the user."""
     file = next((folder / name for name in OBSERVATIONS if (folder / name).is_file()), None)
     if file is None:
         seen = [np.arange(len(xyz))] * len(frames)

@@ -1,4 +1,7 @@
-"""What Project Aria's machine perception services (MPS) write: trajectories, calibration, points and observations."""
+"""Readers of the files of Project Aria's machine perception services (MPS).
+
+These are trajectories, calibration, points and observations.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,15 @@ MICROSECONDS = 1e-6
 
 @dataclass(frozen=True)
 class DeviceTrajectory:
-    """times: (N,) seconds of the device's clock, rising. T_world_device: (N, 4, 4). world: name of their world."""
+    """Device poses over time.
+
+    Attributes:
+        path: The file.
+        times: Times (N,) on the device clock [s], strictly increasing.
+        T_world_device: Poses (N, 4, 4), device to world.
+        world: Name of the world frame (`graph_uid` or `session_uid`).
+        left_out: Number of poses that belong to other worlds and were dropped.
+    """
 
     path: Path
     times: NDArray[np.float64]
@@ -41,27 +52,37 @@ class DeviceTrajectory:
 
 @dataclass(frozen=True)
 class CameraMounts:
-    """Where a camera sits on the device, as estimated over time. times: (N,) seconds. T_device_camera: (N, 4, 4)."""
+    """Pose of a camera on the device, estimated over time.
+
+    Attributes:
+        path: The file.
+        times: Times (N,) [s].
+        T_device_camera: Poses (N, 4, 4), camera to device.
+    """
 
     path: Path
     times: NDArray[np.float64]
     T_device_camera: NDArray[np.float64]
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """The estimate nearest in time."""
+        """Return the estimate (4, 4) nearest to `time` [s]."""
         return self.T_device_camera[int(np.abs(self.times - time).argmin())]
 
 
 def read_closed_loop(path: Path) -> DeviceTrajectory:
-    """closed_loop_trajectory.csv. Of several worlds (`graph_uid`) the one with most poses is taken, others counted.
+    """Read closed_loop_trajectory.csv.
 
-    Raises InputError with file and line for what is malformed, as do the readers below.
+    If there are several worlds (`graph_uid`), the one with most poses is used; poses of the others are counted in
+    `left_out`.
+
+    Raises:
+        InputError: If the file is malformed. The message names file and line. The other readers do the same.
     """
     return _trajectory(path, "graph_uid", "world_device")
 
 
 def read_open_loop(path: Path) -> DeviceTrajectory:
-    """open_loop_trajectory.csv, of the odometry: it drifts. Of several sessions the longest is taken."""
+    """Read open_loop_trajectory.csv, the odometry, which drifts. The session with most poses is used."""
     return _trajectory(path, "session_uid", "odometry_device")
 
 
@@ -88,7 +109,7 @@ def _trajectory(path: Path, world: str, frame: str) -> DeviceTrajectory:
 
 
 def read_calibration(path: Path, label: str) -> CameraMounts:
-    """`T_device_camera` of the camera of this label from online_calibration.jsonl."""
+    """Read `T_device_camera` of the camera with this label from online_calibration.jsonl."""
     times, translations, quaternions, lines = [], [], [], []
     try:
         for number, line in enumerate(text_lines(path), start=1):
@@ -116,7 +137,7 @@ def read_calibration(path: Path, label: str) -> CameraMounts:
 
 
 def _mount(line: str, label: str, path: Path, number: int) -> tuple[float, list[float], list[float]]:
-    """Time, translation and quaternion (x, y, z, w) of the camera in one line."""
+    """Parse time, translation and quaternion (x, y, z, w) of the camera from one line."""
     data, what = parse_json(line, str(path), number), f"{path}:{number}"
     cameras = data.get("CameraCalibrations") if isinstance(data, Mapping) else None
     if not isinstance(cameras, list):
@@ -150,10 +171,19 @@ def _numbers(values: Any, count: int) -> list[float]:
 def read_points(
     path: Path, world: str, max_inv_dist_std: float, max_dist_std: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
-    """Numbers (N,) and positions (N, 3) of the points that are certain enough, and how many there were.
+    """Read the points of the given world that are sufficiently certain.
 
-    path: semidense_points.csv.gz or the older global_points.csv.gz. Points of another world are left out. Raises
-    InputError where none is left.
+    Args:
+        path: semidense_points.csv.gz or the older global_points.csv.gz.
+        world: Name of the trajectory's world; points of other worlds are dropped.
+        max_inv_dist_std: Largest standard deviation of the inverse distance [1/m].
+        max_dist_std: Largest standard deviation of the distance [m].
+
+    Returns:
+        Ids (N,) of the points, increasing, their positions (N, 3), and the total number of points in the file.
+
+    Raises:
+        InputError: If no point is left.
     """
     columns = {
         "uid": "i8",
@@ -168,7 +198,7 @@ def read_points(
             & (rows["inv_dist_std"] <= max_inv_dist_std)
             & (rows["dist_std"] <= max_dist_std)
         ]
-        uid.append(kept["uid"].copy())  # a column alone holds the whole table
+        uid.append(kept["uid"].copy())  # a view of one column would keep the whole table alive
         xyz.append(np.stack([kept[name] for name in ("px_world", "py_world", "pz_world")], axis=1))
     numbers, first = np.unique(np.concatenate(uid), return_index=True)
     if len(numbers) == 0:
@@ -182,10 +212,19 @@ def read_points(
 def read_observations(
     path: Path, numbers: NDArray[np.int64], first: float, last: float
 ) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """Times (T,) [seconds], rising, at which the device's tracking cameras saw points, and which of them each time.
+    """Read which points the device's tracking cameras saw at which time.
 
-    numbers: (N,) rising; of other points nothing is kept. first, last: seconds, of other times nothing is kept. Points
-    come as their places in `numbers`.
+    Args:
+        path: semidense_observations.csv.gz.
+        numbers: Ids (N,) of the points of interest, increasing; others are ignored.
+        first: Start of the time range of interest [s].
+        last: End of the time range of interest [s].
+
+    Returns:
+        Times (T,) [s], increasing, and for each of them the observed points as indices into `numbers`.
+
+    Raises:
+        InputError: If there are no such observations.
     """
     columns = {"uid": "i8", "frame_tracking_timestamp_us": "i8"}
     times, points = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]

@@ -1,4 +1,4 @@
-"""Tracker `colmap`: poses and points of a COLMAP model, binary or text, read with pycolmap."""
+"""Tracker `colmap`: poses and points of a binary or text COLMAP model, read with pycolmap."""
 
 from __future__ import annotations
 
@@ -33,10 +33,15 @@ __all__ = ["open_colmap"]
 
 
 def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTracker:
-    """The images that the model has poses for, in natural order, with the points that each observes.
+    """Open the images that have a pose in the model, in natural order, with the points that each observes.
 
-    Raises InputError for a folder or model that is missing, damaged or of a camera model that is not
-    supported, where no image of the model is in the folder, and for images that do not fit their cameras.
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is the model's folder.
+
+    Raises:
+        InputError: If the model is missing or damaged, has an unsupported camera model, has no image in the folder, or
+            if images do not match their cameras.
     """
     place = source.require_path()
     images = open_source(source)
@@ -93,7 +98,7 @@ def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTrac
 
 
 def _model_folder(images: Path, given: Path | None) -> Path:
-    """The folder that holds cameras, images and points3D."""
+    """Return the folder with cameras, images and points3D."""
     roots = [given] if given is not None else [images.parent / "sparse", images / "sparse"]
     for root in roots:
         for folder in (root, root / "0") if given is not None else (root / "0", root):
@@ -140,7 +145,7 @@ def _observed_points(
     ids = np.array([point.point3D_id for point in observed], dtype=np.int64)
     if not all(int(i) in positions for i in ids):
         raise InputError(f"{folder}: points3D is incomplete: image {image.name} observes points that it lacks")
-    # A track may hold two observations in one image: the first one stands for the point.
+    # A track may have two observations in one image. The first one is used.
     ids, first = np.unique(ids, return_index=True)
     pixels = undistorter.points(np.array([point.xy for point in observed])[first])
     return points_inside(np.array([positions[int(i)] for i in ids]), pixels, ids, undistorter, T_camera_world)

@@ -1,8 +1,8 @@
-"""Structure of COLMAP's binary files, checked before pycolmap reads them.
+"""Reading of COLMAP models, with a check of the file structure before pycolmap reads them.
 
-pycolmap does not notice the end of a file: of a model that was cut off it takes whatever the memory held for
-counts and numbers, which ends in wrong cameras or in gigabytes of allocation. Walking the records and meeting
-the end exactly rules that out.
+pycolmap does not detect the end of a file. In a truncated model it takes counts and numbers from uninitialised memory,
+which gives wrong cameras or allocates gigabytes. Walking over all records first and ending exactly at the end of the
+file rules that out.
 """
 
 from __future__ import annotations
@@ -21,17 +21,21 @@ if TYPE_CHECKING:
 
 __all__ = ["read_colmap_model"]
 
-# Parameters of each camera model, by COLMAP's model number.
+# Number of parameters of each camera model, by COLMAP's model id.
 CAMERA_PARAMS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
 
 
 STEMS = ("cameras", "images", "points3D")
-# Characters of a line of a text model: an image's observations stand in one.
+# Longest line of a text model [characters]. All observations of an image are in one line.
 MAX_TEXT_LINE = 1 << 24
 
 
 def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
-    """The model in a folder, binary or text. Raises InputError for one that is incomplete or damaged."""
+    """Read the binary or text model in a folder.
+
+    Raises:
+        InputError: If the model is incomplete or damaged.
+    """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     if not any(all((folder / f"{stem}{suffix}").exists() for stem in STEMS) for suffix in (".bin", ".txt")):
@@ -44,8 +48,8 @@ def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     try:
         model = pycolmap.Reconstruction(str(folder))
         for image in model.images.values():
-            image.name.encode()  # a name need not be UTF-8 in the file
-    except Exception as error:  # pycolmap throws what its C++ does: ValueError, IndexError, MemoryError, RuntimeError
+            image.name.encode()  # fails if the name in the file is not UTF-8
+    except Exception as error:  # from C++: ValueError, IndexError, MemoryError or RuntimeError
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{folder}: not a readable COLMAP model ({reason}); export it again") from None
     return model
@@ -59,7 +63,7 @@ def _number(word: str) -> float:
 
 
 def _require_text_model(folder: Path) -> None:
-    """Raises InputError where a .txt file of the model is no text file."""
+    """Raise InputError if a .txt file of the model is not text or an image's quaternion is invalid."""
     for stem in RECORDS:
         file = folder / f"{stem}.txt"
         if not file.exists():
@@ -70,7 +74,7 @@ def _require_text_model(folder: Path) -> None:
                 words = line.split(maxsplit=5)
                 if stem == "images" and words and not words[0].startswith("#"):
                     _require_quaternion([_number(word) for word in words[1:5]])
-                    next(lines, None)  # its observations
+                    next(lines, None)  # the image's observations
         except _DamagedError as error:
             raise InputError(f"{file}: {error}; the file is damaged") from None
         except (OSError, UnicodeDecodeError) as error:
@@ -79,11 +83,11 @@ def _require_text_model(folder: Path) -> None:
 
 
 class _CutOffError(Exception):
-    """A record goes on behind the end of the file."""
+    """A record extends beyond the end of the file."""
 
 
 class _DamagedError(Exception):
-    """A record holds what no COLMAP writes."""
+    """A record contains values that COLMAP never writes."""
 
 
 class _Cursor:
@@ -113,7 +117,7 @@ class _Cursor:
 
 
 def _require_quaternion(q: list[float]) -> None:
-    """Raises _DamagedError for one that is no rotation: COLMAP makes one of unit length of any, and says nothing."""
+    """Raise _DamagedError if a quaternion is not of unit length. COLMAP would normalise it silently."""
     length = math.hypot(*q)
     if not 0.9 < length < 1.1:
         raise _DamagedError(f"the quaternion of an image has length {length:.4g} instead of 1")
@@ -167,7 +171,7 @@ RECORDS: dict[str, Callable[[_Cursor], None]] = {
 
 
 def _require_whole_binary_model(folder: Path) -> None:
-    """Raises InputError where a .bin file of the model is cut off, damaged or followed by other data."""
+    """Raise InputError if a .bin file of the model is truncated, damaged or followed by other data."""
     for stem, skip_record in RECORDS.items():
         file = folder / f"{stem}.bin"
         if not file.exists():

@@ -1,4 +1,7 @@
-"""Frames of which a file gives the poses alone: the source knows their camera, a file or triangulation their points."""
+"""Frames whose poses come from a file.
+
+The camera comes from the source, the points from another file or from triangulation.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +34,20 @@ __all__ = [
 
 
 def selected_frames(images: ImageSource, source: SourceSettings) -> list[str]:
-    """The images that source.start/stop/step select, in their order."""
+    """Return the images selected by source.start/stop/step, in order."""
     return list(images.selected(source.start, source.stop, source.step))
 
 
 def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
-    """The file that tracker.path names, or the first of the guesses that is there.
+    """Find the tracker's input file.
 
-    A folder in tracker.path is searched for the guesses' names. Raises InputError where there is none.
+    Args:
+        given: `tracker.path`: the file, a folder that is searched for the names of the guesses, or None.
+        guesses: Candidate files, in order of preference.
+        what: Description of the file, for error messages.
+
+    Raises:
+        InputError: If no such file exists.
     """
     if given is None:
         candidates = list(guesses)
@@ -59,9 +68,17 @@ def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
 def checked_reader(
     images: ImageSource, source: SourceSettings, names: Sequence[str], undistorter: Undistorter, intrinsics: str
 ) -> FrameReader:
-    """What reads the frames. Raises InputError where an image, a mask or the vignette does not fit the camera.
+    """Create the reader of the frames and check that images, masks and vignette match the camera.
 
-    intrinsics: where the camera comes from, for the message.
+    Args:
+        images: The image source.
+        source: Settings of the images.
+        names: Names of the images that will be read.
+        undistorter: Undistorter of all images.
+        intrinsics: Origin of the camera, for error messages.
+
+    Raises:
+        InputError: If an image, a mask or the vignette does not match the camera.
     """
     cameras = [(name, undistorter) for name in names]
     require_fitting_sizes(images, cameras, intrinsics)
@@ -71,7 +88,7 @@ def checked_reader(
 
 
 def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], origin: Path) -> list[str]:
-    """A remark on how many of the selected images have no pose; none where all have."""
+    """Return a remark on selected images without a pose, or an empty list if there are none."""
     missing = [name for name in selected if name not in posed]
     if not missing:
         return []
@@ -88,12 +105,22 @@ def replay_poses(
     notes: Sequence[str],
     progress: Progress | None,
 ) -> ReplayedTracker:
-    """A tracker over the images that have a pose `T_camera_world`, in the source's order.
+    """Create a tracker over the images that have a pose, in the source's order.
 
-    Points are those of `tracker.points` that project into each image; without such a file features are tracked and
-    triangulated here with the poses, before the first frame is delivered, and the poses adjusted with them where
-    `tracker.adjust` says so. Raises InputError for a camera that nobody
-    knows, images that do not fit it, and a point file that is none.
+    If `tracker.points` is set, each frame gets the points of that file that project into it. Otherwise features are
+    tracked and triangulated with the given poses before the first frame is delivered. With `tracker.adjust`, the poses
+    are then bundle adjusted together with these points.
+
+    Args:
+        images: The image source.
+        source: Settings of the images.
+        tracker: Settings of the tracker.
+        poses: T_camera_world (4, 4) by image name.
+        notes: Remarks for the user.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: If the camera is unknown, images do not match it, or the point file is invalid.
     """
     undistorter = require_intrinsics(images).undistorter(source.scale)
     names = sorted(poses, key=images.position)
@@ -119,15 +146,21 @@ def replay_poses(
 
 
 def spread_points(xyz: NDArray[np.float64], numbers: NDArray[np.int64], frame: PosedImage, limit: int) -> SparsePoints:
-    """The points (N, 3), called by their numbers (N,), that the frame sees by projection, `limit` of them at most.
+    """Select the visible points of a frame, at most `limit` of them.
 
-    Which ones are left out is drawn once for all frames, so that frames of the same place keep the same points.
+    The random choice is the same for all frames, so that frames of the same place keep the same points.
+
+    Args:
+        xyz: World points (N, 3).
+        numbers: Their ids (N,).
+        frame: The frame.
+        limit: Largest number of points.
     """
     points = visible_points(xyz, frame.undistorter, frame.T_camera_world)
     ids = numbers[points.ids]
     if len(points) <= limit:
         return SparsePoints(points.xyz, points.pixels, ids)
-    # A bijection on 64-bit numbers (splitmix64) gives every number its place in one random order.
+    # splitmix64, a bijection on 64-bit numbers, defines one random order of all ids.
     order = ids.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
     order = (order ^ (order >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     order = (order ^ (order >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -1,4 +1,4 @@
-"""Tracker `modp`: the files of the paper's release, a JSON of poses and a file of points for each frame."""
+"""Tracker `modp`: sequences of the paper's release, a JSON file of poses and one point file per frame."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, miss
 __all__ = ["open_modp"]
 
 POSES = "trajectory.json"
-# With ORB-SLAM3 as its tracker the release writes other names.
+# File names that the release uses with ORB-SLAM3 as its tracker.
 POSES_ORB = "trajectory_orb.json"
 CLOUDS = {POSES: "point_cloud", POSES_ORB: "orb_point_clouds"}
 
 
-# What np.save writes before the numbers; its length stands in two bytes, or in four.
+# The header that np.save writes. Its length is stored in two or four bytes.
 NPY_START = 4096
 NPY_HEADER = re.compile(
     rb"\x93NUMPY[\1-\3]\0(?:..|....)\{\s*'descr':\s*'[<>|=]?[a-zA-Z]\d{1,3}',\s*'fortran_order':\s*(?:True|False),"
@@ -38,11 +38,18 @@ NPY_HEADER = re.compile(
 
 
 def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
-    """The images that the JSON has poses for, in the source's order, each with the points of its own file.
+    """Open the images that have a pose in the JSON file, in the source's order, each with the points of its own file.
 
-    Points are told apart by their coordinates: one place is one point, in whichever frames' files it stands; pixels are
-    projections. Raises InputError for files that are missing or malformed, poses that are no rigid motion, a point file
-    with the wrong columns or NaN, no points at all, and images that do not fit `source.intrinsics`.
+    Points have no ids in these files: points with the same coordinates are treated as one point. Pixels are
+    projections.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is the JSON file or its folder.
+
+    Raises:
+        InputError: If a file is missing or malformed, a pose is not a rigid motion, a point file has wrong columns or
+            contains NaN, there are no points at all, or images do not match `source.intrinsics`.
     """
     place = source.require_path()
     folders = (place, place.parent)
@@ -78,7 +85,7 @@ def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
     xyz = [_read_cloud(clouds[number]) if number in clouds else np.zeros((0, 3)) for number in numbers]
     if not any(len(each) for each in xyz):
         raise InputError(f"{folder}: holds no point for any of the {len(names)} frames")
-    # One number for one place, in whichever files it stands.
+    # The same coordinates get the same id in all files.
     _, ids = np.unique(np.concatenate(xyz), axis=0, return_inverse=True)
     ids = ids.reshape(-1).astype(np.int64)
     frames, first = [], 0
@@ -101,7 +108,7 @@ def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
 def _projected(
     xyz: NDArray[np.float64], ids: NDArray[np.int64], undistorter: Undistorter, T_camera_world: NDArray[np.float64]
 ) -> SparsePoints:
-    """The points before the camera and inside the image, at their projections."""
+    """Return the points in front of the camera that project into the image, with their projections as pixels."""
     depth = xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
     pixels = np.full((len(xyz), 2), np.nan)
     before = depth > 1e-9
@@ -110,7 +117,7 @@ def _projected(
 
 
 def _cameras(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
-    """Image and `T_camera_world` of each entry."""
+    """Read image name and `T_camera_world` of each entry."""
     data = read_json(file, "tracker.path")
     entries = data.get("cameras") if isinstance(data, dict) else None
     if not isinstance(entries, list) or not entries:
@@ -132,7 +139,7 @@ def _camera(file: Path, number: int, entry: Any) -> tuple[str, NDArray[np.float6
 
 
 def _cloud_files(folder: Path) -> dict[int, Path]:
-    """The file of points of each camera's number."""
+    """Return the point file of each camera number."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: it would have brought the points of each frame, point_cloud_0.txt")
     clouds: dict[int, Path] = {}
@@ -148,7 +155,7 @@ def _cloud_files(folder: Path) -> dict[int, Path]:
 
 
 def _read_cloud(path: Path) -> NDArray[np.float64]:
-    """World points (N, 3); a text file without a line has none."""
+    """Read world points (N, 3). An empty text file has none."""
     if path.suffix.lower() == ".txt":
         try:
             with open_file(path) as file:
@@ -160,14 +167,14 @@ def _read_cloud(path: Path) -> NDArray[np.float64]:
     try:
         with open_file(path) as file:
             start = file.read(NPY_START)
-        if NPY_HEADER.match(start) is None:  # np.load takes archives and pickles too, and code for a header
+        if NPY_HEADER.match(start) is None:  # np.load also accepts archives and pickles, and evaluates the header
             raise ValueError
-        xyz = np.load(path, allow_pickle=False, mmap_mode="r")  # mapped: its header is held against the file's size
+        xyz = np.load(path, allow_pickle=False, mmap_mode="r")  # mapping checks the shape against the file's size
     except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TypeError):
         raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
     if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
         raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
-    with np.errstate(all="ignore"):  # a NaN that signals says so when it becomes a float64
+    with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
         xyz = np.array(xyz[:, :3], dtype=np.float64)
     bad = np.flatnonzero(~(np.abs(xyz) <= LARGEST).all(axis=1))
     if len(bad):

@@ -1,6 +1,6 @@
-"""The registry of trackers: for the settings of each kind, what opens it.
+"""Registry of trackers: maps the settings class of each kind to its opener.
 
-An opener imports its reader when it is called: a run must not wait for the libraries of all others.
+Openers import their reader when called, so that a run loads only the libraries that it needs.
 """
 
 from __future__ import annotations
@@ -32,9 +32,12 @@ __all__ = ["OPENERS", "Opening", "opens"]
 
 @dataclass(frozen=True)
 class Opening:
-    """What an opener is given beside its own settings.
+    """Arguments of an opener besides the tracker's own settings.
 
-    source: where the images are. seed: of all randomness. progress: called while the tracker prepares.
+    Attributes:
+        source: Settings of the images.
+        seed: Random seed.
+        progress: Called while the tracker prepares.
     """
 
     source: SourceSettings
@@ -45,11 +48,11 @@ class Opening:
 S = TypeVar("S", bound=TrackerSettings)
 
 OPENERS: dict[type[TrackerSettings], Callable[[Any, Opening], Tracker]] = {}
-"""By the model of a kind's settings. An opener checks its input as far as possible without decoding images."""
+"""Openers by settings class. An opener checks its input as far as possible without decoding all images."""
 
 
 def opens(settings: type[S]) -> Callable[[Callable[[S, Opening], Tracker]], Callable[[S, Opening], Tracker]]:
-    """Register the decorated function as the opener of trackers with such settings."""
+    """Register the decorated function as the opener for this settings class."""
 
     def register(opener: Callable[[S, Opening], Tracker]) -> Callable[[S, Opening], Tracker]:
         OPENERS[settings] = opener

@@ -1,4 +1,4 @@
-"""Tracker `orbslam3`: the trajectories that ORB-SLAM2 and ORB-SLAM3 write, of all frames or of the keyframes."""
+"""Tracker `orbslam3`: trajectories of ORB-SLAM2 and ORB-SLAM3, of all frames or of the keyframes only."""
 
 from __future__ import annotations
 
@@ -14,17 +14,25 @@ from modp_ti.inputs.trackers.tum import replay_trajectory
 
 __all__ = ["open_orbslam3"]
 
-# All frames before keyframes alone; a run that was given a name writes f_NAME.txt and kf_NAME.txt.
+# In order of preference. A run with a name writes f_NAME.txt and kf_NAME.txt instead.
 FRAMES, KEYFRAMES = "CameraTrajectory.txt", "KeyFrameTrajectory.txt"
 
 
 def open_orbslam3(
     source: SourceSettings, tracker: OrbSlam3Settings, progress: Progress | None = None
 ) -> ReplayedTracker:
-    """The images with a pose in CameraTrajectory.txt or, where that is missing, KeyFrameTrajectory.txt.
+    """Open the images that have a pose in CameraTrajectory.txt or, if that is missing, in KeyFrameTrajectory.txt.
 
-    Both flavours are read: TUM's in seconds and EuRoC's in nanoseconds. Frames between keyframes that have no pose are
-    skipped with a count. Raises InputError as `open_tum` does.
+    Both variants are read: TUM's with times in seconds and EuRoC's with nanoseconds. Frames without a pose are skipped
+    and counted.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is the trajectory or its folder.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: As for `open_tum`.
     """
     place = source.require_path()
     file = _trajectory_file(tracker.path, place)

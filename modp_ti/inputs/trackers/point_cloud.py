@@ -1,4 +1,4 @@
-"""Points without observations: read from a PLY file, and shown to each camera as far as it can see them."""
+"""Points without observations: reading from PLY files, and a visibility test per camera."""
 
 from __future__ import annotations
 
@@ -18,16 +18,19 @@ from modp_ti.inputs.sources import Undistorter
 
 __all__ = ["read_ply_points", "visible_points"]
 
-# Visibility is judged in cells of this part of the image's longer side: in a cell, points up to this factor
-# behind the nearest one are seen, those farther away are taken as hidden by it.
+# Visibility is decided per square cell, whose size is this share of the image's longer side. In a cell, points up to
+# this factor of the nearest depth are visible; those farther away count as hidden.
 CELL = 1 / 60
 HIDDEN_BEHIND = 1.15
 
 
 def read_ply_points(path: Path) -> NDArray[np.float64]:
-    """Positions (N, 3) of the vertices of a PLY file, ASCII or binary, without those that are not finite.
+    """Read the vertex positions (N, 3) of an ASCII or binary PLY file.
 
-    Raises InputError for a file that is missing, damaged or without x, y and z.
+    Positions that are not finite or lie beyond `FARTHEST` are dropped.
+
+    Raises:
+        InputError: If the file is missing, damaged, or lacks x, y and z.
     """
     try:
         data = read_bytes(path)
@@ -49,7 +52,7 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
             order = {"binary_little_endian": "<", "binary_big_endian": ">"}[header.form]
             record = np.dtype([(name, order + kind) for name, kind in header.properties])
             vertices = np.frombuffer(data, dtype=record, count=header.count, offset=header.start)
-            with np.errstate(all="ignore"):  # a NaN that signals says so when it becomes a float64
+            with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
                 for column, axis in enumerate("xyz"):
                     xyz[:, column] = vertices[axis]
     except (ValueError, UnicodeDecodeError):
@@ -58,7 +61,7 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
 
 
 def _ascii_rows(data: bytes, header: PlyHeader) -> Iterator[str]:
-    """The lines of the vertices. Raises ValueError where there are fewer of them."""
+    """Yield the vertex lines. Raises ValueError if there are fewer than the header states."""
     with io.TextIOWrapper(io.BytesIO(data), encoding="ascii") as text:
         text.buffer.seek(header.start)
         rows = (line for line in limited_lines(text) if not line.isspace())
@@ -72,9 +75,15 @@ def _ascii_rows(data: bytes, header: PlyHeader) -> Iterator[str]:
 def visible_points(
     xyz: NDArray[np.float64], undistorter: Undistorter, T_camera_world: NDArray[np.float64]
 ) -> SparsePoints:
-    """The points (N, 3) of the world that project into the image and are not hidden behind nearer ones.
+    """Return the points that project into the image and are not hidden behind nearer ones.
 
-    Their pixels are their projections; their ids are their numbers in `xyz`.
+    Args:
+        xyz: World points (N, 3).
+        undistorter: Holds the camera of the delivered image.
+        T_camera_world: Pose (4, 4), world to camera.
+
+    Returns:
+        The visible points, with their projections as pixels and their row in `xyz` as id.
     """
     camera = undistorter.camera
     in_camera = xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]

@@ -1,4 +1,4 @@
-"""World points in a file of their own: PLY, or text with `x y z` a line."""
+"""World points from a separate file: PLY, or text with `x y z` per line."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ __all__ = ["read_point_file"]
 
 
 def read_point_file(path: Path) -> NDArray[np.float64]:
-    """Positions (N, 3) of a PLY file, or of text whose lines begin with `x y z`.
+    """Read positions (N, 3) from a PLY file, or from text whose lines begin with `x y z`.
 
-    Raises InputError, with the line where there is one, for a file that is neither or holds no point.
+    Raises:
+        InputError: If the file is neither or has no points. For text, the message names the line.
     """
     try:
         with open_file(path) as file:

@@ -1,4 +1,4 @@
-"""Tracker `replica`: traj.txt of the Replica sequences, one pose a line."""
+"""Tracker `replica`: traj.txt of the Replica sequences, one pose per line."""
 
 from __future__ import annotations
 
@@ -23,10 +23,18 @@ __all__ = ["open_replica"]
 
 
 def open_replica(source: SourceSettings, tracker: ReplicaSettings, progress: Progress | None = None) -> ReplayedTracker:
-    """The images with a line in traj.txt, which holds 4x4 matrices, camera to world, row by row.
+    """Open the images that have a line in traj.txt.
 
-    Image `frame000123` has the line 123, counted from 0. Raises InputError, with the line, for a file that is missing
-    or malformed, a matrix that is no rigid motion, and as `replay_poses` does.
+    Each line is a 4x4 matrix, camera to world, in row-major order. Image `frame000123` has line 123, counted from 0.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is traj.txt or its folder.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: If the file is missing or malformed, a matrix is not a rigid motion (the message names the line), or
+            as for `replay_poses`.
     """
     place = source.require_path()
     folders = (place, place.parent)

@@ -1,4 +1,4 @@
-"""Tracker `sevenscenes`: the pose files of Microsoft's 7-Scenes, one for each frame."""
+"""Tracker `sevenscenes`: the pose files of Microsoft's 7-Scenes, one per frame."""
 
 from __future__ import annotations
 
@@ -25,11 +25,17 @@ SUFFIX = ".pose.txt"
 def open_sevenscenes(
     source: SourceSettings, tracker: SevenScenesSettings, progress: Progress | None = None
 ) -> ReplayedTracker:
-    """The images `NAME.color.*` that have a `NAME.pose.txt` with a 4x4 matrix, camera to world.
+    """Open the images `NAME.color.*` that have a file `NAME.pose.txt` with a 4x4 matrix, camera to world.
 
-    The files lie beside the images, in `poses` beside their folder, or in the folder tracker.path. Raises InputError,
-    with the line, for a file that is malformed, a matrix that is no rigid motion, where there is no pose at all, and as
-    `replay_poses` does.
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is the folder of the pose files. By default they are searched for next
+            to the images, and in `poses` inside or next to `source.path`.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: If there is no pose, a file is malformed, a matrix is not a rigid motion (the message names the
+            line), or as for `replay_poses`.
     """
     place = source.require_path()
     images = open_source(source)
@@ -53,7 +59,7 @@ def open_sevenscenes(
 
 
 def _pose_folder(given: Path | None, source: Path, images: ImageSource, names: Sequence[str]) -> Path:
-    """The folder in which one of the images at least has its pose."""
+    """Return the first candidate folder with a pose file of at least one image."""
     if given is not None and not given.is_dir():
         raise InputError(f"{given}: no such folder (tracker.path); it should hold *{SUFFIX}")
     candidates = [images.path, source, source / "poses", source.parent / "poses"] if given is None else [given]
@@ -67,7 +73,7 @@ def _pose_folder(given: Path | None, source: Path, images: ImageSource, names: S
 
 
 def _pose_file(folder: Path, image: str) -> Path:
-    """`frame-000000.pose.txt` of `frame-000000.color.png`."""
+    """Return the pose file of an image: `frame-000000.pose.txt` for `frame-000000.color.png`."""
     path = PurePosixPath(image)
     stem = path.stem.removesuffix(".color")
     beside = folder / path.with_name(stem + SUFFIX)

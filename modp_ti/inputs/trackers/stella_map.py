@@ -1,4 +1,4 @@
-"""stella_vslam's map file in MessagePack: cameras, keyframes with what they observe, landmarks."""
+"""stella_vslam's map file in MessagePack: cameras, keyframes with their observations, and landmarks."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from modp_ti.inputs.trackers.trajectory import poses_of_quaternions
 
 __all__ = ["StellaKeyframe", "StellaMap", "read_stella_map"]
 
-# Bounds on what a file may ask for before its content is there: the reader sets an array's memory aside when it meets
-# its length, nested ones too.
-MAX_ARRAY = 50_000  # keypoints of a keyframe are the longest arrays
+# Bounds on lengths stated in the file. The reader allocates an array, including nested ones, when it reads the length,
+# before it has seen the content.
+MAX_ARRAY = 50_000  # the longest arrays are the keypoints of a keyframe
 MAX_TEXT = 4096
 MAX_ITEMS = 20_000_000  # keyframes or landmarks
 MAX_BUFFER = 1 << 26  # bytes of one value
@@ -35,10 +35,15 @@ WANTED = ("ts", "cam", "rot_cw", "trans_cw", "undist_keypts", "lm_ids")
 
 @dataclass(frozen=True)
 class StellaKeyframe:
-    """number: its id. time: seconds. T_camera_world: (4, 4).
+    """A keyframe of the map.
 
-    landmarks: (N,) int64 ids of what it observes. pixels: (N, 2), where, in the image without distortion, pixel centres
-    at +0.5.
+    Attributes:
+        number: Id of the keyframe.
+        time: Time [s].
+        camera: Name of the camera.
+        T_camera_world: Pose (4, 4), world to camera.
+        landmarks: Ids (N,) int64 of the observed landmarks.
+        pixels: Their pixels (N, 2) in the undistorted image, with pixel centres at +0.5.
     """
 
     number: int
@@ -51,7 +56,14 @@ class StellaKeyframe:
 
 @dataclass(frozen=True)
 class StellaMap:
-    """keyframes: in the order of time. landmarks: position (3,) of each id."""
+    """Contents of a map file.
+
+    Attributes:
+        path: The file.
+        cameras: Intrinsics by camera name.
+        keyframes: Keyframes, ordered by time.
+        landmarks: World position (3,) of each landmark by id.
+    """
 
     path: Path
     cameras: dict[str, Intrinsics]
@@ -60,13 +72,14 @@ class StellaMap:
 
 
 class _DamagedError(Exception):
-    """The file holds what no stella_vslam writes; the message says what."""
+    """The file contains something that stella_vslam never writes; the message says what."""
 
 
 def read_stella_map(path: Path) -> StellaMap:
-    """The map of a `.msg` file. Raises InputError for one that is missing, cut off, damaged, or without keyframes.
+    """Read the map from a `.msg` file. Descriptors and the graph between keyframes are skipped.
 
-    Descriptors and the graph between keyframes are skipped, not held.
+    Raises:
+        InputError: If the file is missing, truncated, damaged, or has no keyframes or landmarks.
     """
     try:
         with open_file(path) as file:
@@ -76,7 +89,7 @@ def read_stella_map(path: Path) -> StellaMap:
                     "configuration, and --map-db-out map.msg"
                 )
             file.seek(0)
-            _unpacker(file).skip()  # makes nothing: every length in the file is backed by as much content
+            _unpacker(file).skip()  # without allocating anything, checks that every stated length has its content
             file.seek(0)
             return _read(path, file)
     except FileNotFoundError:
@@ -143,7 +156,7 @@ def _read(path: Path, file: BinaryIO) -> StellaMap:
 
 
 def _keys(unpacker: msgpack.Unpacker, what: str) -> Iterator[str]:
-    """The keys of the map that comes next; whoever iterates takes each value out before asking for the next key."""
+    """Yield the keys of the next map. The caller must consume each value before it requests the next key."""
     try:
         count = unpacker.read_map_header()
     except (ValueError, msgpack.UnpackException) as error:
@@ -164,7 +177,7 @@ def _number(key: str, what: str) -> int:
 
 
 def _floats(value: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
-    """Finite numbers of this shape; -1 as its first is any."""
+    """Convert a value to finite numbers of this shape. The first dimension may be -1 for any length."""
     try:
         array = np.array(value, dtype=np.float64).reshape(shape)
     except (TypeError, ValueError, OverflowError):
@@ -189,7 +202,7 @@ def _camera(name: str, values: Any) -> Intrinsics:
         return float(value)
 
     try:
-        # stella_vslam counts pixel centres from 0, as OpenCV does.
+        # stella_vslam has pixel centres at whole numbers, as OpenCV does.
         camera = PinholeCamera(
             number("fx"),
             number("fy"),
@@ -240,7 +253,7 @@ def _keyframe(unpacker: msgpack.Unpacker, key: str) -> StellaKeyframe:
     seen = np.flatnonzero(numbers >= 0)
     places = [keypoints[i].get("pt") if isinstance(keypoints[i], Mapping) else None for i in seen]
     pixels = _floats(places, (len(seen), 2), f"{what}: the places of its keypoints") + 0.5
-    # One landmark at two keypoints: the first stands for it.
+    # If a landmark has two keypoints, the first one is used.
     landmarks, first = np.unique(numbers[seen], return_index=True)
     return StellaKeyframe(number, float(time), str(values["cam"]), T_camera_world, landmarks, pixels[first])
 

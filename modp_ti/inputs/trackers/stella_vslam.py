@@ -1,4 +1,4 @@
-"""Tracker `stella_vslam`: its map in MessagePack, and the trajectory of all frames beside it."""
+"""Tracker `stella_vslam`: its map in MessagePack, and the trajectory of all frames next to it."""
 
 from __future__ import annotations
 
@@ -21,19 +21,26 @@ from modp_ti.inputs.trackers.trajectory import Trajectory, read_trajectory_file,
 __all__ = ["open_stella_vslam"]
 
 TRAJECTORY = "frame_trajectory.txt"
-# A frame between keyframes is shown what this many of them on either side of it observe.
+# A frame between keyframes gets the landmarks observed by this many keyframes on either side.
 NEIGHBOURS = 2
-# A keyframe is the frame whose time differs by less than this [s]; both were written with 15 digits.
+# A frame is a keyframe if their times differ by at most this [s]. Both are written with 15 digits.
 SAME_TIME = 1e-4
 
 
 def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> ReplayedTracker:
-    """The images that stella_vslam has poses for, in the source's order, with the landmarks that each sees.
+    """Open the images that stella_vslam has poses for, in the source's order, with the landmarks of each.
 
-    A keyframe sees what it observed, where it observed it. A frame between keyframes sees the landmarks that two
-    keyframes before and two after it observe, where they project to: nothing in stella_vslam's files says more. Without
-    frame_trajectory.txt beside the map there are keyframes alone. Raises InputError for a map or trajectory that is
-    missing or malformed, and images that do not fit the map's camera or times.
+    A keyframe gets its observed landmarks at the observed pixels. A frame between keyframes gets the landmarks that the
+    two keyframes before it and the two after it observe, at their projections, because the files do not contain its
+    observations. Without frame_trajectory.txt next to the map, only keyframes are used.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is the map or its folder.
+
+    Raises:
+        InputError: If the map is missing, the map or the trajectory is malformed, or images do not match the camera or
+            the times.
     """
     place = source.require_path()
     file = found_file(tracker.path, [place.parent / "map.msg", place / "map.msg"], "a map of stella_vslam (map.msg)")
@@ -59,7 +66,7 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
         nearest = int(np.abs(keyframe_times - time).argmin())
         if abs(keyframe_times[nearest] - time) <= SAME_TIME:
             keyframe = world.keyframes[nearest]
-            # The map's own pose: of the same optimisation as its landmarks.
+            # The map's pose comes from the same optimisation as its landmarks.
             T = keyframe.T_camera_world
             points = _observed(keyframe, world, undistorter)
         else:
@@ -81,7 +88,7 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
 
 
 def _intrinsics(images: ImageSource, world: StellaMap, source: SourceSettings) -> tuple[Intrinsics, str]:
-    """The camera, and who says so: the user before the map before the source."""
+    """Return the camera and its origin: `source.intrinsics` if the user set it, otherwise the map."""
     if source.intrinsics.given and images.intrinsics is not None:
         return images.intrinsics, "source.intrinsics"
     cameras = {keyframe.camera for keyframe in world.keyframes}

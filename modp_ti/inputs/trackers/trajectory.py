@@ -1,4 +1,4 @@
-"""Poses with times, as trackers write them, and which image each of them belongs to."""
+"""Trajectories of timed poses, and their association with images."""
 
 from __future__ import annotations
 
@@ -27,17 +27,21 @@ __all__ = [
 ]
 
 TUM_COLUMNS = "time tx ty tz qx qy qz qw"
-# A quaternion further from unit length than this was not meant as a rotation; below it lies the rounding of text files.
+# Largest deviation of a quaternion's length from 1. Rounding in text files stays below it.
 MAX_LENGTH_ERROR = 1e-2
-# A time beyond this is no number of seconds (3 million years), but of nanoseconds.
+# Times from here on are nanoseconds: in seconds they would be 3 million years.
 NANOSECONDS_FROM = 1e14
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """times: (N,) seconds, rising. T_camera_world: (N, 4, 4). path: where they come from, for messages.
+    """Poses over time.
 
-    left_out: lines of the file that are no pose.
+    Attributes:
+        path: The file, for error messages.
+        times: Times (N,) [s], strictly increasing.
+        T_camera_world: Poses (N, 4, 4), world to camera.
+        left_out: Number of skipped lines.
     """
 
     path: Path
@@ -50,11 +54,14 @@ class Trajectory:
 
 
 def read_trajectory_file(path: Path) -> Trajectory:
-    """A trajectory in TUM's format: `time tx ty tz qx qy qz qw` a line, camera to world, in the order of time.
+    """Read a trajectory in TUM format: `time tx ty tz qx qy qz qw` per line, camera to world, ordered by time.
 
-    Times are seconds, or, in ORB-SLAM3's EuRoC flavour, nanoseconds: their size tells. A few lines may hold NaN, as
-    trackers write it where they are lost, or a time out of order: they are left out. Raises InputError with file and
-    line for a wrong number of columns, a quaternion that is not of unit length, and where more lines are like that.
+    Times are in seconds, or in nanoseconds in ORB-SLAM3's EuRoC variant; the magnitude decides. Lines with NaN, which
+    trackers write when they are lost, and lines with times out of order are skipped, up to a share `FEW` each.
+
+    Raises:
+        InputError: If a line has the wrong number of columns or a quaternion that is not of unit length, or if too many
+            lines are faulty. The message names file and line.
     """
     rows = read_number_rows(path, 8, TUM_COLUMNS, few=FEW)
     rising, left_out = _rising(rows.values[:, 0]), rows.left_out
@@ -68,8 +75,8 @@ def read_trajectory_file(path: Path) -> Trajectory:
 
 
 def _rising(times: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Places of the most times that rise from one to the next: those before and behind a leap of the clock."""
-    ends: list[float] = []  # the least end of a rising sequence of each length, and where it is
+    """Return the indices of the longest strictly increasing subsequence of the times."""
+    ends: list[float] = []  # smallest last value of an increasing subsequence of each length; `places` is its index
     places: list[int] = []
     before = np.full(len(times), -1)
     for i, time in enumerate(times.tolist()):
@@ -87,14 +94,20 @@ def _rising(times: NDArray[np.float64]) -> NDArray[np.int64]:
 def poses_of_quaternions(
     translation: NDArray[np.float64], quaternion: NDArray[np.float64], where: Callable[[int], str]
 ) -> NDArray[np.float64]:
-    """Poses (N, 4, 4) of translations (N, 3) and quaternions (N, 4) as (x, y, z, w).
+    """Convert translations and quaternions to poses (N, 4, 4).
 
-    where(row): file and line, for the InputError about a quaternion that is not of unit length.
+    Args:
+        translation: Translations (N, 3).
+        quaternion: Quaternions (N, 4) as (x, y, z, w).
+        where: Maps a row to file and line, for error messages.
+
+    Raises:
+        InputError: If a quaternion is not of unit length, or a position lies beyond `FARTHEST` or is NaN.
     """
     far = np.flatnonzero(~(np.abs(translation) <= FARTHEST).all(axis=1))
     if len(far):
         raise InputError(f"{where(int(far[0]))}: the position lies beyond {FARTHEST:g}; the file is damaged")
-    with np.errstate(over="ignore"):  # an infinite length is no unit length either
+    with np.errstate(over="ignore"):  # an infinite length is rejected below
         length = np.linalg.norm(quaternion, axis=1)
     wrong = np.flatnonzero(~(np.abs(length - 1.0) <= MAX_LENGTH_ERROR))
     if len(wrong):
@@ -115,7 +128,7 @@ def poses_of_quaternions(
 
 
 def inverse_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverses (N, 4, 4) of rigid motions (N, 4, 4)."""
+    """Invert rigid motions (N, 4, 4)."""
     inverse = np.tile(np.eye(4), (len(poses), 1, 1))
     inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
     inverse[:, :3, 3] = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
@@ -123,7 +136,7 @@ def inverse_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> None:
-    """Raises InputError for the first time that does not lie after the one before it."""
+    """Raise InputError if the times are not strictly increasing. The message names the first offending row."""
     back = np.flatnonzero(np.diff(times) <= 0)
     if len(back):
         row = int(back[0]) + 1
@@ -136,10 +149,23 @@ def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> N
 def rows_at_frames(
     images: ImageSource, names: Sequence[str], path: Path, times: NDArray[np.float64], tracker: TimedPosesSettings
 ) -> dict[str, int]:
-    """The pose of each image that has one within `tracker.max_difference` of its time, as its row.
+    """Associate images with poses by time.
 
-    times: (N,) [seconds] of the poses, before `tracker.time_offset`; path: where they come from, for messages.
-    An image and a pose are used once, the nearest pairs first. Raises InputError where no image has one.
+    An image and a pose may differ by at most `tracker.max_difference`. Each is used once; the pairs nearest in time are
+    matched first.
+
+    Args:
+        images: The image source.
+        names: Names of the images.
+        path: Origin of the poses, for error messages.
+        times: Times (N,) of the poses [s], before `tracker.time_offset` is added.
+        tracker: Settings of the tracker.
+
+    Returns:
+        The row of the pose of each matched image, by name.
+
+    Raises:
+        InputError: If no image has a pose.
     """
     of_frames = np.array([images.timestamp(name) for name in names])
     shifted = times + tracker.time_offset

@@ -31,7 +31,7 @@ from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
 
 __all__ = ["open_transforms"]
 
-# OpenGL camera axes (x right, y up, z back) in OpenCV ones; its own inverse.
+# From OpenGL camera axes (x right, y up, z back) to OpenCV axes. The matrix is its own inverse.
 OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -41,11 +41,19 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 def open_transforms(
     source: SourceSettings, tracker: TransformsSettings, progress: Progress | None = None
 ) -> ReplayedTracker:
-    """The frames of the file whose images are in the folder, in natural order of the images.
+    """Open the frames of the file whose images are in the folder, in natural order of the image names.
 
-    Points come from `ply_file_path` where the file names one, otherwise they are triangulated here with the
-    poses, before the first frame is delivered. Raises InputError for a file that is missing or malformed,
-    poses that are none, no image at all, and images that do not fit the intrinsics.
+    Points are read from `ply_file_path` if the file names one that exists. Otherwise they are triangulated with the
+    given poses before the first frame is delivered.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is transforms.json or its folder.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: If the file is missing or malformed, a pose is not a rigid motion, no image is found, or images do
+            not match the intrinsics.
     """
     place = source.require_path()
     images = open_source(source)
@@ -127,7 +135,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:
-    """T_camera_world in OpenCV axes."""
+    """Read T_camera_world (4, 4) with OpenCV axes."""
     what = f"{file}: frame {entry['file_path']}"
     try:
         matrix = np.array(entry.get("transform_matrix"), dtype=np.float64)
@@ -147,7 +155,7 @@ def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:
 def _intrinsics(
     values: Mapping[str, Any], images: ImageSource, name: str, file: Path
 ) -> tuple[PinholeCamera, Distortion]:
-    """Camera of the stored image; `values` are the file's keys with those of the frame over them."""
+    """Read the camera of the stored image. `values` are the file's keys, overridden by those of the frame."""
 
     def number(key: str) -> float | None:
         value = values.get(key)

@@ -1,4 +1,4 @@
-"""Tracker `tum`: any trajectory in TUM's format, which is what most SLAM systems write."""
+"""Tracker `tum`: trajectories in TUM format, which most SLAM systems write."""
 
 from __future__ import annotations
 
@@ -18,10 +18,16 @@ NAMES = ("groundtruth.txt", "trajectory.txt", "CameraTrajectory.txt", "KeyFrameT
 
 
 def open_tum(source: SourceSettings, tracker: TumSettings, progress: Progress | None = None) -> ReplayedTracker:
-    """The images that have a pose within `tracker.max_difference` of their time, in the source's order.
+    """Open the images that have a pose within `tracker.max_difference` of their time, in the source's order.
 
-    Raises InputError for a trajectory that is missing or malformed or of other times than the images, and as
-    `replay_poses` does.
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker. `path` is the trajectory or its folder.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: If the trajectory is missing or malformed, its times do not match the images, or as for
+            `replay_poses`.
     """
     place = source.require_path()
     folders = (place, place.parent)
@@ -34,8 +40,8 @@ def open_tum(source: SourceSettings, tracker: TumSettings, progress: Progress | 
 def replay_trajectory(
     file: Path, source: SourceSettings, tracker: TumSettings | OrbSlam3Settings, progress: Progress | None
 ) -> ReplayedTracker:
-    """The same for a given file."""
-    trajectory = read_trajectory_file(file)  # before the images are listed: a wrong file is named at once
+    """Open the images that have a pose in the given trajectory, as `open_tum` does."""
+    trajectory = read_trajectory_file(file)  # first, so that a wrong file is reported before images are listed
     images = open_source(source)
     selected = selected_frames(images, source)
     rows = rows_at_frames(images, selected, file, trajectory.times, tracker)
