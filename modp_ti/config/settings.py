@@ -58,6 +58,7 @@ class IntrinsicsSettings(StrictModel):
 
     @property
     def given(self) -> bool:
+        """Whether the scene has this section."""
         return self.fx is not None
 
     @model_validator(mode="after")

@@ -45,6 +45,7 @@ class PlyHeader:
 
     @property
     def names(self) -> list[str]:
+        """Names of the vertex properties."""
         return [name for name, _ in self.properties]
 
 

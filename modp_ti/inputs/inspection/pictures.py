@@ -12,8 +12,8 @@ from modp_ti.inputs.inspection.survey import FrameRecord
 
 __all__ = ["blurred", "centres", "duplicates", "judge_sequence", "time_gaps"]
 
-# A frame is blurred if its sharpness is below this factor of the median of the AROUND frames on each side. Keyframe
-# selection uses the same measure.
+# A frame is blurred if its sharpness is below this factor of the median of the AROUND frames on each side. The factor
+# is the default of keyframe selection.
 BLURRED = 0.75
 AROUND = 7
 # Mean difference of thumbnails [grey levels] below which two images are the same, encoded twice.

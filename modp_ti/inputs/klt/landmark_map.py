@@ -51,9 +51,11 @@ class Keyframe:
         return inverse_se3(self.T_camera_world)[:3, 3]
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Remove all observations except those of the mask (N,)."""
         self.ids, self.pixels, self.rays = self.ids[kept], self.pixels[kept], self.rays[kept]
 
     def append(self, ids: NDArray[np.int64], pixels: NDArray[np.float64], rays: NDArray[np.float64]) -> None:
+        """Add observations (M,) with their pixels (M, 2) and normalised coordinates (M, 2)."""
         self.ids = np.concatenate([self.ids, ids])
         self.pixels = np.concatenate([self.pixels, pixels])
         self.rays = np.concatenate([self.rays, rays])

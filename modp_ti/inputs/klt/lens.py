@@ -27,6 +27,7 @@ class Lens:
 
     @classmethod
     def pinhole(cls, camera: PinholeCamera) -> Lens:
+        """A camera without distortion."""
         from modp_ti.files.quiet_pycolmap import pycolmap
 
         parameters = [camera.fx, camera.fy, camera.cx, camera.cy]

@@ -12,7 +12,7 @@ from modp_ti.inputs.klt.lens import Lens
 
 __all__ = ["TwoViews", "two_views"]
 
-MAX_ERROR = 1.5  # px
+MAX_ERROR = 1.5  # px, RANSAC threshold
 FEWEST = 40  # points with parallax
 
 

@@ -33,6 +33,7 @@ class History:
         self._known: set[int] = set()
 
     def add(self, frame: Delivered, points: SparsePoints) -> None:
+        """Add a delivered frame with the points that it observes."""
         ids = points.ids.tolist()
         self._known.update(ids)
         for i in ids:  # a later frame's position of a point is newer than an earlier correction

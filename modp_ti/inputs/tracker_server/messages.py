@@ -110,6 +110,7 @@ class Encoding(IntEnum):
 
     @property
     def suffix(self) -> str:
+        """Suffix of stored images."""
         return {Encoding.JPEG: ".jpg", Encoding.PNG: ".png"}.get(self, f".{self.name.lower()}")
 
 
