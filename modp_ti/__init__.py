@@ -1,11 +1,25 @@
-"""MODP-Ti: a photorealistic 3D Gaussian map from one RGB camera, built while the frames arrive.
+"""MODP-Ti: online monocular 3D Gaussian mapping in Taichi.
+
+Map the scene that a `scene.yaml` describes:
 
     import modp_ti
-    config = modp_ti.load_scene("scene.yaml")
+
+    config = modp_ti.load_scene("scene.yaml", overrides=["source.scale=0.5"])
     modp_ti.run_scene(config)
 
-or, with frames of your own, `modp_ti.Mapper(width, height).add(modp_ti.TrackedFrame.from_arrays(...))`. The renderer
-alone is `modp_ti.rasterize`, the voxels alone `modp_ti.OccupancyVoxels`; docs/api.md has examples of all.
+Map frames from your own loop:
+
+    modp_ti.initialise("cpu")
+    mapper = modp_ti.Mapper(width=640, height=480)
+    mapper.add(modp_ti.TrackedFrame.from_arrays(index, image, T_camera_world, intrinsics, xyz, pixels))
+    mapper.save("out/room")
+
+Use one part alone:
+
+    picture = modp_ti.rasterize(**gaussians, T_camera_world=T_camera_world, camera=camera)  # a PyTorch function
+    kept = points[modp_ti.OccupancyVoxels(coarsest=1.0, levels=8).admit(points, 0.25)]  # multi-resolution occupancy
+
+`docs/api.md` has complete examples. Names are imported on first access, so `import modp_ti` does not load Taichi.
 """
 
 from __future__ import annotations
@@ -13,7 +27,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-# For type checkers and editors alone: at run time `__getattr__` does it.
+# Only for type checkers and editors. At run time `__getattr__` imports these names on first access.
 if TYPE_CHECKING:
     from fields.frames.pose_correction import PoseCorrection
     from fields.frames.tracked_frame import SparsePoints, TrackedFrame
@@ -90,11 +104,11 @@ __all__ = [
 ]
 
 
-# Hidden from type checkers, for whom it would make every name one of this module.
+# Hidden from type checkers, which would otherwise accept any attribute name of this module.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> object:
-        # Loaded when first asked for: the command's help must not wait for compilers and readers.
+        # Lazy, so that `modp-ti --help` does not wait for Taichi and the file readers to load.
         if name not in _HOMES:
             raise AttributeError(f"module 'modp_ti' has no attribute {name!r}")
         return getattr(importlib.import_module(_HOMES[name]), name)

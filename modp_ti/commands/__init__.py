@@ -1,1 +1,1 @@
-"""The commands of `modp-ti`, one file each: arguments in, exit codes out."""
+"""The commands of `modp-ti`, one file per command: arguments, output and exit codes."""

@@ -1,4 +1,4 @@
-"""The command `modp-ti`: one subcommand a job."""
+"""The command `modp-ti` with its subcommands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`modp-ti check scene.yaml`: reads everything, maps nothing, says what is wrong and how to mend it."""
+"""`modp-ti check scene.yaml`: reads the whole input without mapping it, and reports problems and corrections."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def check(
 ) -> None:
     """Look a scene's input over without mapping it. Exit code: 0 fine, 1 with warnings, 2 unusable."""
     with outcome(as_json) as result:
-        # Imported here: asking for help must not wait for the readers.
+        # Imported here, so that `--help` does not wait for the readers to load.
         from rich.console import Console
 
         from modp_ti.config.scene_file import load_scene
@@ -53,9 +53,14 @@ def check(
 
 
 def inspect_scene(config: SceneConfig, console: Console) -> Report:
-    """Iterate over the scene's tracker once and judge what it delivers. Progress is shown on `console`.
+    """Iterate over a scene's tracker once and judge its frames.
 
-    Raises InputError for input that cannot be read at all.
+    Args:
+        config: The scene.
+        console: Where progress is shown.
+
+    Raises:
+        InputError: If the input cannot be read at all.
     """
     from fields.runtime.backend import initialise
     from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
@@ -94,7 +99,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
 
 
 def _lens(tracker: Tracker) -> str:
-    """The distortion that the tracker's images are freed from; empty where it does not say."""
+    """Describe the lens distortion that the tracker removes; empty if the tracker does not tell."""
     undistorter = tracker.undistorter
     if undistorter is None:
         return ""

@@ -1,4 +1,4 @@
-"""What the shell is offered where it cannot know the values itself."""
+"""Shell completion of values that depend on the settings."""
 
 from __future__ import annotations
 
@@ -8,9 +8,16 @@ __all__ = ["matching_settings"]
 
 
 def matching_settings(incomplete: str) -> list[tuple[str, str]]:
-    """`key=default` of all settings that begin so, with their meanings; of those without a plain default `key=`.
+    """Complete `--set KEY=VALUE`.
 
-    A key that several kinds of a section have is offered once; the key that tells the kind, with each of them.
+    Settings with a plain default are offered as `key=default`, others as `key=`. A key that several kinds of a section
+    have is offered once. A key that selects the kind is offered with each kind.
+
+    Args:
+        incomplete: The text before the cursor.
+
+    Returns:
+        Completions with the meanings of their keys.
     """
     from modp_ti.config.keys import documented_keys
     from modp_ti.config.settings import SceneConfig

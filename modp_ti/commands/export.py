@@ -1,4 +1,4 @@
-"""`modp-ti export OUT --format ...`: a finished map for other programs."""
+"""`modp-ti export OUT --format ...`: exports a finished map for other programs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EXAMPLES = examples(
 
 
 class Format(str, Enum):
-    """What a map is exported as."""
+    """Export formats."""
 
     points = "points"
     mesh = "mesh"
@@ -58,7 +58,7 @@ def export(
 ) -> None:
     """Write a finished map as points, mesh, compressed splats, data set or video."""
     with outcome(as_json) as result:
-        # Imported here: asking for help must not wait for the compiler and the readers.
+        # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.outputs.playback.export_map import ExportOptions, export_map
         from modp_ti.outputs.playback.finished_run import open_run
         from modp_ti.outputs.progress import ProgressLine

@@ -1,4 +1,4 @@
-"""`modp-ti render OUT`: pictures, depth or a video of a finished map."""
+"""`modp-ti render OUT`: renders images, depth or a video of a finished map."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ EXAMPLES = examples(
     "modp-ti render out/room --path mine.txt -o pictures/   (poses of your own)",
 )
 
-# As modp_ti.outputs.playback.flight has them, which needs the compiler.
+# The same names as in modp_ti.outputs.playback.flight, whose import would load Taichi.
 PATH_NAMES = ("recorded", "smoothed", "orbit")
 
 
 class Shown(str, Enum):
-    """What a picture shows."""
+    """Content of the rendered images."""
 
     colour = "colour"
     depth = "depth"
@@ -73,7 +73,7 @@ def render(
 ) -> None:
     """Render a finished map along the recorded path, a smoothed one, an orbit, or any path of your own."""
     with outcome(as_json) as result:
-        # Imported here: asking for help must not wait for the compiler and the readers.
+        # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.outputs.playback.finished_run import open_run
         from modp_ti.outputs.playback.flight import film, plan_flight
         from modp_ti.outputs.progress import ProgressLine

@@ -1,4 +1,4 @@
-"""The main job: `modp-ti run scene.yaml [--set key=value ...]`, the same as `python -m modp_ti.run`."""
+"""`modp-ti run scene.yaml [--set key=value ...]`: maps a scene, as `python -m modp_ti.run` does."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run(
 
 
 def _run(scene: Path | None, resume: Path | None, overrides: list[str], quiet: bool) -> Path:
-    # Imported here: asking for help must not wait for the compiler and the readers.
+    # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.config.scene_file import load_scene
 
     snapshot = None

@@ -1,4 +1,4 @@
-"""What the commands of `modp-ti` share: what they print where, how they end, and values that they take."""
+"""Shared parts of the commands: common options, output, error handling and exit codes."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ __all__ = [
     "standalone",
 ]
 
-# Exit codes; docs/commands.md has them all. 1 is `check`'s own: the input is usable, with warnings.
+# Exit codes; docs/commands.md lists all of them. 1 is used only by `check`: the input is usable, with warnings.
 BAD_INPUT, FAULT, INTERRUPTED = 2, 3, 130
 
-# Characters of a message, which may name what stands in a damaged file.
+# Longest error message in characters, since messages may quote the content of a damaged file.
 MAX_MESSAGE = 1000
 
 
 class Device(str, Enum):
-    """Where it is computed."""
+    """The device to compute on."""
 
     auto = "auto"
     cpu = "cpu"
@@ -70,7 +70,13 @@ Overrides = Annotated[
 
 @dataclass
 class Outcome:
-    """What a command has to say at its end: a text for a person, data for a program, and the exit code."""
+    """The result of a command.
+
+    Attributes:
+        code: The exit code.
+        text: Printed at the end.
+        data: Printed instead as JSON with `--json`.
+    """
 
     code: int = 0
     text: str = ""
@@ -79,10 +85,16 @@ class Outcome:
 
 @contextmanager
 def outcome(as_json: bool) -> Iterator[Outcome]:
-    """Prints the outcome that the block fills in, and ends the command as docs/commands.md says where it fails.
+    """Run a command's body, print its outcome, and exit with the codes of docs/commands.md.
 
-    What is wrong with the user's input is said in one line. as_json: the outcome is one JSON object; whatever else
-    would be printed to standard output goes to standard error.
+    An InputError is printed in one line, any other exception with its traceback.
+
+    Args:
+        as_json: Print the outcome as one JSON object. Everything else that is printed to standard output goes to
+            standard error.
+
+    Yields:
+        The outcome, which the body fills in.
     """
     result = Outcome()
     try:
@@ -105,8 +117,8 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
 
 @contextmanager
 def _to_standard_error() -> Iterator[None]:
-    """Send what is printed to standard output there, by libraries that are not Python's too."""
-    if sys.stdout is not sys.__stdout__:  # a caller in this process takes what is printed
+    """Redirect standard output to standard error, including that of native libraries."""
+    if sys.stdout is not sys.__stdout__:  # a caller in this process captures the output
         with redirect_stdout(sys.stderr):
             yield
         return
@@ -122,7 +134,7 @@ def _to_standard_error() -> Iterator[None]:
 
 
 def one_line(error: object) -> str:
-    """An error as one line of a terminal: of limited length, without what a terminal would take for a command."""
+    """Format an error as one line of limited length without control characters."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(str(error).split()))
     return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE // 2]} ... {text[-MAX_MESSAGE // 2 :]}"
 
@@ -135,26 +147,26 @@ def _end(code: int, message: str, as_json: bool) -> None:
 
 
 def progress_console(quiet: bool) -> Console:
-    """Where progress and notes are shown: standard error, or nowhere."""
+    """A console for progress and notes, on standard error; it prints nothing if `quiet`."""
     from rich.console import Console
 
     return Console(stderr=True, quiet=quiet)
 
 
 def examples(*lines: str) -> str:
-    """Example calls, each of which may be followed by its meaning, as the end of a help text."""
+    """Format example calls, each optionally followed by its meaning, as the epilog of a help text."""
     return "\n".join(["Examples:", *(f"  {line}" for line in lines)])
 
 
 def standalone(command: object, epilog: str) -> None:
-    """Run one command as a program of its own, as `python -m modp_ti.run` does."""
+    """Run one command as a separate program, as `python -m modp_ti.run` does."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command(epilog=epilog)(command)
     app()
 
 
 def picture_size(text: str) -> tuple[int, int]:
-    """(width, height) of `WIDTHxHEIGHT`. Raises InputError for anything else."""
+    """Parse `WIDTHxHEIGHT` as (width, height). Raises InputError for any other text."""
     found = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
     if found is None:
         raise InputError(f"--size {text}: write it as WIDTHxHEIGHT, for example 640x480")

@@ -1,4 +1,4 @@
-"""`modp-ti view OUT`: a finished map in the browser."""
+"""`modp-ti view OUT`: shows a finished map in the browser."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def view(
 ) -> None:
     """Show a finished map as a web page, until Ctrl-C."""
     with outcome(as_json=False):
-        # Imported here: asking for help must not wait for the compiler and the readers.
+        # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.config.settings import ViewSettings
         from modp_ti.outputs.playback.finished_run import open_run
         from modp_ti.outputs.progress import ProgressLine

@@ -1,4 +1,4 @@
-"""Compiling ahead of time: `modp-ti warmup` fills Taichi's offline cache."""
+"""`modp-ti warmup`: compiles kernels ahead of time into Taichi's offline cache."""
 
 from __future__ import annotations
 
@@ -50,19 +50,19 @@ def warmup(
 
 
 def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: bool) -> list[dict[str, Any]]:
-    """What was compiled: width, height, backend and seconds of each."""
+    """Compile for each size. Returns width, height, backend and seconds of each."""
     if scene is None and overrides:
         raise InputError("--set changes keys of a scene file: name one")
     if scene is None and not sizes:
         raise InputError("nothing to compile for: name a scene file, or give --size 640x480")
     wanted = [picture_size(text) for text in sizes] or [None]
-    # Imported here: asking for help must not wait for the compiler and the readers.
+    # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.config.scene_file import load_scene
     from modp_ti.config.settings import SceneConfig
     from modp_ti.config.tracker_settings import SyntheticSettings
 
     if scene is None:
-        # Any scene of default settings; nothing of it is opened.
+        # A placeholder with default settings; neither its tracker nor its output folder is opened.
         config = SceneConfig(tracker=SyntheticSettings(), output=Path())
     else:
         config = load_scene(scene, overrides)
@@ -79,11 +79,20 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: b
 
 
 def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str, int, int]:
-    """Start Taichi and compile what a run of the scene does; return the backend, width and height.
+    """Start Taichi and compile the kernels of a run.
 
-    size: (width, height) of the frames; None takes it from the tracker's first frame. Taichi finds a kernel in its
-    cache only where the same fields were made before it, so all is made in the order of a run. Raises InputError as a
-    run does.
+    Taichi finds a kernel in its cache only if the same fields were created before it, so everything is created in the
+    order of a run.
+
+    Args:
+        config: The scene.
+        size: (width, height) of the frames; None takes them from the tracker's first frame.
+
+    Returns:
+        The backend, the width and the height.
+
+    Raises:
+        InputError: If the device or the input cannot be used, or a live tracker is given without a size.
     """
     from fields.geometry.camera import PinholeCamera
     from fields.runtime.backend import initialise

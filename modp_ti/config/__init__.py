@@ -1,1 +1,1 @@
-"""The configuration: its settings as models, `scene.yaml` read and written, and the documentation of its keys."""
+"""Configuration: the settings as pydantic models, reading and writing of `scene.yaml`, documentation of its keys."""

@@ -1,4 +1,4 @@
-"""`python -m modp_ti.config`: the documentation of every key as Markdown."""
+"""`python -m modp_ti.config` prints the documentation of every key as Markdown."""
 
 from modp_ti.config.keys import markdown_of_keys
 from modp_ti.config.settings import SceneConfig

@@ -1,4 +1,4 @@
-"""The keys of a configuration model: what each is called, takes and means, and the page that tells it."""
+"""Documentation of a configuration model: name, type, default and meaning of each key, and the page of all keys."""
 
 from __future__ import annotations
 
@@ -25,16 +25,22 @@ __all__ = [
 
 
 def as_yaml(value: Any) -> str:
-    """A value as YAML text on one line."""
+    """Format a value as one line of YAML."""
     return json.dumps(value, ensure_ascii=False, default=str)
 
 
 @dataclass(frozen=True)
 class KeyDoc:
-    """One setting: dotted key, type, default as YAML text (None where the key is required), meaning.
+    """Documentation of one setting.
 
-    variant: the kind of its section, where that has keys of its own for each kind; otherwise empty. selects: whether it
-    is the key that says which kind that is.
+    Attributes:
+        key: The dotted key.
+        type: Its type in words.
+        default: Its default as YAML text; None for a required key.
+        description: Its meaning.
+        variant: The kind of its section, for example of the tracker, if the keys of the section depend on the kind;
+            otherwise empty.
+        selects: Whether this key selects the kind of its section.
     """
 
     key: str
@@ -46,11 +52,13 @@ class KeyDoc:
 
 
 def documented_keys(model: type[BaseModel], prefix: str = "") -> Iterator[KeyDoc]:
-    """Every setting of a model in its order, of a section with several kinds those of one kind after the other.
+    """Iterate over the settings of a model in the order of their definition.
+
+    A section with several kinds lists the keys of one kind after the other.
 
     Args:
-        model: The settings.
-        prefix: Of the dotted keys.
+        model: The settings model.
+        prefix: Prefix of the dotted keys.
     """
     return _keys(model, prefix, "", "")
 
@@ -68,7 +76,7 @@ def _keys(model: type[BaseModel], prefix: str, variant: str, tells_kind: str) ->
 
 
 def documented_values(settings: BaseModel) -> Iterator[tuple[KeyDoc, Any]]:
-    """Every setting of these settings with its value, in their order."""
+    """Iterate over the documentation and value of each setting, in the order of their definition."""
     return _values(settings, "", "", "")
 
 
@@ -92,7 +100,7 @@ def _documented(key: str, info: FieldInfo, variant: str, selects: bool) -> KeyDo
 
 
 def variants_of(info: FieldInfo) -> dict[str, type[BaseModel]]:
-    """The models of a discriminated union by the values of the key that tells them apart; empty for other fields."""
+    """The models of a discriminated union by the values of its discriminator; empty for other fields."""
     if not isinstance(info.discriminator, str):
         return {}
     return {
@@ -103,7 +111,7 @@ def variants_of(info: FieldInfo) -> dict[str, type[BaseModel]]:
 
 
 def sections_of(annotation: Any) -> list[type[BaseModel]]:
-    """The models that a field can hold: one for `Section` and `Section | None`, none for a plain value."""
+    """The models that a field accepts: one for `Section` and `Section | None`, none for a plain value."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     arguments = get_args(annotation)
@@ -134,7 +142,7 @@ def _type_name(annotation: Any) -> str:
 
 
 def markdown_of_keys(model: type[BaseModel]) -> str:
-    """The reference of all keys as Markdown tables, one a section, and in a section of several kinds one a kind."""
+    """Format the reference of all keys as Markdown, with one table per section, or per kind of a section."""
     sections: dict[str, dict[str, list[KeyDoc]]] = {}
     for entry in documented_keys(model):
         sections.setdefault(entry.key.rpartition(".")[0], {}).setdefault(entry.variant, []).append(entry)

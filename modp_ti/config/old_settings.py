@@ -1,9 +1,9 @@
-"""What older versions wrote into settings and this one does not have, so that their files go on running.
+"""Compatibility with the settings files of older versions.
 
 Until 0.1.0 the `tracker` section had one flat list of keys for all kinds, and a run's `config.yaml` and its snapshots
-held every one of them with its default. Now each kind has its own keys. A key of another kind is therefore dropped
-where its value is empty or what its default was: it never had an effect. With any other value it is an unknown key,
-as the user believes that it does something.
+contained all of them with their defaults. Now each kind has its own keys. A key of another kind is therefore dropped
+if its value is empty or the old default, since it never had an effect. With any other value it is reported as an
+unknown key, since the user expects it to have an effect.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from modp_ti.config.settings import SceneConfig
 
 __all__ = ["without_leftovers"]
 
-# The keys of the flat section beside `kind`, with their defaults.
+# The keys of the old flat section except `kind`, with their defaults.
 FLAT_TRACKER: Mapping[str, Any] = {
     "path": None,
     "points": None,
@@ -36,9 +36,15 @@ FLAT_TRACKER: Mapping[str, Any] = {
 
 
 def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a scene as plain data, without the keys of other kinds of tracker that say nothing.
+    """Drop tracker keys of other kinds that are empty or have their old default.
 
-    Where the kind is missing or unknown, all keys stay.
+    If the tracker's kind is missing or unknown, all keys are kept.
+
+    Args:
+        settings: The settings of a scene as plain data.
+
+    Returns:
+        A copy of the settings without these keys.
     """
     tracker = settings.get("tracker")
     if not isinstance(tracker, Mapping):

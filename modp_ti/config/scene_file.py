@@ -1,4 +1,4 @@
-"""`scene.yaml`: the settings of a scene read from YAML with overrides, and written resolved."""
+"""Reading of `scene.yaml` with overrides, and writing of the resolved settings."""
 
 from __future__ import annotations
 
@@ -31,10 +31,23 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneConfig:
-    """Reads a scene file; `overrides` are "section.key=value" with the value in YAML, applied in their order.
+    """Read a scene file.
 
-    Relative paths, those of overrides included, are relative to the scene file's folder; the result holds
-    absolute paths. Raises InputError (one line) for an unreadable file, an unknown key or a wrong value.
+    Args:
+        path: The scene file (YAML).
+        overrides: Settings as "section.key=value" with the value in YAML, applied in order after the file.
+
+    Returns:
+        The settings, with absolute paths. Relative paths, including those of overrides, are resolved against the
+        scene file's folder.
+
+    Raises:
+        InputError: With a one-line message, if the file is unreadable, a key is unknown, or a value is invalid.
+
+    Examples:
+        Halve the image size of a scene and change its output folder:
+
+            config = modp_ti.load_scene("scene.yaml", ["source.scale=0.5", "output=out/half"])
     """
     file = Path(path)
     try:
@@ -58,16 +71,24 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
 
 
 def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = ()) -> SceneConfig:
-    """The settings that a run has kept as plain data, `name` being the file; overrides as of `load_scene`.
+    """Build the settings from the plain data that a run has stored.
 
-    Raises InputError for settings that this version does not have, and as `load_scene` does.
+    Relative paths are resolved against the working directory.
+
+    Args:
+        data: The settings as plain data.
+        name: The file that they come from, for error messages.
+        overrides: As for `load_scene`.
+
+    Raises:
+        InputError: As for `load_scene`, and if this version does not have one of the settings.
     """
     data = json.loads(json.dumps(data))
     return _with_absolute_paths(_resolved(data, {}, name, overrides), Path.cwd())
 
 
 def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
-    """Writes every setting with absolute paths, so that the file gives the same run from wherever it lies."""
+    """Write every setting with absolute paths, so that the file gives the same run from any folder."""
     resolved = _with_absolute_paths(config, Path.cwd())
     text = "# Every setting of this run: `modp-ti run` on this file gives the same map.\n"
     text += yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
@@ -85,25 +106,25 @@ def _with_absolute_paths(model: M, base: Path) -> M:
 
 
 def _absolute_path(value: Path, base: Path, name: str) -> Path:
-    """Raises InputError for what no file can be called."""
+    """Resolve a path against `base`. Raises InputError for one that no file can have."""
     longest = max(len(os.fsencode(part)) for part in (*value.parts, ""))
     if "\0" in str(value) or longest > MAX_NAME or len(os.fsencode(value)) > MAX_PATH:
         shown = f"{value}".replace("\0", "")[:40]
         raise InputError(f"{name}: {shown}...: no file can be called that: it is too long, or holds a NUL character")
     try:
         return (base / value.expanduser()).resolve()
-    except (RuntimeError, OSError) as error:  # no such user, or links that lead in a circle
+    except (RuntimeError, OSError) as error:  # no such user (`~name`), or a loop of symbolic links
         raise InputError(f"{name}: {value}: is no path: {error}") from None
 
 
 def _resolved(data: dict[str, Any], where: dict[str, str], name: str, overrides: Iterable[str]) -> SceneConfig:
-    """The model of the raw data, which the overrides change.
+    """Apply overrides to the raw data and validate it.
 
-    where: file and line that wrote a dotted key; overrides take the place of what they change.
+    `where` maps each dotted key to the file and line, or the override, that set it. Overrides update it.
     """
     for override in overrides:
         _apply_override(data, override, where)
-    # Only now: an override may say another `tracker.kind`, on which the keys of its section depend.
+    # After the overrides, since one may change `tracker.kind`, on which the keys of the section depend.
     data = without_leftovers(data)
     refuse_unknown_keys(data, SceneConfig, where, name)
     return _validated(data, where, name)
@@ -111,15 +132,14 @@ def _resolved(data: dict[str, Any], where: dict[str, str], name: str, overrides:
 
 def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
     try:
-        # Strict JSON keeps `scale: "0.5"` and `holdout: true` from passing as numbers, and still takes text
-        # as path.
+        # Strict JSON mode rejects `scale: "0.5"` and `holdout: true` as numbers, but still accepts text as a path.
         return SceneConfig.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         problems = error.errors()
         first = problems[0]
         place = _place(first["loc"])
         text = first["msg"].removeprefix("Value error, ")
-        if first["type"].startswith("union_tag"):  # a kind that is missing, or that there is not
+        if first["type"].startswith("union_tag"):  # the section's kind is missing or unknown
             place += "." + first.get("ctx", {})["discriminator"].strip("'")
             text = _no_such_kind(place, first)
         elif first["type"] == "missing":
@@ -131,7 +151,7 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
 
 
 def _place(location: tuple[int | str, ...]) -> str:
-    """The dotted key that an error of pydantic is about, which names the kind of a section as well."""
+    """The dotted key of a pydantic error, whose location also contains the kind of a section."""
     parts: list[str] = []
     fields: Mapping[str, FieldInfo] = SceneConfig.model_fields
     remaining = iter(location)
@@ -148,7 +168,7 @@ def _place(location: tuple[int | str, ...]) -> str:
 
 
 def _no_such_kind(key: str, error: ErrorDetails) -> str:
-    """What is wrong with the key that tells which keys its section has. error: pydantic's, of that section."""
+    """The message for a section whose discriminator `key` is missing or unknown, from pydantic's error."""
     if error["type"] == "union_tag_not_found":
         return f"{key} is missing: {_description(key)}"
     given = error["input"][key.rpartition(".")[2]]
@@ -159,9 +179,9 @@ def _no_such_kind(key: str, error: ErrorDetails) -> str:
     return f"{key}: must be {names} or '{kinds[-1]}', not {as_yaml(given)}{hint}"
 
 
-# Of a scene file: characters, values and marks between them, sections in sections; digits of a whole number.
+# Limits of a scene file: characters, YAML events, nesting depth, and characters of an integer.
 MAX_TEXT, MAX_EVENTS, MAX_DEPTH, MAX_DIGITS = 1 << 18, 20_000, 16, 19
-# Bytes that file systems take: of a name, of a path.
+# Limits of common file systems: bytes of a name and of a path.
 MAX_NAME, MAX_PATH = 255, 4095
 
 _INT = re.compile(r"[-+]?[0-9]+")
@@ -169,9 +189,9 @@ _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def _parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
-    """Plain data of a YAML text under the YAML 1.2 rules: `1e-3` is a number, `no` is text, keys are unique.
+    """Parse YAML 1.2 into plain data: `1e-3` is a number, `no` is text, and duplicate keys are errors.
 
-    lines: filled with the line (from 1) of every dotted key.
+    `lines` is filled with the line (from 1) of every dotted key.
     """
     try:
         _require_flat(text, name)
@@ -186,9 +206,9 @@ def _parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
 
 
 def _require_flat(text: str, name: str) -> None:
-    """Raises InputError for YAML whose tree is deeper or larger than a scene's, before it is built.
+    """Raise InputError for YAML that is too deep or too large, before its tree is built.
 
-    Aliases, of which a few lines can make any number of values, are refused.
+    Aliases are refused, because a few lines of them can expand to any number of values.
     """
     depth = count = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
@@ -240,7 +260,7 @@ def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any
 
 
 def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
-    """Puts one "section.key=value" into the raw data."""
+    """Write one "section.key=value" into the raw data."""
     origin = f"--set {override}"
     key, equals, text = override.partition("=")
     key = key.strip()
@@ -266,7 +286,7 @@ def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) 
 
 
 def _description(key: str) -> str:
-    """What a key means; for a section, the keys that it needs."""
+    """The meaning of a key; for a section, its required keys."""
     keys = list(documented_keys(SceneConfig))
     found = [entry for entry in keys if entry.key == key]
     if found and found[0].selects:

@@ -1,6 +1,7 @@
-"""The settings of a scene: one strict model, of which `modp_ti.config.scene_file` reads and writes the files.
+"""The settings of a scene as one strict model, `SceneConfig`.
 
-The `tracker` section is in `modp_ti.config.tracker_settings`, what happens to the map in `pipelines.settings`.
+`modp_ti.config.scene_file` reads and writes its files. The `tracker` section is defined in
+`modp_ti.config.tracker_settings`; `mapping`, `refine` and `offline` are defined in `pipelines.settings`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ NO_PATH = "source.path is missing: give the folder that holds the images"
 
 
 class IntrinsicsSettings(StrictModel):
-    """The camera's calibration, for the stored size of the images."""
+    """The camera's intrinsics and lens distortion, in pixels of the images as stored."""
 
     fx: float | None = Field(
         default=None,
@@ -57,6 +58,7 @@ class IntrinsicsSettings(StrictModel):
 
     @property
     def given(self) -> bool:
+        """Whether the scene has this section."""
         return self.fx is not None
 
     @model_validator(mode="after")
@@ -73,7 +75,7 @@ class IntrinsicsSettings(StrictModel):
 
 
 class VrsSettings(StrictModel):
-    """The pinhole camera that Aria's fisheye images are undistorted to."""
+    """The pinhole camera to which Aria's fisheye images are undistorted."""
 
     width: int = Field(default=800, ge=8, description="width of the undistorted image (Aria VRS only)")
     height: int = Field(default=800, ge=8, description="height of the undistorted image (Aria VRS only)")
@@ -81,7 +83,7 @@ class VrsSettings(StrictModel):
 
 
 class SourceSettings(StrictModel):
-    """Where the frames are."""
+    """The source of the images, and how they are selected, scaled and masked."""
 
     kind: Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] = Field(
         default="auto",
@@ -137,10 +139,10 @@ class SourceSettings(StrictModel):
     )
 
     def require_path(self) -> Path:
-        """`path`, for those who cannot do without it.
+        """Return `path`.
 
         Raises:
-            InputError: Where it is not given.
+            InputError: If `path` is empty.
         """
         if self.path is None:
             raise InputError(NO_PATH)
@@ -171,7 +173,7 @@ class SourceSettings(StrictModel):
 
 
 class EvaluationSettings(StrictModel):
-    """How the finished map is scored."""
+    """The evaluation of the finished map."""
 
     lpips_weights: Path | None = Field(
         default=None,
@@ -181,7 +183,7 @@ class EvaluationSettings(StrictModel):
 
 
 class ExportSettings(StrictModel):
-    """What a run writes beside its map."""
+    """Optional output files of a run."""
 
     images: bool = Field(
         default=False,
@@ -230,7 +232,16 @@ class ViewSettings(StrictModel):
 
 
 class SceneConfig(StrictModel):
-    """Everything that a run depends on."""
+    """All settings of a run; `load_scene` reads them from a `scene.yaml`.
+
+    Examples:
+        Build the settings in Python and map a COLMAP model:
+
+            config = modp_ti.SceneConfig(
+                source={"path": "room/images"}, tracker={"kind": "colmap"}, output="out/room", device="cpu"
+            )
+            modp_ti.run_scene(config)
+    """
 
     source: SourceSettings = SourceSettings()
     tracker: AnyTrackerSettings
@@ -257,12 +268,12 @@ class SceneConfig(StrictModel):
 
     @property
     def is_live(self) -> bool:
-        """Whether the frames are gone when the run is, so that nothing can read them again."""
+        """Whether the frames come from a live source and cannot be read again after the run."""
         return self.source.stream is not None or self.tracker.is_live
 
     @property
     def can_be_resumed(self) -> bool:
-        """Whether a snapshot is of use: it does not hold the frames, which are read again."""
+        """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
         return self.mode == "online" and not self.is_live
 
     @model_validator(mode="after")

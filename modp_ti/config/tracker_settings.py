@@ -1,6 +1,6 @@
-"""The `tracker` section of a scene: one model for each `tracker.kind`, with the keys of that kind alone.
+"""The `tracker` section of a scene: one model per `tracker.kind`, with only the keys of that kind.
 
-To add a kind, write its model here, put it into `AnyTrackerSettings`, and register its opener in
+To add a kind, write its model here, add it to `AnyTrackerSettings`, and register its opener in
 `modp_ti.inputs.trackers.openers`.
 """
 
@@ -35,32 +35,32 @@ __all__ = [
 
 
 class TrackerSettings(StrictModel):
-    """Base of every tracker's settings: what the rest of a scene must know of its kind."""
+    """Base class of all tracker settings, with the properties of a kind that other sections depend on."""
 
-    # Narrowed to one literal by each kind. Declared here so that it is the first key of `config.yaml` and of the docs.
+    # Each kind narrows it to one literal. Declared here so that it is the first key in `config.yaml` and in the docs.
     kind: Any
 
     needs_source: ClassVar[bool] = True
-    """Whether the images come from `source`; other trackers bring their own."""
+    """Whether the images come from `source`; other trackers provide their own."""
     brings_cameras: ClassVar[bool] = False
-    """Whether the tracker knows the camera of every image, so that `source.intrinsics` would contradict it."""
+    """Whether the tracker provides the camera of every image, so that `source.intrinsics` must be empty."""
     follows_streams: ClassVar[bool] = False
-    """Whether it can track `source.stream`, whose images are not there before it starts."""
+    """Whether the tracker works on a live `source.stream`, whose images are not known in advance."""
     is_live: ClassVar[bool] = False
-    """Whether its frames come from outside and are gone when the run is."""
+    """Whether the frames arrive from another program and cannot be read again after the run."""
     renders_frames: ClassVar[bool] = False
-    """Whether its frames are made by Taichi, which must be initialised before they are asked for."""
+    """Whether Taichi renders the frames, so that it must be initialised before the first one is read."""
 
 
 class RecordedSettings(TrackerSettings):
-    """Tracking that was done before and lies in files."""
+    """Base class for trackers that read the results of earlier tracking from files."""
 
-    # Each kind says in its own words which file it is and where it is looked for.
+    # Each kind describes its file and the default places in its own `description`.
     path: Path | None = None
 
 
 class TimedPosesSettings(RecordedSettings):
-    """Poses that belong to an image by their time."""
+    """Base class for trackers that match poses with images by time stamp."""
 
     max_difference: float = Field(
         default=0.02, gt=0, description="seconds by which a pose's time may differ from its image's time"
@@ -71,7 +71,7 @@ class TimedPosesSettings(RecordedSettings):
 
 
 class GivenPosesSettings(RecordedSettings):
-    """Poses from a file that holds no points."""
+    """Base class for trackers whose file contains poses but no points."""
 
     adjusts_by_default: ClassVar[bool] = False
 
@@ -127,7 +127,7 @@ class TransformsSettings(RecordedSettings):
 
 
 class KltSettings(TrackerSettings):
-    """Our own tracker."""
+    """The built-in tracker, which needs only the images."""
 
     follows_streams: ClassVar[bool] = True
 
@@ -171,7 +171,7 @@ class StellaVslamSettings(TimedPosesSettings):
 
 
 class AriaSettings(TimedPosesSettings):
-    """What Project Aria's machine perception services (MPS) wrote."""
+    """Trajectory and points of Project Aria's machine perception services (MPS)."""
 
     kind: Literal["aria"] = Field(
         default="aria", description="what Project Aria's machine perception services (MPS) wrote"
@@ -214,7 +214,7 @@ class ReplicaSettings(GivenPosesSettings):
 class SevenScenesSettings(GivenPosesSettings):
     """The pose files of Microsoft's 7-Scenes."""
 
-    # They are the poses of the depth camera, and noisy.
+    # The files contain noisy poses of the depth camera.
     adjusts_by_default: ClassVar[bool] = True
 
     kind: Literal["sevenscenes"] = Field(default="sevenscenes", description="the pose files of Microsoft's 7-Scenes")
@@ -230,7 +230,7 @@ class SevenScenesSettings(GivenPosesSettings):
 
 
 class SocketSettings(TrackerSettings):
-    """Another program, which sends frames and poses."""
+    """Another program that sends frames and poses through a socket."""
 
     needs_source: ClassVar[bool] = False
     brings_cameras: ClassVar[bool] = True
@@ -257,7 +257,7 @@ class SocketSettings(TrackerSettings):
 
 
 class SyntheticSettings(TrackerSettings):
-    """The embedded demo."""
+    """The built-in synthetic demo scene."""
 
     needs_source: ClassVar[bool] = False
     brings_cameras: ClassVar[bool] = True
@@ -294,4 +294,4 @@ AnyTrackerSettings = Annotated[
     | SyntheticSettings,
     Field(discriminator="kind"),
 ]
-"""The section as a scene holds it: the model that `kind` names."""
+"""The type of the `tracker` section: a union of the models, discriminated by `kind`."""

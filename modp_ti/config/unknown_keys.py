@@ -1,4 +1,4 @@
-"""Keys that a model of settings does not have: refused with their place and the nearest right one."""
+"""Errors for unknown keys in settings, with the place of the key and the nearest valid one."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def refuse_unknown_keys(
     origin: str,
     whole_key: str | None = None,
 ) -> None:
-    """Refuse the first key that the model does not have, with the nearest one that it has.
+    """Raise an error for the first key that the model does not have, and suggest the nearest valid one.
 
     Args:
-        data: Settings as plain data, before they are validated. A section with several kinds is held against the
-            kind that it names, and against all of them where it names none.
-        model: What they are settings of.
-        where: File and line, or the override, that wrote a dotted key.
-        origin: What to name for keys that `where` does not have.
-        whole_key: The dotted key of an override, compared as a whole with all dotted keys.
+        data: Settings as plain data, before validation. A section with several kinds is compared with the kind that it
+            names, or with all kinds if it names none.
+        model: The settings model.
+        where: File and line, or the override, that set each dotted key.
+        origin: Place to name for keys that are not in `where`.
+        whole_key: The dotted key of an override, which is compared as a whole with all dotted keys.
 
     Raises:
-        InputError: For such a key, and for an override of a key below a value.
+        InputError: If a key is unknown, or an override sets a key below a plain value.
     """
     refusal = _Refusal(where, origin, whole_key, list(dict.fromkeys(entry.key for entry in documented_keys(model))))
     refusal.check(data, {"": model}, "", "")
@@ -42,10 +42,14 @@ def refuse_unknown_keys(
 
 @dataclass(frozen=True)
 class _Section:
-    """A section as far as its data tell of which kind it is.
+    """A section with the kind that its data name.
 
-    prefix: of its keys. told_by: the key that tells its kind, empty where there are no kinds. kind: the one that it
-    names, empty where it names none. fields: that it may have. others: models of the other kinds.
+    Attributes:
+        prefix: Prefix of its dotted keys.
+        told_by: The key that selects its kind; empty if it has no kinds.
+        kind: The kind that the data name; empty if they name none.
+        fields: Valid keys.
+        others: Models of the other kinds, by kind.
     """
 
     prefix: str
@@ -57,7 +61,7 @@ class _Section:
 
 @dataclass(frozen=True)
 class _Refusal:
-    """What stays the same from section to section. every: all dotted keys of the whole model."""
+    """The check of one set of settings; `every` has all dotted keys of the whole model."""
 
     where: Mapping[str, str]
     origin: str
@@ -67,7 +71,7 @@ class _Refusal:
     def check(
         self, data: Mapping[str, Any], variants: Mapping[str, type[BaseModel]], told_by: str, prefix: str
     ) -> None:
-        """Check a section. variants: the models that it may have, by the value of its key `told_by`."""
+        """Check a section against `variants`, its possible models by the value of its key `told_by`."""
         named = data.get(told_by)
         kind = named if isinstance(named, str) and named in variants else ""
         chosen = {kind: variants[kind]} if kind in variants else variants
@@ -93,7 +97,7 @@ class _Refusal:
             self.check(value, {"": sections[0]}, "", f"{place}.")
 
     def _written(self, place: str) -> str:
-        """Who wrote the key, or the section that it stands in."""
+        """The place that set the key, or the nearest enclosing section that has one."""
         while place not in self.where and "." in place:
             place = place.rpartition(".")[0]
         return self.where.get(place, self.origin)
@@ -108,7 +112,7 @@ class _Refusal:
         whole = difflib.get_close_matches(whole_key or place, self.every, n=1, cutoff=0.6)
         if in_section:
             found = prefix + in_section[0]
-            if whole_key is not None and whole_key != place:  # the wrong part is a section: name the key below it
+            if whole_key is not None and whole_key != place:  # the name of a section is wrong: suggest the key below it
                 keys_below = [other for other in self.every if other.startswith(found)]
                 below = difflib.get_close_matches(whole_key, keys_below, n=1, cutoff=0)
                 found = below[0] if below else found
@@ -126,7 +130,7 @@ class _Refusal:
 
 
 def _of_another_kind(key: str, section: _Section) -> str:
-    """What to say of a key that other kinds of the section have; empty where none has it."""
+    """The hint for a key that other kinds of the section have; empty if none has it."""
     having = [kind for kind, model in section.others.items() if key in model.model_fields]
     if not having:
         return ""

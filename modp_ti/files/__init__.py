@@ -1,4 +1,4 @@
-"""How files that somebody else wrote are read: what is not a file is refused, and nothing is allocated on its word."""
+"""Readers for untrusted files: only regular files are opened, and no allocation relies on a size that a file claims."""
 
 from __future__ import annotations
 

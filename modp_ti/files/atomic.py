@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, also where the machine stops in between."""
+"""Atomic file writes: a file appears complete or not at all, even after a crash or a power cut."""
 
 from __future__ import annotations
 
@@ -17,10 +17,21 @@ __all__ = ["replace_file", "replace_text", "replacing", "sync_folder", "write_pi
 
 @contextmanager
 def replacing(path: str | os.PathLike[str], mode: str = "wb", sync: bool = True) -> Iterator[IO]:
-    """A file to write, beside `path`, which takes the place of what is there once all is written and on the disk.
+    """Open a temporary file next to `path` that replaces `path` when the block ends.
 
-    sync: wait for the disk; without, only a fault of this process leaves what was there before. Text is UTF-8, with
-    plain line ends. Where writing fails nothing is left of it; raises OSError then.
+    If the block or the write fails, the temporary file is deleted and `path` keeps its old content.
+
+    Args:
+        path: The file to replace or create.
+        mode: `"wb"` or `"w"`. Text is written as UTF-8 without newline translation.
+        sync: Flush the file and its folder to the disk. Without it, the old content survives a crash of this process
+            but not necessarily of the machine.
+
+    Yields:
+        The open temporary file.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     target = Path(path)
     partial = target.with_name(target.name + ".partial")
@@ -41,30 +52,36 @@ def replacing(path: str | os.PathLike[str], mode: str = "wb", sync: bool = True)
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """`replacing` of the whole content."""
+    """Write `content` to `path` atomically, synced to the disk; see `replacing`."""
     with replacing(path) as file:
         file.write(content)
 
 
 def replace_text(path: str | os.PathLike[str], text: str) -> None:
-    """`replacing` of the whole text."""
+    """Write `text` to `path` atomically as UTF-8, synced to the disk; see `replacing`."""
     replace_file(path, text.encode("utf-8"))
 
 
 def write_picture(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-    """A picture (H, W, 3) RGB or (H, W), in the format of the path's ending. Raises OSError where it cannot be written.
+    """Write an image in the format of the path's suffix.
 
-    OpenCV's own writer is silent on a full disk.
+    Args:
+        path: The file, for example `picture.png`.
+        image: (H, W, 3) RGB or (H, W).
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     import cv2
 
+    # Encoded in memory, because `cv2.imwrite` does not report a full disk.
     _, data = cv2.imencode(Path(path).suffix, image[..., ::-1] if image.ndim == 3 else image)
     with replacing(path, sync=False) as file:
         file.write(data.tobytes())
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the disk know the folder's names, on file systems that can be asked to."""
+    """Flush a folder's entries to the disk, on file systems that support it."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

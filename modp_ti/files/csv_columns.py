@@ -1,4 +1,4 @@
-"""Columns of a CSV file with a header, plain or gzipped, read block by block: files of MPS have millions of rows."""
+"""Block-wise reader for columns of a CSV file, plain or gzipped. The files of Aria's MPS have millions of rows."""
 
 from __future__ import annotations
 
@@ -19,18 +19,25 @@ from modp_ti.files.errors import InputError
 
 __all__ = ["read_csv_blocks"]
 
-BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows
-# A gzip file may unpack to so many bytes, and beyond that to so many times its size; those of MPS do to 3 to 10 times.
+BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows and characters of a block, whichever comes first
+# A gzip file may unpack to this many bytes plus this many times its own size. MPS's files unpack to 3 to 10 times.
 UNPACKED_AT_LEAST = 1 << 22
 MOST_SHRUNK = 25
 
 
 def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
-    """Line of the first row (from 1), and the rows as a structured array with these columns, block by block.
+    """Read the given columns of a CSV file block by block.
 
-    columns: name and numpy type of what is wanted; the file may hold others, in any order. Raises InputError with file
-    and line for a header without one of them, a row of another length, and a value that is none or not finite; with the
-    file for one that is cut off.
+    Args:
+        path: The CSV file; the suffix `.gz` marks a gzip file.
+        columns: Name and NumPy type of each column to read. The file may have more columns, in any order.
+
+    Yields:
+        The line number of the block's first row (from 1), and the block's rows as a structured array of `columns`.
+
+    Raises:
+        InputError: With file and line, if a column is missing from the header, a row has the wrong length, or a value
+            is not a finite number; with the file, if it is truncated or cannot be read.
     """
     try:
         with open_file(path) as stored:
@@ -46,7 +53,7 @@ def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[in
 
 
 class _Unpacked(gzip.GzipFile):
-    """The content of a gzip file, up to what tables of numbers shrink by: a small file may unpack to any size."""
+    """A gzip stream that limits how far it unpacks, as a small file can expand to any size."""
 
     def __init__(self, path: Path, stored: BinaryIO) -> None:
         super().__init__(fileobj=stored, mode="rb")
@@ -73,7 +80,7 @@ def _blocks(path: Path, file: Iterator[str], columns: Mapping[str, str]) -> Iter
     kinds = np.dtype(list(columns.items()))
     line = 2
     while rows := _taken(file):
-        # The last row of a file that was cut off is shorter, or has no end.
+        # A truncated file ends in a short row.
         for number, row in enumerate(rows, start=line):
             if row.count(",") != len(header) - 1:
                 raise InputError(
@@ -96,7 +103,7 @@ def _blocks(path: Path, file: Iterator[str], columns: Mapping[str, str]) -> Iter
 
 
 def _taken(file: Iterator[str]) -> list[str]:
-    """The next rows: BLOCK of them, or fewer of long ones."""
+    """The next BLOCK rows, or fewer once they exceed BLOCK_CHARACTERS."""
     rows, room = [], BLOCK_CHARACTERS
     for row in islice(file, BLOCK):
         rows.append(row)
@@ -107,7 +114,7 @@ def _taken(file: Iterator[str]) -> list[str]:
 
 
 def _first_bad_value(rows: list[str], columns: Mapping[str, str], places: list[int]) -> tuple[int, str, str]:
-    """Row, column and text of the first value that is not of its column's type."""
+    """Index of the row, column and text of the first value that does not convert to its column's type."""
     for number, row in enumerate(rows):
         words = row.strip().split(",")
         for (name, kind), place in zip(columns.items(), places, strict=True):

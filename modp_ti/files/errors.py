@@ -1,15 +1,24 @@
-"""The one exception that the command line turns into a line of text and exit code 2."""
+"""The exception for unusable input, which the command line reports as one line with exit code 2."""
 
 __all__ = ["FEW", "InputError", "UnreadableImageError"]
 
-# Share of a recording's frames, or of a file's lines, that may be faulty: they are left out and counted. Of more the
-# whole input is taken to be wrong.
+# Largest share of a recording's frames, or of a file's lines, that may be faulty. Up to it they are skipped and
+# counted; above it the whole input is rejected.
 FEW = 0.1
 
 
 class InputError(Exception):
-    """Something the user gave cannot be used. The message is one line and says how to mend it."""
+    """The user's input cannot be used. The message is one line that says what to change.
+
+    Examples:
+        Report the problem without a traceback:
+
+            try:
+                config = modp_ti.load_scene("scene.yaml")
+            except modp_ti.InputError as error:
+                raise SystemExit(f"error: {error}")
+    """
 
 
 class UnreadableImageError(InputError):
-    """An image is damaged. Where it is one of few, the run goes on without it."""
+    """An image is damaged. The run continues without it as long as at most a share `FEW` of the images is."""

@@ -1,4 +1,4 @@
-"""JSON, with its structure looked over before anything is made of it."""
+"""JSON reader that checks brackets and nesting depth before it builds any object."""
 
 from __future__ import annotations
 
@@ -13,17 +13,25 @@ from modp_ti.files.reading import read_text
 __all__ = ["parse_json", "read_json"]
 
 MAX_DEPTH = 64
-# Brackets, what opens and closes strings, in which brackets do not count, and what is escaped there.
+# Brackets, quotes and escaped characters. Brackets within strings do not count.
 TOKEN = re.compile(r'\\.|["\[{\]}]', re.DOTALL)
-# What half a character of UTF-16 looks like; whole ones are pairs of them.
+# An escaped UTF-16 surrogate. A valid character consists of a pair of them.
 HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 CLOSES = {"]": "[", "}": "{"}
-# Digits of a whole number that is kept as one; longer ones become floats.
+# Integers with more characters than this become floats.
 DIGITS = 18
 
 
 def read_json(path: Path, setting: str) -> Any:
-    """The data of a file, as `parse_json`. setting: the key that named it, for the message where it cannot be read."""
+    """Read a JSON file; see `parse_json`.
+
+    Args:
+        path: The file.
+        setting: The configuration key that names the file, for the error message.
+
+    Raises:
+        InputError: If the file cannot be read as text or is not valid JSON.
+    """
     try:
         text = read_text(path, "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -33,10 +41,18 @@ def read_json(path: Path, setting: str) -> Any:
 
 
 def parse_json(text: str, name: str, line: int | None = None) -> Any:
-    """The data in a text. name: of the file, and line: where the text stands in it, for the message.
+    """Parse a JSON text.
 
-    Numbers beyond float64 become infinite, as `NaN` and `Infinity` are let through: who reads them judges them. Raises
-    InputError, with the line, for text that is no JSON, is cut off, or nested deeper than MAX_DEPTH.
+    Numbers beyond the range of float64 become infinite, and `NaN` and `Infinity` are accepted. The caller must check
+    that numbers are finite.
+
+    Args:
+        text: The JSON text.
+        name: Name of the file, for the error message.
+        line: Line of the file at which the text starts, for the error message; None for the first.
+
+    Raises:
+        InputError: With the line, if the text is not valid JSON, is truncated, or is nested deeper than `MAX_DEPTH`.
     """
     first = 1 if line is None else line
     _require_structure(text, name, first)

@@ -1,4 +1,4 @@
-"""How much memory there is to read something into."""
+"""Estimate of the memory that is available for reading files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 __all__ = ["available_memory"]
 
-# Where the system does not tell.
+# Bytes assumed where the system does not report its memory.
 ASSUMED = 4 << 30
 CGROUP_LIMITS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
@@ -16,7 +16,7 @@ CGROUP_LIMITS = (
 
 
 def available_memory() -> int:
-    """Bytes that this process can still take, about: of the machine, its container and its own limit."""
+    """Approximate bytes that this process can still allocate: the least that machine, container and rlimit allow."""
     return max(0, min(_of_machine(), *(_of_container(*files) for files in CGROUP_LIMITS), _of_process()))
 
 
@@ -33,7 +33,7 @@ def _of_machine() -> int:
 def _of_container(limit: str, used: str) -> int:
     try:
         return int(Path(limit).read_text(encoding="ascii")) - int(Path(used).read_text(encoding="ascii"))
-    except (OSError, ValueError):  # no such container, or "max"
+    except (OSError, ValueError):  # no such cgroup file, or its limit is "max"
         return 1 << 62
 
 

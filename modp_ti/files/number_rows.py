@@ -1,4 +1,4 @@
-"""Tables of numbers as text: one row a line, `#` comments, columns parted by blanks or commas."""
+"""Reader for text tables of numbers: one row per line, `#` comments, columns separated by blanks or commas."""
 
 from __future__ import annotations
 
@@ -19,7 +19,14 @@ __all__ = ["NumberRows", "read_number_rows"]
 
 @dataclass(frozen=True)
 class NumberRows:
-    """values: (N, columns). lines: (N,) line of the file that each row stands in, from 1."""
+    """The rows of a text table.
+
+    Attributes:
+        path: The file.
+        values: (N, columns).
+        lines: (N,) line of each row in the file, from 1.
+        left_out: Number of rows that were skipped because they contain NaN or Inf.
+    """
 
     path: Path
     values: NDArray[np.float64]
@@ -35,7 +42,7 @@ class NumberRows:
 
 
 def _lines(path: Path, setting: str) -> Iterator[str]:
-    """Lines of a text file. setting: the key that named it, for the message of the InputError where it cannot be."""
+    """Lines of a text file. Raises InputError, which names the key `setting`, if it cannot be read."""
     try:
         yield from text_lines(path)
     except FileNotFoundError:
@@ -48,11 +55,19 @@ def _lines(path: Path, setting: str) -> Iterator[str]:
 def read_number_rows(
     path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False, few: float = 0.0
 ) -> NumberRows:
-    """The rows of a file whose lines hold `columns` finite numbers each; with `more`, what follows them is ignored.
+    """Read a text table whose rows have `columns` finite numbers each.
 
-    meaning: the columns in words, for messages. few: share of the rows that may hold NaN or infinity, and are then left
-    out. Raises InputError with file and line for anything else, and for a file
-    without a row.
+    Args:
+        path: The file.
+        columns: Numbers per row.
+        meaning: The columns in words, for error messages.
+        setting: The configuration key that names the file, for error messages.
+        more: Accept and ignore further columns.
+        few: Largest share of the rows that may contain NaN or Inf; these rows are skipped.
+
+    Raises:
+        InputError: With file and line, if a row has another number of columns, text, too many rows contain NaN or Inf,
+            or a number exceeds `LARGEST`; also if the file cannot be read or has no rows.
     """
     values, lines = array("d"), array("q")
     bad: list[int] = []

@@ -1,4 +1,4 @@
-"""Headers of PLY files, held against the size of the file before anything is made of its content."""
+"""Parser for PLY headers, which checks the vertex count against the file size before anything is allocated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from modp_ti.files.errors import InputError
 
 __all__ = ["PLY_TYPES", "PlyHeader", "parse_ply_header"]
 
-# Bytes that a header may have; that of splats with the highest harmonics takes two thousand.
+# Largest header in bytes. Splats with the highest spherical harmonics degree need about 2,000.
 MAX_HEADER = 1 << 16
 MAX_DIGITS = 12
 MAX_PROPERTIES = 1000
@@ -29,9 +29,13 @@ PLY_TYPES = {name: code for code, names in PLY_TYPE_NAMES.items() for name in na
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """form: as the file calls it. count: of vertices, the first element. start: where the data begins, in bytes.
+    """The header of a PLY file whose first element is `vertex`.
 
-    properties: name and NumPy type (without byte order) of each number of a vertex.
+    Attributes:
+        form: The file's format, for example `binary_little_endian`.
+        count: Number of vertices.
+        properties: Name and NumPy type (without byte order) of each vertex property.
+        start: Offset of the data in bytes.
     """
 
     form: str
@@ -41,11 +45,20 @@ class PlyHeader:
 
     @property
     def names(self) -> list[str]:
+        """Names of the vertex properties."""
         return [name for name, _ in self.properties]
 
 
 def parse_ply_header(data: bytes, path: Path) -> PlyHeader:
-    """The header of a file's content. Raises InputError for none, and for more vertices than the file has room for."""
+    """Parse the header at the start of a PLY file.
+
+    Args:
+        data: The content of the whole file.
+        path: The file's path, for error messages.
+
+    Raises:
+        InputError: If the header is missing, damaged or unsupported, or announces more vertices than `data` can hold.
+    """
     found = data.find(b"end_header", 0, MAX_HEADER)
     newline = data.find(b"\n", found, found + 16)
     if not data.startswith(b"ply") or found < 0 or newline < 0:
@@ -53,8 +66,8 @@ def parse_ply_header(data: bytes, path: Path) -> PlyHeader:
     header = _parsed(data[:found].decode("ascii", "replace").splitlines()[1:], newline + 1, path)
     room = len(data) - header.start
     if header.form == "ascii":
-        least = 2 * len(header.properties)  # a digit and what parts it from the next
-        room += 1  # the last one may lack that
+        least = 2 * len(header.properties)  # one digit and one separator
+        room += 1  # the last separator may be missing
     elif header.form in ("binary_little_endian", "binary_big_endian"):
         least = sum(int(kind[1:]) for _, kind in header.properties)
     else:

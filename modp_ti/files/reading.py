@@ -1,6 +1,6 @@
-"""Regular files opened and read whole or line by line, never a pipe, a device or more than there is memory for.
+"""Bounded reading of regular files. Pipes, devices and files too large for the memory are refused.
 
-What goes wrong is an OSError whose `strerror` says it in words, so that each reader words its own message.
+Failures raise OSError with a readable `strerror`, from which each reader builds its own message.
 """
 
 from __future__ import annotations
@@ -28,27 +28,31 @@ __all__ = [
 ]
 
 MAX_LINE = 1 << 16
-"""Characters of a line of text; longer ones are none that a person or a tracker wrote."""
+"""Longest line of text in characters. No person or tracker writes longer ones."""
 
 LARGEST = 1e30
-"""Numbers beyond this are none that a tracker wrote, and their products would leave float64."""
+"""Largest accepted magnitude of a number. No tracker writes larger ones, and their products could overflow float64."""
 
-# Of the memory that there is, what one file may take.
+# Share of the available memory that one file may take.
 SHARE = 0.25
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a regular file; False, too, for what cannot be a path, such as a name that is too long."""
+    """Whether `path` is a regular file. Invalid paths, such as names that are too long, give False."""
     return os.path.isfile(path)
 
 
 def exists(path: Path) -> bool:
-    """Whether anything is there; False, too, for what cannot be a path."""
+    """Whether `path` exists. Invalid paths give False."""
     return os.path.exists(path)
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:
-    """A regular file, opened. Raises OSError for a folder, a pipe (on which one would wait for ever) or a device."""
+    """Open a regular file for reading.
+
+    Raises:
+        OSError: If it cannot be opened, or is a folder, a pipe (which could block forever), a socket or a device.
+    """
     name = os.fspath(path)
     try:
         descriptor = os.open(name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -64,7 +68,11 @@ def open_file(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """The content. Raises OSError where it cannot be read, and where it is larger than there is memory for."""
+    """Read a whole file.
+
+    Raises:
+        OSError: If the file cannot be read, or takes more than a share `SHARE` of the available memory.
+    """
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > SHARE * available_memory():
@@ -73,22 +81,33 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 def read_text(path: str | os.PathLike[str], encoding: str = "utf-8") -> str:
-    """The content as text. Raises OSError as `read_bytes` does, and UnicodeDecodeError."""
+    """Read a whole file as text.
+
+    Raises:
+        OSError: As for `read_bytes`.
+        UnicodeDecodeError: If the content does not decode.
+    """
     return read_bytes(path).decode(encoding)
 
 
 def text_lines(path: str | os.PathLike[str], encoding: str = "utf-8-sig", longest: int = MAX_LINE) -> Iterator[str]:
-    """The lines of a text file, one after the other, with their ends.
+    """Iterate over the lines of a text file, with their line ends.
 
-    longest: characters that a line may have. Raises OSError as `open_file` does and for a longer line, and
-    UnicodeDecodeError.
+    Args:
+        path: The file.
+        encoding: Its encoding; the default also skips a byte-order mark.
+        longest: Longest line in characters.
+
+    Raises:
+        OSError: As for `open_file`, and for a line that is too long.
+        UnicodeDecodeError: If the content does not decode.
     """
     with open_file(path) as file, io.TextIOWrapper(file, encoding=encoding) as text:
         yield from limited_lines(text, longest)
 
 
 def limited_lines(text: io.TextIOBase, longest: int = MAX_LINE) -> Iterator[str]:
-    """The lines of an opened text. Raises OSError for one of more than `longest` characters."""
+    """Iterate over the lines of an open text stream. Raises OSError for one with more than `longest` characters."""
     number = 0
     while line := text.readline(longest + 1):
         number += 1

@@ -1,1 +1,1 @@
-"""What `modp-ti check` looks at: frames, times, pictures, and whether poses and intrinsics fit them."""
+"""The checks of `modp-ti check`: frames, time stamps, images, and whether poses and intrinsics fit them."""

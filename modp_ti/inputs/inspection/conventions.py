@@ -1,4 +1,4 @@
-"""How poses and intrinsics may have been meant: as they stand, or in one of the ways in which they often go wrong."""
+"""Possible interpretations of given poses and intrinsics: as stated, or with one of the common mistakes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,16 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class Convention:
-    """A reading of the same numbers.
+    """An interpretation of the given poses and intrinsics.
 
-    inverse: they are camera to world where world to camera was taken, or the other way round. opengl: their camera axes
-    are y up, z back. intrinsics: factor that they need. fault, mend: what is wrong if this one fits, and what to do.
+    Attributes:
+        name: Its name in reports.
+        inverse: The poses are inverted (camera to world and world to camera are exchanged).
+        opengl: The camera axes are OpenGL's (y up, z back).
+        intrinsics: Factor that corrects the focal lengths and the principal point.
+        focal: Additional factor that corrects the focal lengths.
+        fault: What is wrong with the input if this interpretation fits.
+        mend: How to correct it.
     """
 
     name: str
@@ -32,12 +38,12 @@ class Convention:
     mend: str = ""
 
     def pose(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The true pose (4, 4), up to a turn of the world, if the given one is to be read so."""
+        """The correct T_camera_world (4, 4) under this interpretation, up to a rotation of the world."""
         T = inverse_se3(T_camera_world) if self.inverse else T_camera_world
         return OPENGL @ T if self.opengl else T
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
-        """The true camera of the same image."""
+        """The correct camera under this interpretation, for the same image size."""
         f, c = self.intrinsics * self.focal, self.intrinsics
         return replace(camera, fx=f * camera.fx, fy=f * camera.fy, cx=c * camera.cx, cy=c * camera.cy)
 

@@ -1,4 +1,4 @@
-"""Do poses and intrinsics fit the images? Asked of matched features, which know nothing of either."""
+"""Epipolar test of poses and intrinsics with matched features, which were found without either of them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,23 @@ from modp_ti.inputs.multiview.features import Features, essential_matrix, match_
 __all__ = ["EpipolarScore", "MatchedPair", "epipolar_score", "matched_pair"]
 
 LEAST_MATCHES = 30
-# Pixels of the searched image.
+# Thresholds of RANSAC and of a fitting match, in px of the image used for detection.
 RANSAC_BAND = 1.5
 FITS = 2.5
-# Below this angle between its two rays [degrees], a match does not tell before from behind.
+# Smallest angle [degrees] between the rays of a match at which the sign of its depth is reliable.
 LEAST_ANGLE = 0.5
 
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Matches of two images that agree with one another under some epipolar geometry.
+    """Matches of two images that are consistent with a common epipolar geometry.
 
-    a, b: places of the images among the frames. pixels_a, pixels_b: (M, 2). pixel: of the searched images [px].
+    Attributes:
+        a: Index of the first frame.
+        b: Index of the second frame.
+        pixels_a: (M, 2) features in the first image.
+        pixels_b: (M, 2) features in the second image.
+        pixel: Pixel size of the images used for detection, in pixels of the mapped image.
     """
 
     a: int
@@ -38,7 +43,13 @@ class MatchedPair:
 
 @dataclass(frozen=True)
 class EpipolarScore:
-    """Share of the matches that fit, and their median Sampson error [px of the mapped image]; matches: how many."""
+    """Agreement of matches with poses and intrinsics.
+
+    Attributes:
+        share: Share of the matches that fit.
+        error: Median Sampson error of all matches [px of the mapped image]; NaN without matches.
+        matches: Number of matches.
+    """
 
     share: float
     error: float
@@ -46,7 +57,17 @@ class EpipolarScore:
 
 
 def matched_pair(a: int, features_a: Features, b: int, features_b: Features) -> MatchedPair | None:
-    """The matches of two images; None where too few agree, or where the image hardly moved."""
+    """Match two images without using their poses.
+
+    Args:
+        a: Index of the first frame.
+        features_a: Its features.
+        b: Index of the second frame.
+        features_b: Its features.
+
+    Returns:
+        The matches that are inliers of a fundamental matrix; None if there are too few.
+    """
     import cv2
 
     nowhere = np.zeros((3, 3))
@@ -70,7 +91,16 @@ def epipolar_score(
     poses: Sequence[NDArray[np.float64]],
     convention: Convention,
 ) -> EpipolarScore:
-    """How the matches fit the frames' cameras and T_camera_world (4, 4), read after the convention."""
+    """Measure how matches fit cameras and poses under a convention.
+
+    A match fits if its Sampson error is below `FITS` px and its rays meet in front of both cameras.
+
+    Args:
+        pairs: The matches.
+        cameras: Camera of each frame.
+        poses: T_camera_world (4, 4) of each frame.
+        convention: The interpretation of cameras and poses.
+    """
     fits: list[NDArray[np.bool_]] = [np.zeros(0, dtype=bool)]
     errors: list[NDArray[np.float64]] = [np.zeros(0)]
     for pair in pairs:
@@ -79,7 +109,7 @@ def epipolar_score(
         x_a, x_b = _rays(camera_a, pair.pixels_a), _rays(camera_b, pair.pixels_b)
         E = essential_matrix(T_a, T_b)
         if np.linalg.norm(E) == 0:
-            continue  # a camera that only turned says nothing
+            continue  # pure rotation has no epipolar geometry
         line_b, line_a = x_a @ E.T, x_b @ E
         residual = (x_b * line_b).sum(axis=1)
         slope = np.linalg.norm(np.c_[line_a[:, :2], line_b[:, :2]], axis=1)
@@ -97,13 +127,13 @@ def _rays(camera: PinholeCamera, pixels: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _before_both(x_a: NDArray[np.float64], x_b: NDArray[np.float64], T_b_a: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether the rays (M, 3) of two cameras come nearest to each other before both, or are too parallel to tell."""
+    """Whether the rays (M, 3) are closest to each other in front of both cameras, or too parallel to decide."""
     a = x_a @ T_b_a[:3, :3].T  # in the axes of b
     a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, x_b))
     cosine = (a * b).sum(axis=1)
     sine2 = 1.0 - cosine**2
     t = T_b_a[:3, 3]
-    # t + s a = u b in the least squares.
+    # t + s a = u b in the least-squares sense.
     s = (cosine * (b @ t) - a @ t) / np.maximum(sine2, 1e-12)
     u = (b @ t - cosine * (a @ t)) / np.maximum(sine2, 1e-12)
     return (sine2 < np.sin(np.radians(LEAST_ANGLE)) ** 2) | ((s > 0) & (u > 0))

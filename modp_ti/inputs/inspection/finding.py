@@ -1,4 +1,4 @@
-"""What an inspection comes to: remarks with their mends, and a verdict."""
+"""Results of an inspection: findings with corrections, and a verdict."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["Finding", "Severity", "verdict"]
 
 
 class Severity(Enum):
-    """How bad a finding is; the order is from harmless to fatal."""
+    """Severity of a finding, in increasing order."""
 
     NOTE = "note"
     WARNING = "warning"
@@ -19,7 +19,14 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found. code: a word for machines. mend: what to do about it, may be empty."""
+    """One finding.
+
+    Attributes:
+        severity: How severe it is.
+        code: A machine-readable identifier.
+        text: The finding in one line.
+        mend: How to correct it; may be empty.
+    """
 
     severity: Severity
     code: str
@@ -28,7 +35,7 @@ class Finding:
 
 
 def verdict(findings: Iterable[Finding]) -> tuple[str, int]:
-    """The word for all findings, fine, warnings or unusable, and the exit code of `modp-ti check`: 0, 1 or 2."""
+    """Summarise findings as "fine", "warnings" or "unusable", with `modp-ti check`'s exit code 0, 1 or 2."""
     severities = {finding.severity for finding in findings}
     if Severity.UNUSABLE in severities:
         return "unusable", 2

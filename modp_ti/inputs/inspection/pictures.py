@@ -1,4 +1,4 @@
-"""Blurred and repeated pictures, gaps in time, leaps of the camera: what is odd about the frames one after another."""
+"""Checks of the image sequence: sizes, time stamps, blurred and repeated frames."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from modp_ti.inputs.inspection.survey import FrameRecord
 
 __all__ = ["blurred", "centres", "duplicates", "judge_sequence", "time_gaps"]
 
-# A frame is blurred where it is so much less sharp than the median of those around it (as keyframe selection has it).
+# A frame is blurred if its sharpness is below this factor of the median of the AROUND frames on each side. The factor
+# is the default of keyframe selection.
 BLURRED = 0.75
 AROUND = 7
-# Mean difference of thumbnails [grey levels] up to which two pictures are the same, encoded twice.
+# Mean difference of thumbnails [grey levels] below which two images are the same, encoded twice.
 SAME = 0.2
-# A gap is so many times the usual time between frames.
+# A time step of more than this many times the median is a gap.
 GAP = 3.0
-# Shares of the frames from which on these are worth a warning.
+# Shares of the frames above which blurred or repeated ones are a warning rather than a note.
 MANY_BLURRED, MANY_DUPLICATES = 0.2, 0.1
-NAMED = 5  # frames that a finding names
+NAMED = 5  # frames that a finding names, at most
 
 
 def blurred(frames: Sequence[FrameRecord]) -> list[int]:
-    """Places of frames that are less sharp than their surroundings."""
+    """Indices of frames that are less sharp than their neighbours."""
     sharp = np.array([frame.sharpness for frame in frames])
     result = []
     for i, value in enumerate(sharp):
@@ -36,12 +37,12 @@ def blurred(frames: Sequence[FrameRecord]) -> list[int]:
 
 
 def duplicates(frames: Sequence[FrameRecord]) -> list[int]:
-    """Places of frames whose picture is that of the frame before."""
+    """Indices of frames whose image repeats the one before."""
     return [i for i, frame in enumerate(frames) if frame.change < SAME]
 
 
 def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
-    """Places of frames that come much later after the one before than is usual."""
+    """Indices of frames that follow a gap in time."""
     steps = np.diff([frame.timestamp for frame in frames])
     if len(steps) == 0 or np.median(steps) <= 0:
         return []
@@ -49,12 +50,12 @@ def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
 
 
 def centres(frames: Sequence[FrameRecord]) -> NDArray[np.float64]:
-    """Where the cameras stand in the world (N, 3)."""
+    """Camera centres (N, 3) in the world."""
     return np.array([-f.T_camera_world[:3, :3].T @ f.T_camera_world[:3, 3] for f in frames])
 
 
 def judge_sequence(frames: Sequence[FrameRecord]) -> list[Finding]:
-    """Findings on sizes, times and pictures."""
+    """Judge image sizes, time stamps and image quality."""
     findings = []
     sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
     if len(sizes) > 1:

@@ -1,4 +1,4 @@
-"""An inspection as tables for a person and as JSON for a machine."""
+"""Reports of an inspection, as tables and as JSON."""
 
 from __future__ import annotations
 
@@ -25,9 +25,15 @@ SIGNS = {Severity.NOTE: "note", Severity.WARNING: "[yellow]warning[/]", Severity
 
 @dataclass
 class Report:
-    """What was found. Empty but for findings where the input could not be read.
+    """Results of an inspection. If the input cannot be read, only `findings` is set.
 
-    lens: the distortion, in words. notes: the tracker's own.
+    Attributes:
+        frames: Measurements of each frame.
+        geometry: Agreement of poses and intrinsics with the images.
+        scale: Depth of the scene and motion of the camera.
+        lens: The lens distortion in words.
+        notes: Notes of the tracker.
+        findings: The findings.
     """
 
     frames: Sequence[FrameRecord] = ()
@@ -39,7 +45,7 @@ class Report:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Plain data; numbers that are not finite are null."""
+    """Convert a report to plain data for JSON. Numbers that are not finite become None."""
     word, code = verdict(report.findings)
     data: dict[str, Any] = {
         "verdict": word,
@@ -91,7 +97,7 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def print_report(report: Report, console: Console) -> None:
-    """Tables, findings with their mends, and the verdict in the last line."""
+    """Print notes, tables, findings with corrections, and the verdict in the last line."""
     data = as_json(report)
     for note in report.notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True, markup=False)

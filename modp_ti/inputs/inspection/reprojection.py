@@ -1,4 +1,4 @@
-"""How far the tracked points lie from their pixels, under each reading of poses and intrinsics."""
+"""Reprojection errors of the tracked points under each convention of poses and intrinsics."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from modp_ti.inputs.inspection.conventions import Convention
 
 __all__ = ["COMPUTED", "reprojection_errors"]
 
-# Pixels that fit better than this [px] were computed from the points, and prove nothing.
+# Pixels with a smaller error [px] were computed from the points and prove nothing.
 COMPUTED = 1e-3
 
 
 def reprojection_errors(frame: TrackedFrame, convention: Convention) -> NDArray[np.float32]:
-    """Distances (N,) [px] of the frame's points from their pixels; infinite for a point behind the camera."""
+    """Reprojection errors (N,) [px] of a frame's points; infinite for points behind the camera.
+
+    Args:
+        frame: The frame, with N points.
+        convention: The interpretation of its pose and camera.
+    """
     T, camera = convention.pose(frame.T_camera_world), convention.camera(frame.camera)
     p = frame.points.xyz @ T[:3, :3].T + T[:3, 3]
     errors = np.full(len(p), np.inf, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Points, depths, the way of the camera, and intrinsics: whether there is enough to map from."""
+"""Checks of the number of points, the scale of the camera's motion, and the intrinsics."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from modp_ti.inputs.inspection.survey import FrameRecord
 
 __all__ = ["Scale", "judge_scale", "measure_scale"]
 
-# The camera's whole way, in depths of the scene, below which nothing has parallax.
+# Extent of the camera path, in scene depths, below which there is no parallax.
 LEAST_WAY = 0.01
-# A step, in depths of the scene, after which hardly anything is seen twice.
+# Step between frames, in scene depths, above which consecutive images hardly overlap.
 LONG_STEP = 0.5
-# Of the image's size: how far a principal point may be from its middle.
+# Largest plausible distance of the principal point from the image centre, as a share of the image size.
 OFF_CENTRE = 0.15
-# Ratio of focal lengths that no camera with square pixels has.
+# Largest plausible ratio of fx and fy for a camera with square pixels.
 ANAMORPHIC = 1.1
-FIELD_OF_VIEW = (20.0, 130.0)  # [degrees] across, of cameras that are not suspicious
+FIELD_OF_VIEW = (20.0, 130.0)  # range of plausible horizontal fields of view [degrees]
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How deep the scene is, and how far the camera goes in it.
+    """Depth of the scene, and motion of the camera relative to it.
 
-    depth: median over the frames of the median depth of their points [scene units], NaN without points. In depths:
-    step, the median way between frames; longest, the greatest; extent, the diagonal of the box of all camera centres.
+    Attributes:
+        depth: Median over the frames of the median depth of their points [scene units]; NaN without points.
+        step: Median distance between consecutive camera centres, in depths.
+        longest: Largest distance between consecutive camera centres, in depths.
+        extent: Diagonal of the bounding box of all camera centres, in depths.
     """
 
     depth: float
@@ -39,7 +42,7 @@ class Scale:
 
 
 def measure_scale(frames: Sequence[FrameRecord]) -> Scale:
-    """The figures of one frame at least."""
+    """Measure depth and camera motion. There must be at least one frame."""
     depths = np.array([frame.depth for frame in frames])
     depth = float(np.nanmedian(depths)) if np.isfinite(depths).any() else float("nan")
     places = centres(frames)
@@ -51,7 +54,13 @@ def measure_scale(frames: Sequence[FrameRecord]) -> Scale:
 
 
 def judge_scale(frames: Sequence[FrameRecord], scale: Scale, min_points: int) -> list[Finding]:
-    """Findings on points and camera. min_points: that a keyframe needs."""
+    """Judge the number of points, the camera's motion and its intrinsics.
+
+    Args:
+        frames: Measurements of each frame.
+        scale: Depth of the scene and motion of the camera.
+        min_points: Points that a keyframe needs.
+    """
     findings = []
     mapped = [frame for frame in frames if not frame.held_out]
     poor = [frame for frame in mapped if frame.points < min_points]

@@ -1,4 +1,4 @@
-"""One pass over a tracker's frames: what is measured of each while it is there."""
+"""Measurements of all frames in a single pass over a tracker."""
 
 from __future__ import annotations
 
@@ -19,21 +19,30 @@ from pipelines.select.sharpness import sharpness
 
 __all__ = ["FrameRecord", "Survey", "survey"]
 
-# Features are matched between a frame and those so many behind it, at so many places of the sequence.
+# At PLACES frames of the sequence, features are matched with the frames GAPS further on.
 GAPS = (1, 2, 4)
 PLACES = 8
-# Where the number of frames is not known before: every so many frames.
+# Distance between these places if the number of frames is unknown.
 LIVE_SPACING = 25
 THUMBNAIL = 64  # [px] longer side
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What is kept of a frame.
+    """Measurements of a frame.
 
-    points: tracked ones. depth: their median [scene units], NaN without. sharpness: as `pipelines.select.sharpness`.
-    change: mean difference to the frame before [grey levels of 255], at thumbnail size; NaN for the first. masked:
-    share of pixels that do not count.
+    Attributes:
+        index: Index of the frame.
+        name: Its name.
+        timestamp: Its time in seconds.
+        camera: Its camera.
+        T_camera_world: (4, 4) its pose.
+        held_out: Whether it is held out.
+        points: Number of tracked points.
+        depth: Their median depth [scene units]; NaN without points.
+        sharpness: Sharpness as in `pipelines.select.sharpness`.
+        change: Mean difference to the frame before [grey levels of 255] at thumbnail size; NaN for the first frame.
+        masked: Share of masked pixels.
     """
 
     index: int
@@ -51,7 +60,13 @@ class FrameRecord:
 
 @dataclass
 class Survey:
-    """All frames' records, matched pairs of some of them, and reprojection errors [px] by convention."""
+    """Measurements of all frames.
+
+    Attributes:
+        frames: Measurements of each frame.
+        pairs: Matches between some of the frames.
+        reprojection: Reprojection errors [px] of all point observations, by convention.
+    """
 
     frames: list[FrameRecord] = field(default_factory=list)
     pairs: list[MatchedPair] = field(default_factory=list)
@@ -59,9 +74,12 @@ class Survey:
 
 
 def survey(frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[int], None]) -> Survey:
-    """Look at every frame once.
+    """Measure every frame in one pass.
 
-    total: how many there will be, None where that is not known. seen: called after each with how many there were.
+    Args:
+        frames: The frames.
+        total: Number of frames; None if unknown.
+        seen: Called after each frame with the number of frames so far.
     """
     result = Survey()
     errors: dict[Convention, list[NDArray[np.float32]]] = {c: [] for c in CONVENTIONS}

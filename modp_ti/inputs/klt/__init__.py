@@ -1,4 +1,4 @@
-"""Tracker `klt`: poses and points from the images alone, while they arrive."""
+"""Tracker `klt`: online poses and sparse points from the images alone."""
 
 from modp_ti.inputs.klt.tracker import KltTracker, open_klt
 

@@ -1,4 +1,4 @@
-"""Bundle adjustment of some keyframes of a map, others held."""
+"""Bundle adjustment of a map's keyframes, some of them fixed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,18 @@ def adjust_bundle(
     focal: bool = False,
     distortion: bool = False,
 ) -> float:
-    """Moves the keyframes `free` and the landmarks that they see, to the least robust reprojection error.
+    """Minimise the robust reprojection error over keyframes and the landmarks that they see, in place.
 
-    held: keyframes that take part where they are; where there is none, the first two of `free` hold the world.
-    steps: Levenberg-Marquardt steps at most. focal, distortion: whether these of the camera are refined too.
-    Returns the mean cost of an observation [px^2 / 2], infinite where there is nothing to adjust.
+    Args:
+        landmarks: The map.
+        free: Keyframes whose poses are optimised.
+        held: Keyframes that take part with fixed poses. Without any, the first two of `free` fix the gauge.
+        steps: Levenberg-Marquardt steps at most.
+        focal: Also optimise the focal length.
+        distortion: Also optimise the distortion.
+
+    Returns:
+        The mean cost per observation [px^2 / 2]; infinite if there are too few observations.
     """
     views = sorted({*free, *held})
     of, slot, ids = landmarks.observations(views)

@@ -1,4 +1,4 @@
-"""A camera that nobody described, estimated from the images that it took."""
+"""Self-calibration: estimation of an unknown camera from its images."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
 
 __all__ = ["TYPICAL_FOCAL", "estimated_intrinsics"]
 
-# Focal length as a share of the image's longer side: of phones, webcams and depth cameras; and what is believed.
+# Focal length as a share of the image's longer side: typical of phones, webcams and depth cameras, and the accepted
+# range of an estimate.
 TYPICAL_FOCAL = 0.85
 LEAST_FOCAL, LARGEST_FOCAL = 0.4, 3.0
 LARGEST_DISTORTION = 0.5
-# Keyframes after which more of them change little.
+# Further keyframes change the estimate little.
 ENOUGH = 60
 
 Image = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
@@ -29,12 +30,21 @@ Image = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 def estimated_intrinsics(
     images: Iterable[Image], size: tuple[int, int], start: float, seed: int, progress: Progress | None, total: int
 ) -> tuple[Intrinsics | None, int]:
-    """The camera of stored images of `size` (width, height), None where they do not tell; and how many were used.
+    """Estimate one focal length and one radial distortion coefficient; the principal point is the image centre.
 
-    images: grey (H, W) uint8 and which of its pixels count, of one size and of the stored images' shape. start: focal
-    length [stored px] to begin with. One focal length and one radial coefficient are estimated, the principal point is
-    the middle. The images are tracked with the starting value, and the map that this gives is adjusted
-    together with the camera.
+    The images are tracked with the initial focal length. Then the map and the camera are bundle adjusted together.
+
+    Args:
+        images: Grey images (H, W) uint8 with masks of the usable pixels. All have one size, with the aspect ratio of
+            the stored images.
+        size: (width, height) of the stored images.
+        start: Initial focal length [px of the stored images].
+        seed: Seed of RANSAC.
+        progress: Called after each image.
+        total: Number of images to report to `progress`.
+
+    Returns:
+        The camera of the stored images, or None if it cannot be estimated; and the number of images used.
     """
     width, height = size
     odometry, used = None, 0
@@ -57,7 +67,7 @@ def estimated_intrinsics(
 
 
 def _believable(landmarks: LandmarkMap, width: int, height: int) -> Intrinsics | None:
-    """The map's camera at the stored size; None where no lens is like that."""
+    """The map's camera, scaled to the stored size; None if its values are implausible."""
     focal, _, _, k = (float(value) for value in landmarks.lens.camera.params)
     focal *= width / landmarks.lens.width
     if not LEAST_FOCAL < focal / max(width, height) < LARGEST_FOCAL or not abs(k) < LARGEST_DISTORTION:

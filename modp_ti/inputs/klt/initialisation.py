@@ -1,4 +1,4 @@
-"""How a map begins: features followed through the first frames until two of them tell motion and depth."""
+"""Initialisation of the map: features are tracked until two frames have enough parallax for motion and depth."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from modp_ti.inputs.multiview.camera_pose import pose_from_points, ray_errors
 
 __all__ = ["Initialisation", "SeenFrame"]
 
-WANTED = 450  # features that are followed
-FEWEST_SHARED = 60  # of two views
-# The pair must have moved by this share of the image's longer side, and its rays by these degrees; less is asked for
-# after many frames.
+WANTED = 450  # features that are tracked
+FEWEST_SHARED = 60  # features that two views must share
+# Least motion of the pair, as a share of the image's longer side, and least parallax in degrees. After PATIENCE frames
+# half the parallax is enough.
 LEAST_SHIFT = 0.03
 LEAST_ANGLE = 2.5
 PATIENCE = 90  # frames
@@ -31,7 +31,15 @@ LONGEST = 400  # frames in memory
 
 @dataclass
 class SeenFrame:
-    """A frame without pose: grey and valid (H, W); features ids (N,) at pixels (N, 2)."""
+    """A frame without a pose.
+
+    Attributes:
+        number: Number of the frame.
+        grey: (H, W) uint8.
+        valid: (H, W), False where no features may be tracked; None for everywhere.
+        ids: (N,) ids of its features.
+        pixels: (N, 2) their positions.
+    """
 
     number: int
     grey: NDArray[np.uint8]
@@ -41,9 +49,14 @@ class SeenFrame:
 
 
 class Initialisation:
-    """Takes frames in until `add` returns a map. frames: those seen so far, the oldest forgotten after LONGEST.
+    """Collects frames until `add` returns a map.
 
-    lenses: cameras that may be the right one; the map has the one that explains the features best.
+    Args:
+        lenses: Candidate cameras. The map gets the one with the lowest cost.
+        seed: Seed of RANSAC.
+
+    Attributes:
+        frames: The last LONGEST frames.
     """
 
     def __init__(self, lenses: Sequence[Lens], seed: int) -> None:
@@ -53,7 +66,16 @@ class Initialisation:
         self._count = 0
 
     def add(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> LandmarkMap | None:
-        """Takes a frame in; the map as soon as there is one, its last keyframe this frame."""
+        """Add a frame.
+
+        Args:
+            number: Number of the frame, increasing.
+            grey: (H, W) uint8.
+            valid: (H, W), False where no features may be tracked.
+
+        Returns:
+            The map, whose last keyframe is this frame; None as long as it cannot be initialised.
+        """
         ids, pixels = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
         if self.frames:
             last = self.frames[-1]
@@ -76,7 +98,7 @@ class Initialisation:
         return found
 
     def _matched(self, last: SeenFrame, grey: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Features of the frame before, found by their looks; they are added to that frame."""
+        """Match SIFT features with the frame before, where flow has lost too many. They are added to that frame."""
         a, b = describe(last.grey), describe(grey)
         pairs = matches(a, b)
         ids = np.arange(self._count, self._count + len(pairs))
@@ -103,7 +125,7 @@ class Initialisation:
         return best
 
     def _partner(self, frame: SeenFrame) -> int | None:
-        """Place of the frame that moved most against this one among those that share enough features with it."""
+        """Index of the frame with the largest motion to this one, among those that share enough features with it."""
         size = max(frame.grey.shape)
         best, best_shift = None, LEAST_SHIFT * size
         older = len(self.frames) - 1
@@ -127,10 +149,10 @@ class Initialisation:
         xyz: NDArray[np.float64],
         good: NDArray[np.bool_],
     ) -> tuple[LandmarkMap | None, float]:
-        """The map of a pair and of frames between, and its cost; None where it does not hold together."""
+        """Build the map of a pair and of frames between, with its cost; None if it is inconsistent."""
         landmarks = LandmarkMap(lens)
         landmarks.new_ids(self._count)
-        scale = 1.0 / float(np.median(xyz[good, 2]))  # the typical depth is the unit
+        scale = 1.0 / float(np.median(xyz[good, 2]))  # the median depth becomes 1
         landmarks.xyz[share[good]] = scale * xyz[good]
         landmarks.known[share[good]] = True
         T_last = T_b_a.copy()
@@ -168,7 +190,7 @@ class Initialisation:
 
     @staticmethod
     def _holds(landmarks: LandmarkMap, shared: int) -> bool:
-        """Whether most of what was seen agrees with the map."""
+        """Whether the map keeps enough landmarks and has a median reprojection error below 1 px."""
         _, _, ids = landmarks.observations([len(landmarks.keyframes) - 1])
         if len(ids) < max(FEWEST_SHARED // 2, 0.5 * shared):
             return False

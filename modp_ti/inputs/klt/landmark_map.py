@@ -1,4 +1,4 @@
-"""What a tracker has mapped: keyframes, and the landmarks that they see."""
+"""The tracker's map: keyframes and the landmarks that they observe."""
 
 from __future__ import annotations
 
@@ -15,19 +15,25 @@ from modp_ti.inputs.multiview.features import Features
 
 __all__ = ["Keyframe", "LandmarkMap"]
 
-# px: an observation farther than this from where its landmark projects is wrong.
+# Observations with a larger reprojection error [px] are outliers.
 MAX_ERROR = 2.5
-# Degrees between the rays of a new landmark: below, its depth is a guess.
+# Smallest angle [degrees] between the rays of a new landmark. With less parallax its depth is unreliable.
 MIN_ANGLE = 1.2
 
 
 @dataclass
 class Keyframe:
-    """A frame that the map is made of.
+    """A keyframe of the map.
 
-    number: of the frame. T_camera_world: (4, 4). grey: (H, W) uint8. ids: (N,) int64 of the features that it sees,
-    landmarks or not yet, with their pixels (N, 2) and rays (N, 2) in ideal coordinates. described: its SIFT features,
-    where they were asked for, and described_ids (M,) which of `ids` each is, -1 for none.
+    Attributes:
+        number: Number of the frame.
+        T_camera_world: (4, 4).
+        grey: (H, W) uint8.
+        ids: (N,) int64 of the features that it sees, triangulated or not.
+        pixels: (N, 2) their positions.
+        rays: (N, 2) their undistorted normalised coordinates.
+        described: Its M SIFT features; None until they are needed.
+        described_ids: (M,) the feature id of each SIFT feature, -1 for none.
     """
 
     number: int
@@ -41,23 +47,37 @@ class Keyframe:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Place of the camera (3,) in the world."""
+        """Camera centre (3,) in the world."""
         return inverse_se3(self.T_camera_world)[:3, 3]
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Remove all observations except those of the mask (N,)."""
         self.ids, self.pixels, self.rays = self.ids[kept], self.pixels[kept], self.rays[kept]
 
     def append(self, ids: NDArray[np.int64], pixels: NDArray[np.float64], rays: NDArray[np.float64]) -> None:
+        """Add observations (M,) with their pixels (M, 2) and normalised coordinates (M, 2)."""
         self.ids = np.concatenate([self.ids, ids])
         self.pixels = np.concatenate([self.pixels, pixels])
         self.rays = np.concatenate([self.rays, rays])
 
 
 class LandmarkMap:
-    """Keyframes and landmarks. A landmark's number is its place in the arrays here, and never given twice.
+    """Keyframes and landmarks. The id of a feature is its index in the arrays, and is never reused.
 
-    xyz: (C, 3) world. known: (C,) whether it has a place. first, first_slot: keyframe that saw it first, and its pixel
-    and ray there. looked, found: (C,) how often it was looked for from the map, and found.
+    Args:
+        lens: The camera.
+
+    Attributes:
+        lens: The camera.
+        keyframes: The keyframes in order.
+        xyz: (C, 3) positions in the world.
+        known: (C,) whether the feature is triangulated, and so is a landmark.
+        first: (C,) keyframe that saw the feature first; -1 for none.
+        first_pixel: (C, 2) its pixel there.
+        last: (C,) keyframe that saw it last; -1 for none.
+        last_pixel: (C, 2) its pixel there.
+        looked: (C,) how often `searched` has looked for the landmark.
+        found: (C,) how often it was found.
     """
 
     def __init__(self, lens: Lens) -> None:
@@ -74,7 +94,7 @@ class LandmarkMap:
         self.found = np.zeros(0, dtype=np.int64)
 
     def new_ids(self, count: int) -> NDArray[np.int64]:
-        """Numbers (count,) for features that nobody has seen before."""
+        """Reserve ids (count,) for new features."""
         ids = np.arange(self._count, self._count + count, dtype=np.int64)
         self._count += count
         if self._count > len(self.known):
@@ -94,27 +114,31 @@ class LandmarkMap:
         return ids
 
     def add_keyframe(self, keyframe: Keyframe) -> int:
-        """Number of the keyframe, now the last."""
+        """Append a keyframe and return its index."""
         self.keyframes.append(keyframe)
         k = len(self.keyframes) - 1
         self.note_observations(k, keyframe.ids, keyframe.pixels)
         return k
 
     def note_observations(self, k: int, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:
-        """Remember the first and the last keyframe that saw each feature."""
+        """Update the first and last observation of features (N,) that keyframe k sees at pixels (N, 2)."""
         fresh = self.first[ids] < 0
         self.first[ids[fresh]], self.first_pixel[ids[fresh]] = k, pixels[fresh]
         late = self.last[ids] <= k
         self.last[ids[late]], self.last_pixel[ids[late]] = k, pixels[late]
 
     def use_lens(self, lens: Lens) -> None:
-        """Take another camera: the rays of all that was observed follow."""
+        """Replace the camera and recompute the rays of all observations."""
         self.lens = lens
         for keyframe in self.keyframes:
             keyframe.rays = lens.rays(keyframe.pixels)
 
     def observations(self, keyframes: Iterable[int]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Keyframe, place within it and landmark, (M,) each, of what these keyframes see of landmarks with a place."""
+        """Observations of landmarks in these keyframes.
+
+        Returns:
+            Keyframe, index within the keyframe, and landmark id of each observation, (M,) each.
+        """
         of, place, ids = [], [], []
         for k in keyframes:
             slots = np.flatnonzero(self.known[self.keyframes[k].ids])
@@ -126,7 +150,7 @@ class LandmarkMap:
         return np.concatenate(of), np.concatenate(place), np.concatenate(ids)
 
     def triangulate(self, k: int) -> NDArray[np.int64]:
-        """Gives places to features of keyframe k whose ray there and in their first keyframe fix one; their numbers."""
+        """Triangulate features of keyframe k with their first observation. Returns the ids of the new landmarks."""
         keyframe = self.keyframes[k]
         slots = np.flatnonzero(~self.known[keyframe.ids] & (self.first[keyframe.ids] >= 0))
         slots = slots[self.first[keyframe.ids[slots]] != k]
@@ -145,7 +169,7 @@ class LandmarkMap:
         return np.concatenate(made) if made else np.zeros(0, dtype=np.int64)
 
     def discard_outliers(self, keyframes: Iterable[int]) -> None:
-        """Takes out what these keyframes observe where it is not, and landmarks that fewer than two still see."""
+        """Remove outlier observations of these keyframes, and landmarks that fewer than two keyframes still see."""
         touched = []
         for k in keyframes:
             keyframe = self.keyframes[k]
@@ -162,7 +186,7 @@ class LandmarkMap:
         for keyframe in self.keyframes:
             seen[keyframe.ids] += 1
         self.known[touched[seen[touched] < 2]] = False
-        # A first observation that was wrong must not place the feature again.
+        # Choose the first observation again from the remaining ones: an outlier must not triangulate the feature again.
         self.first[touched] = -1
         lost = np.zeros(len(self.known), dtype=bool)
         lost[touched] = True
@@ -179,9 +203,18 @@ def triangulated(
     max_error: float,
     min_angle: float = MIN_ANGLE,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Points (N, 3) nearest to two rays each, and which of them (N,) can be relied upon.
+    """Triangulate points by the midpoint method.
 
-    rays: (N, 2) ideal coordinates. max_error: in ideal coordinates, in both views. min_angle: degrees between the rays.
+    Args:
+        T_a_world: (4, 4) pose of the first view.
+        T_b_world: (4, 4) pose of the second view.
+        rays_a: (N, 2) normalised coordinates in the first view.
+        rays_b: (N, 2) normalised coordinates in the second view.
+        max_error: Largest reprojection error in each view, in normalised coordinates.
+        min_angle: Smallest angle between the rays in degrees.
+
+    Returns:
+        Points (N, 3) in the world, and a mask (N,) of the reliable ones.
     """
     if len(rays_a) == 0:
         return np.zeros((0, 3)), np.zeros(0, dtype=bool)

@@ -1,4 +1,4 @@
-"""The camera that a tracker reckons with: pixels to rays and back, on the images that it follows features in."""
+"""The tracker's camera model: conversion between pixels and rays in the tracked images."""
 
 from __future__ import annotations
 
@@ -16,13 +16,18 @@ __all__ = ["Lens"]
 
 
 class Lens:
-    """A camera of one of COLMAP's models; `camera` is pycolmap's, whose parameters a bundle adjustment may change."""
+    """A camera with one of COLMAP's models.
+
+    Args:
+        camera: The camera in pycolmap, whose parameters a bundle adjustment may optimise.
+    """
 
     def __init__(self, camera: pycolmap.Camera) -> None:
         self.camera = camera
 
     @classmethod
     def pinhole(cls, camera: PinholeCamera) -> Lens:
+        """A camera without distortion."""
         from modp_ti.files.quiet_pycolmap import pycolmap
 
         parameters = [camera.fx, camera.fy, camera.cx, camera.cy]
@@ -31,7 +36,7 @@ class Lens:
 
     @classmethod
     def radial(cls, focal: float, k: float, width: int, height: int) -> Lens:
-        """One focal length [px], one radial coefficient, the principal point in the middle."""
+        """A camera with one focal length [px], one radial coefficient and the principal point at the image centre."""
         from modp_ti.files.quiet_pycolmap import pycolmap
 
         parameters = [focal, width / 2, height / 2, k]
@@ -51,13 +56,13 @@ class Lens:
         return float(self.camera.mean_focal_length())
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Ideal coordinates (N, 2) of pixels (N, 2), centres at +0.5."""
+        """Undistorted normalised coordinates (N, 2) of pixels (N, 2), whose centres are at +0.5."""
         if len(pixels) == 0:
             return np.zeros((0, 2))
         return np.asarray(self.camera.cam_from_img(np.ascontiguousarray(pixels, dtype=np.float64)))
 
     def pixels(self, points_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels (N, 2) of camera-frame points (N, 3); NaN for those that are not before the camera."""
+        """Pixels (N, 2) of points (N, 3) in the camera frame; NaN for points that are not in front of the camera."""
         if len(points_camera) == 0:
             return np.zeros((0, 2))
         return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(points_camera, dtype=np.float64)))

@@ -1,4 +1,4 @@
-"""Where a camera is by the landmarks that it sees, and which of the map's landmarks it sees besides."""
+"""Localisation of a frame by its landmarks, and search for further landmarks of the map in it."""
 
 from __future__ import annotations
 
@@ -12,16 +12,28 @@ from modp_ti.inputs.multiview.camera_pose import pose_from_points, ray_errors, r
 
 __all__ = ["FEWEST", "MAX_ERROR", "SIGMA", "localised", "realigned", "searched"]
 
-MAX_ERROR = 3.0  # px: a landmark farther from where it should be is not followed on
-SIGMA = 1.0  # px
-FEWEST = 20  # landmarks that a pose rests upon
-SEARCHED = 300  # landmarks of the map that are looked for in a keyframe
+MAX_ERROR = 3.0  # landmarks with a larger reprojection error [px] are no longer tracked
+SIGMA = 1.0  # px, scale of the robust loss
+FEWEST = 20  # fewest landmarks for a pose
+SEARCHED = 300  # landmarks of the map that are searched for in a keyframe, at most
 
 
 def localised(
     landmarks: LandmarkMap, ids: NDArray[np.int64], pixels: NDArray[np.float64], T_guess: NDArray[np.float64], seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """Pose (4, 4) from features, and which (N,) to keep: landmarks that agree, and all that are none yet."""
+    """Localise a frame by its features.
+
+    Args:
+        landmarks: The map.
+        ids: (N,) features of the frame.
+        pixels: (N, 2) their positions.
+        T_guess: (4, 4) initial T_camera_world.
+        seed: Seed of RANSAC, which runs if too few landmarks agree with the pose refined from `T_guess`.
+
+    Returns:
+        T_camera_world (4, 4), and a mask (N,) of the features to keep: inlier landmarks and all features that are not
+        triangulated. None if too few landmarks agree.
+    """
     known = np.flatnonzero(landmarks.known[ids])
     if len(known) < FEWEST:
         return None
@@ -48,7 +60,18 @@ def searched(
     ids: NDArray[np.int64],
     pixels: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Landmarks (M,) of the map that should be in view and are not among `ids`, found there; their pixels."""
+    """Search an image for landmarks of the map that should be visible but are not tracked.
+
+    Args:
+        landmarks: The map.
+        T: (4, 4) T_camera_world of the image.
+        grey: (H, W) uint8.
+        ids: (N,) features that are already tracked.
+        pixels: (N, 2) their positions.
+
+    Returns:
+        Ids (M,) of the landmarks that were found, and their pixels (M, 2).
+    """
     height, width = grey.shape
     candidate = landmarks.known.copy()
     candidate[ids] = False
@@ -77,7 +100,18 @@ def realigned(
     ids: NDArray[np.int64],
     pixels: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Pixels (N, 2) of followed features, landmarks moved to where the keyframe that saw them first says."""
+    """Remove the drift of tracked landmarks by aligning them with patches of earlier keyframes.
+
+    Args:
+        landmarks: The map.
+        T: (4, 4) T_camera_world of the image.
+        grey: (H, W) uint8.
+        ids: (N,) tracked features.
+        pixels: (N, 2) their positions.
+
+    Returns:
+        Corrected positions (N, 2). Features without a successful alignment keep theirs.
+    """
     pixels = pixels.copy()
     known = np.flatnonzero(landmarks.known[ids])
     keyframe, pixel, visible = reference_views(landmarks, ids[known], T)
@@ -91,7 +125,7 @@ def realigned(
 def _spread(
     pixels: NDArray[np.float64], count: int, width: int, height: int, merit: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Places (M,) of at most `count` of the pixels (N, 2), spread over the image, those of most merit first."""
+    """Indices (M,) of at most `count` pixels (N, 2), spread over the image, with the highest `merit` first."""
     if len(pixels) <= count:
         return np.arange(len(pixels))
     cell = max(1.0, np.sqrt(width * height / count))

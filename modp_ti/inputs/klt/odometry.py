@@ -1,4 +1,4 @@
-"""Poses of frames as they arrive, and the map that they make: the tracker itself, apart from files and settings."""
+"""Visual odometry: poses of frames as they arrive and a map of landmarks, independent of files and settings."""
 
 from __future__ import annotations
 
@@ -20,29 +20,34 @@ from modp_ti.inputs.multiview.features import Features
 
 __all__ = ["Odometry", "View"]
 
-WANTED = 450  # features that are followed
-# A keyframe is made where the features have moved by this share of the image's longer side since the last one, or
-# where fewer than this share of its landmarks are still seen.
+WANTED = 450  # features that are tracked
+# A frame becomes a keyframe if the features have moved by KEYFRAME_SHIFT of the image's longer side since the last
+# keyframe, or if less than KEYFRAME_SHARE of its landmarks are still seen.
 KEYFRAME_SHIFT = 0.05
 KEYFRAME_SHARE = 0.65
-WINDOW = 8  # keyframes that a bundle adjustment moves
-HELD = 12  # keyframes that it holds
-WIDE_EVERY = 12  # keyframes between bundle adjustments of WIDE_WINDOW of them
+WINDOW = 8  # free keyframes of a local bundle adjustment
+HELD = 12  # fixed keyframes of a local bundle adjustment, at most
+WIDE_EVERY = 12  # keyframes between bundle adjustments of WIDE_WINDOW free ones
 WIDE_WINDOW = 30
-# Keyframes from which a camera that is unknown can be told: few of them fit any.
+# Numbers of keyframes from which focal length and distortion are estimated. Fewer keyframes fit almost any camera.
 FOCAL_FROM = 6
 DISTORTION_FROM = 12
 REFINED_AT = (6, 12, 24, 48)
-# Tries to find a lost camera: at every frame at first, then now and then.
+# Relocalisation is tried at each of the first EAGER frames after the track was lost, then at every LAZY-th frame.
 EAGER = 10
 LAZY = 5
 
 
 @dataclass
 class View:
-    """A frame with a pose: that of its keyframe and where it is from there.
+    """A frame with a pose relative to its keyframe.
 
-    ids, pixels: (N,), (N, 2) the landmarks seen, in the followed image.
+    Attributes:
+        number: Number of the frame.
+        keyframe: Index of its keyframe in the map.
+        T_camera_keyframe: (4, 4) pose relative to the keyframe.
+        ids: (N,) landmarks that it sees.
+        pixels: (N, 2) their positions in the tracked image.
     """
 
     number: int
@@ -54,7 +59,7 @@ class View:
 
 @dataclass
 class _State:
-    """What is followed: the last image, its pose, its features."""
+    """The last tracked frame: image, pose and features."""
 
     number: int
     grey: NDArray[np.uint8]
@@ -67,7 +72,7 @@ class _State:
 
 @dataclass
 class Counts:
-    """What became of the frames."""
+    """Statistics of the frames: lost, relocalised after a loss, and bridged by feature matching without a loss."""
 
     lost: int = 0
     recovered: int = 0
@@ -76,9 +81,16 @@ class Counts:
 
 
 class Odometry:
-    """Takes frames in their order and gives poses. lenses: one camera, or several of which the best is taken.
+    """Estimates poses of frames in order, and builds a map of keyframes and landmarks.
 
-    refines: whether the camera is refined with the map, for frames whose camera is unknown.
+    Args:
+        lenses: The camera, or several candidates. The initialisation chooses the one that fits best.
+        seed: Seed of RANSAC.
+        refines: Refine the camera together with the map, for images whose camera is unknown.
+
+    Attributes:
+        map: The map; None before the initialisation has succeeded.
+        counts: Statistics of the frames.
     """
 
     def __init__(self, lenses: Sequence[Lens], seed: int = 0, refines: bool = False) -> None:
@@ -94,17 +106,24 @@ class Odometry:
 
     @property
     def waiting(self) -> int:
-        """Frames that were taken in and have no pose yet, because there is no map."""
+        """Number of frames that wait for the initialisation of the map."""
         return len(self._initialisation.frames) if self._initialisation is not None else 0
 
     def pose(self, view: View) -> NDArray[np.float64]:
-        """T_camera_world (4, 4) of a view as the map has it now."""
+        """T_camera_world (4, 4) of a view in the current map."""
         return orthonormalised(view.T_camera_keyframe @ self.map.keyframes[view.keyframe].T_camera_world)
 
     def process(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> list[View]:
-        """Views that have got a pose with this frame, in their order: none, this one, or all since the start.
+        """Track one frame.
 
-        number: of the frame, increasing. grey: (H, W) uint8. valid: (H, W), False where nothing may be followed.
+        Args:
+            number: Number of the frame, increasing.
+            grey: (H, W) uint8.
+            valid: (H, W), False where no features may be tracked.
+
+        Returns:
+            The views that this frame adds, in order: none, this frame, or, when the map is initialised, all frames so
+            far that could be localised.
         """
         if self._initialisation is not None:
             found = self._initialisation.add(number, grey, valid)
@@ -122,7 +141,7 @@ class Odometry:
     # ------------------------------------------------------------------------------------------------- initialisation
 
     def _begin(self, landmarks: LandmarkMap) -> list[View]:
-        """Poses for the frames from which the map was made, and for those before."""
+        """Start from the initial map: localise the frames between its keyframes and those before the first one."""
         self.map = landmarks
         self._thumbnails = [thumbnail(keyframe.grey) for keyframe in landmarks.keyframes]
         frames, self._initialisation = self._initialisation.frames, None
@@ -161,7 +180,7 @@ class Odometry:
         return [views[i] for i in sorted(views)]
 
     def _backwards(self, frames: list[SeenFrame], first: int, views: dict[int, View]) -> None:
-        """Poses for the frames before the map's first, followed from there against time."""
+        """Localise the frames before the first keyframe by tracking from it backwards in time."""
         keyframe = self.map.keyframes[0]
         after = _State(
             keyframe.number, frames[first].grey, None, keyframe.T_camera_world, keyframe.ids, keyframe.pixels
@@ -192,7 +211,7 @@ class Odometry:
         predicted = orthonormalised(self._motion @ state.T)
         pixels, found = flow(state.grey, grey, state.pixels, self._predicted(predicted))
         located = localised(self.map, state.ids[found], pixels[found], predicted, self._seed)
-        if located is None:  # the motion may have been another
+        if located is None:  # retry without the constant-velocity prediction
             pixels, found = flow(state.grey, grey, state.pixels, state.pixels)
             located = localised(self.map, state.ids[found], pixels[found], state.T, self._seed)
         if located is None:
@@ -208,7 +227,7 @@ class Odometry:
         return self._view(number, T, ids[known], pixels[known])
 
     def _predicted(self, T: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the followed features will be seen from T; those without a place are as far as most others."""
+        """Predict the pixels of the tracked features at pose T. Untriangulated ones are given the median depth."""
         state = self._state
         known = self.map.known[state.ids]
         world = self.map.xyz[state.ids].copy()
@@ -217,7 +236,7 @@ class Odometry:
         rays = self.map.lens.rays(state.pixels[~known])
         world[~known] = (np.c_[rays, np.ones(len(rays))] * typical - state.T[:3, 3]) @ state.T[:3, :3]
         guess = self.map.lens.pixels(world @ T[:3, :3].T + T[:3, 3])
-        # What was seen off its projection is so still.
+        # The reprojection error of each feature is assumed to persist.
         here = self.map.lens.pixels(world @ state.T[:3, :3].T + state.T[:3, 3])
         guess = guess + (state.pixels - here)
         return np.where(np.isfinite(guess).all(axis=1)[:, None], guess, state.pixels)
@@ -235,7 +254,7 @@ class Odometry:
         return shift > (0.6 if self._refines else 1.0) * KEYFRAME_SHIFT * max(state.grey.shape)
 
     def _make_keyframe(self) -> None:
-        """The last frame becomes a keyframe: its landmarks placed exactly, more of them found, the map adjusted."""
+        """Make the last frame a keyframe: realign its landmarks, search for more, and adjust the map."""
         state = self._state
         ids = state.ids
         pixels = realigned(self.map, state.T, state.grey, ids, state.pixels)
@@ -290,7 +309,7 @@ class Odometry:
         landmarks.discard_outliers(free)
 
     def refine_camera(self) -> None:
-        """Bundle adjustment of the whole map and of the camera's focal length and distortion, as far as they show."""
+        """Bundle adjust the whole map and the focal length, and with enough keyframes the distortion."""
         count = len(self.map.keyframes)
         every = range(count)
         for _ in range(2):
@@ -298,7 +317,7 @@ class Odometry:
             self.map.discard_outliers(every)
 
     def _companions(self, free: list[int]) -> list[int]:
-        """Keyframes that see most of what `free` sees."""
+        """Other keyframes that share the most landmarks with `free`, at most HELD of them."""
         seen = np.zeros(len(self.map.known), dtype=bool)
         seen[self.map.observations(free)[2]] = True
         others = [k for k in range(len(self.map.keyframes)) if k not in set(free)]
@@ -312,7 +331,7 @@ class Odometry:
         return View(keyframe.number, k, np.eye(4), keyframe.ids[known], keyframe.pixels[known])
 
     def _view(self, number: int, T: NDArray[np.float64], ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> View:
-        """A view seen from its nearest keyframe in time, among those before it."""
+        """A view relative to the last keyframe before it."""
         k = max(
             (k for k, keyframe in enumerate(self.map.keyframes) if keyframe.number <= number),
             default=0,
@@ -325,7 +344,7 @@ class Odometry:
     # ------------------------------------------------------------------------------------------------- gaps
 
     def _bridge(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> View | None:
-        """A frame that flow does not reach from the one before: by its features, the frame before made a keyframe."""
+        """Localise a frame where optical flow fails by SIFT matches with the last keyframes and the frame before."""
         if self._state.keyframe is None:
             self._make_keyframe()
         features = describe(grey)
@@ -339,7 +358,7 @@ class Odometry:
         return view
 
     def _recover(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> View | None:
-        """A frame after the track was lost, by the keyframes that look most like it."""
+        """Relocalise a frame after the track was lost, against the most similar keyframes and the last one."""
         self._lost_for += 1
         if self._lost_for > EAGER and self._lost_for % LAZY:
             return None
@@ -364,7 +383,7 @@ class Odometry:
         features: Features,
         candidates: Sequence[int],
     ) -> View | None:
-        """The frame by the first of these keyframes that fits; it becomes a keyframe itself."""
+        """Localise the frame against the first candidate keyframe that fits, and make it a keyframe."""
         for k in candidates:
             placed = place_by_features(self.map, k, features, self._seed)
             if placed is None:

@@ -1,4 +1,4 @@
-"""Features that are followed from image to image: Shi-Tomasi corners and pyramidal Lucas-Kanade flow."""
+"""Feature tracking between images: Shi-Tomasi corners and pyramidal Lucas-Kanade flow."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 __all__ = ["corners", "flow"]
 
 WINDOW = (21, 21)
-LEVELS = 4  # above the image itself
-# A point that is followed there and back must come home this near [px].
+LEVELS = 4  # pyramid levels above the image itself, at most
+# Largest forward-backward error [px].
 ROUND_TRIP = 0.7
-# Least eigenvalue of a corner's gradients, as a share of the best corner's: of the whole image, and of its cell alone.
+# Smallest minimum eigenvalue of a corner's structure tensor, as a share of the best corner's.
 QUALITY = 0.002
-BORDER = 8  # px: nearer to the edge a window is cut off
+BORDER = 8  # px from the edge, where windows would be cut off
 
 
 def flow(
@@ -23,15 +23,24 @@ def flow(
     pixels: NDArray[np.float64],
     guess: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Where pixels (N, 2) of the image before are in the one after, and which were followed there and back.
+    """Track points from one image to the next, with a forward-backward check.
 
-    Both images (H, W) uint8, pixel centres at +0.5. guess: (N, 2) where they are looked for first.
+    Pixel centres are at +0.5.
+
+    Args:
+        before: (H, W) uint8.
+        after: (H, W) uint8.
+        pixels: (N, 2) points in `before`.
+        guess: (N, 2) initial positions in `after`.
+
+    Returns:
+        Positions (N, 2) in `after`, and a mask (N,) of the points that were tracked.
     """
     if len(pixels) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=bool)
     height, width = before.shape
     before = _lit_alike(before, after)
-    # cv2 counts pixel centres from 0 and wants float32.
+    # In cv2 the first pixel's centre is 0, and points are float32.
     start = (pixels - 0.5).astype(np.float32)[:, None]
     there = np.clip(guess - 0.5, (-width, -height), (2 * width, 2 * height)).astype(np.float32)[:, None]
     options = {
@@ -53,7 +62,7 @@ def flow(
 
 
 def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image before in the light of the one after: flow takes a brightness that changes for motion."""
+    """Match brightness and contrast of `before` to `after`, since flow mistakes exposure changes for motion."""
     (mean,), (deviation,) = (each.ravel() for each in cv2.meanStdDev(before))
     (mean_after,), (deviation_after,) = (each.ravel() for each in cv2.meanStdDev(after))
     gain = float(deviation_after / max(deviation, 1e-6))
@@ -63,7 +72,7 @@ def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[n
 
 
 def _levels(grey: NDArray[np.uint8]) -> int:
-    """Levels above the image that leave room for a window."""
+    """Number of pyramid levels above the image whose shorter side still exceeds two windows."""
     levels = 0
     while levels < LEVELS and min(grey.shape) >> (levels + 1) > 2 * WINDOW[0]:
         levels += 1
@@ -76,9 +85,16 @@ def corners(
     wanted: int,
     valid: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
-    """New corners (N, 2) of an image (H, W) uint8, centres at +0.5, on a grid, apart from those `taken` (M, 2).
+    """Detect new corners, distributed over a grid and away from existing features.
 
-    wanted: how many there should be together with those taken. valid: (H, W), False where none may be.
+    Args:
+        grey: (H, W) uint8.
+        taken: (M, 2) existing features.
+        wanted: Number of features, including `taken`.
+        valid: (H, W), False where no corner may be.
+
+    Returns:
+        Corners (N, 2), with pixel centres at +0.5.
     """
     height, width = grey.shape
     if min(height, width) <= 4 * BORDER:
@@ -90,7 +106,7 @@ def corners(
     usable = np.zeros((height, width), dtype=bool)
     usable[BORDER:-BORDER, BORDER:-BORDER] = True
     if valid is not None:
-        # A window that reaches over the mask's edge follows the edge.
+        # A window across the mask's edge would track the edge.
         usable &= cv2.erode(valid.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
     if len(taken):
         blocked = np.zeros((height, width), np.uint8)
@@ -112,7 +128,7 @@ def corners(
     of_cell, x, y, strength = of_cell[order], x[order], y[order], strength[order]
     first = np.searchsorted(of_cell, of_cell)
     rank = np.arange(len(of_cell)) - first + occupied[of_cell]
-    # One a cell first; where cells stay empty, the others' next best take their place.
+    # First the best corner of each cell, then the next best ones where cells have none.
     order = np.lexsort((-strength, rank))
     chosen = order[: max(0, wanted - len(taken))]
     chosen = chosen[rank[chosen] < 3]

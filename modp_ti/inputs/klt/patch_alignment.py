@@ -1,8 +1,7 @@
-"""Landmarks found again where the map says that they are: patches of their keyframes, warped to the view at hand.
+"""Alignment of landmarks with warped patches of the keyframes that observed them.
 
-What is followed from image to image slides off its place little by little; a patch that is always compared with the
-keyframe that saw the landmark first does not. Patches lie side by side in one picture, so that one call of
-Lucas-Kanade aligns all of them.
+Frame-to-frame tracking drifts. Alignment with a patch of the first keyframe does not. The patches are arranged in one
+mosaic, so that one call of Lucas-Kanade aligns all of them.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from modp_ti.inputs.klt.landmark_map import LandmarkMap
 
 __all__ = ["align_landmarks", "reference_views"]
 
-TILE = 40  # px, side of a patch with the room in which it is looked for
-WINDOW = 13  # px, what is compared
+TILE = 40  # side [px] of a patch with its search area
+WINDOW = 13  # side [px] of the compared window
 COLUMNS = 16
-# Correlation of two patches that show the same.
+# Smallest correlation of matching patches.
 ALIKE = 0.75
-# A patch is not warped by more than this, nor seen more aslant (degrees).
+# Largest change of scale, and of viewing direction [degrees], between a patch and the current view.
 LARGEST_ZOOM = 1.8
 LARGEST_TURN = 40.0
 
@@ -29,9 +28,18 @@ LARGEST_TURN = 40.0
 def reference_views(
     landmarks: LandmarkMap, ids: NDArray[np.int64], T_camera_world: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Keyframe (N,) and pixel (N, 2) from which each landmark looks most as it does from this pose, and whether it may.
+    """Choose the keyframe whose patch each landmark is aligned with.
 
-    That is the first keyframe that saw it, where that did so from a like direction and distance, else the last.
+    This is the first keyframe that saw the landmark if its viewing direction and distance are similar, otherwise the
+    last one.
+
+    Args:
+        landmarks: The map.
+        ids: (N,) landmarks.
+        T_camera_world: (4, 4) pose of the current view.
+
+    Returns:
+        Keyframe (N,), pixel (N, 2) in it, and a mask (N,) of the landmarks for which one of the two is similar enough.
     """
     centres = np.array([keyframe.centre for keyframe in landmarks.keyframes])
     to_here = landmarks.xyz[ids] - inverse_se3(T_camera_world)[:3, 3]
@@ -61,9 +69,19 @@ def align_landmarks(
     T_camera_world: NDArray[np.float64],
     guess: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Pixels (N, 2) of landmarks in an image (H, W) taken from about T_camera_world, and which were recognised there.
+    """Find landmarks in an image by aligning warped patches of keyframes.
 
-    keyframe, pixel: as from `reference_views`. guess: (N, 2) where they are looked for, within about 8 pixels.
+    Args:
+        landmarks: The map.
+        ids: (N,) landmarks.
+        keyframe: (N,) from `reference_views`.
+        pixel: (N, 2) from `reference_views`.
+        grey: (H, W) the image.
+        T_camera_world: (4, 4) its approximate pose.
+        guess: (N, 2) expected pixels, accurate to about 8 px.
+
+    Returns:
+        Pixels (N, 2), and a mask (N,) of the landmarks that were found.
     """
     count = len(ids)
     if count == 0:
@@ -117,7 +135,7 @@ def _warps(
     pixel: NDArray[np.float64],
     T_camera_world: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """How the pixels around each landmark move from its keyframe to here (N, 2, 2), were it a plane facing that one."""
+    """Local affine warps (N, 2, 2) from the keyframes to the current view, for planes that face the keyframe."""
     lens = landmarks.lens
     poses = np.array([each.T_camera_world for each in landmarks.keyframes])[keyframe]
     xyz = landmarks.xyz[ids]
@@ -133,19 +151,19 @@ def _warps(
 
 
 def _sampled(grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Grey values (N, a, b) at pixels (N, a, b, 2), centres at +0.5."""
+    """Bilinear samples (N, a, b) at pixels (N, a, b, 2), whose centres are at +0.5."""
     n, a, b, _ = pixels.shape
     x = np.ascontiguousarray(pixels[..., 0] - 0.5, dtype=np.float32).reshape(n * a, b)
     y = np.ascontiguousarray(pixels[..., 1] - 0.5, dtype=np.float32).reshape(n * a, b)
     out = np.empty((n * a, b), np.float32)
-    for start in range(0, n * a, 30000):  # cv2.remap takes no more than 32767 rows
+    for start in range(0, n * a, 30000):  # cv2.remap accepts at most 32767 rows
         part = slice(start, start + 30000)
         out[part] = cv2.remap(grey, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out.reshape(n, a, b)
 
 
 def _sampled_stack(tiles: NDArray[np.float32], near: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The middle of each tile (N, a, b): tiles have an even side, their middle is between pixels."""
+    """The window (N, a, b) at the centre of each tile. Tiles have an even side, so their centre is between pixels."""
     half = near.shape[0] // 2
     middle = TILE // 2
     block = tiles[:, middle - half - 1 : middle + half + 1, middle - half - 1 : middle + half + 1]
@@ -153,7 +171,7 @@ def _sampled_stack(tiles: NDArray[np.float32], near: NDArray[np.float64]) -> NDA
 
 
 def _mosaic(tiles: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Tiles (N, TILE, TILE) side by side, each of the same brightness and contrast."""
+    """Arrange tiles (N, TILE, TILE) in one image, each normalised to the same brightness and contrast."""
     inner = tiles[:, 6:-6, 6:-6]
     mean = inner.mean(axis=(1, 2), keepdims=True)
     deviation = np.maximum(inner.std(axis=(1, 2), keepdims=True), 3.0)

@@ -1,4 +1,4 @@
-"""Frames placed by what they look like: SIFT features matched with a keyframe's, for gaps that flow cannot cross."""
+"""Localisation of frames by SIFT matches with a keyframe, where optical flow fails."""
 
 from __future__ import annotations
 
@@ -14,18 +14,25 @@ from modp_ti.inputs.multiview.features import Features, detect_features, essenti
 
 __all__ = ["Placed", "alike_keyframes", "describe", "inherited", "matches", "place_by_features", "thumbnail"]
 
-# px of the followed image: a place that a feature's neighbours lend it, and one of its own.
+# Thresholds in px of the tracked image. MAX_ERROR is RANSAC's, and is wide because many depths are those of neighbours.
+# A SIFT feature nearer than SAME_PLACE to a landmark takes its depth.
 MAX_ERROR = 5.0
 SAME_PLACE = 2.0
-MAX_OFF_LINE = 3.0  # from the epipolar line
-NEIGHBOURHOOD = 40.0
-FEWEST = 15  # matches that agree with a pose
+MAX_OFF_LINE = 3.0  # distance to the epipolar line
+NEIGHBOURHOOD = 40.0  # distance to landmarks from which a depth is interpolated
+FEWEST = 15  # fewest inlier matches of a pose
 THUMBNAIL = (32, 24)
 
 
 @dataclass(frozen=True)
 class Placed:
-    """T_camera_world (4, 4) of a frame; pairs (M, 2): features of the keyframe and of the frame that agree with it."""
+    """A frame that was localised against a keyframe.
+
+    Attributes:
+        keyframe: Index of the keyframe.
+        T_camera_world: (4, 4) pose of the frame.
+        pairs: (M, 2) matches: indices of SIFT features in the keyframe and in the frame.
+    """
 
     keyframe: int
     T_camera_world: NDArray[np.float64]
@@ -33,31 +40,41 @@ class Placed:
 
 
 def describe(grey: NDArray[np.uint8]) -> Features:
-    """SIFT features of a followed image (H, W) uint8."""
+    """SIFT features of a tracked image (H, W) uint8."""
     return detect_features(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))
 
 
 def matches(a: Features, b: Features) -> NDArray[np.int64]:
-    """Pairs (M, 2) of features that are clearly each other's best."""
-    nowhere = np.zeros((3, 3))  # no epipolar line: every place of the other image will do
+    """Indices (M, 2) of unambiguous mutual matches."""
+    nowhere = np.zeros((3, 3))  # a zero essential matrix accepts all positions
     return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0).pairs
 
 
 def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """A small blurred picture as vector of mean 0 and length 1: 0 where the image is of one grey."""
+    """A small blurred image as a vector with mean 0 and length 1; zero for an image without contrast."""
     small = cv2.GaussianBlur(cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA), (5, 5), 0).astype(np.float32)
     small -= small.mean()
     return (small / max(float(np.linalg.norm(small)), 1.0)).reshape(-1)
 
 
 def alike_keyframes(thumbnails: NDArray[np.float32], grey: NDArray[np.uint8], count: int) -> list[int]:
-    """Numbers of the keyframes that look most like the image, best first."""
+    """Indices of the `count` keyframes whose thumbnails are most similar to the image, best first."""
     likeness = thumbnails @ thumbnail(grey)
     return [int(k) for k in np.argsort(-likeness, kind="stable")[:count]]
 
 
 def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: int) -> Placed | None:
-    """Pose of a frame with these features by those of keyframe k; None where too few agree."""
+    """Localise a frame by SIFT matches with keyframe k.
+
+    Args:
+        landmarks: The map.
+        k: Index of the keyframe.
+        features: SIFT features of the frame.
+        seed: Seed of RANSAC.
+
+    Returns:
+        The pose and its matches; None if too few matches agree.
+    """
     keyframe = landmarks.keyframes[k]
     if keyframe.described is None:
         keyframe.described = describe(keyframe.grey)
@@ -81,9 +98,20 @@ def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: 
 def inherited(
     landmarks: LandmarkMap, k: int, features: Features, pairs: NDArray[np.int64], T: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Features of keyframe k that were matched in a frame at T: their numbers and pixels there.
+    """Turn SIFT matches with keyframe k into tracked features.
 
-    Those that have none yet get one, and are observed by the keyframe from now on.
+    Matches far from their epipolar lines are dropped. SIFT features without an id get one and are added to the
+    keyframe's observations.
+
+    Args:
+        landmarks: The map.
+        k: Index of the keyframe.
+        features: SIFT features of the frame.
+        pairs: (M, 2) matches of `place_by_features`.
+        T: (4, 4) T_camera_world of the frame.
+
+    Returns:
+        Ids (N,) and their pixels (N, 2) in the frame.
     """
     keyframe = landmarks.keyframes[k]
     a, b = keyframe.described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
@@ -105,9 +133,10 @@ def inherited(
 
 
 def _places(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
-    """World points (M, 3) of a keyframe's SIFT features; NaN where nothing tells how far away they are.
+    """World points (M, 3) of a keyframe's SIFT features; NaN where the depth is unknown.
 
-    A feature that is a landmark lies there; any other at the depth of the landmarks around it, where they agree.
+    A feature that is a landmark has its position. Any other takes the depth of a landmark at the same pixel, or of the
+    landmarks around it if they agree.
     """
     pixels, ids = keyframe.described.pixels, keyframe.described_ids
     xyz = np.full((len(pixels), 3), np.nan)

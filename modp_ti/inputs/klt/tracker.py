@@ -1,4 +1,4 @@
-"""`KltTracker`: the odometry over a source's images, with the poses that it revises."""
+"""`KltTracker`: visual odometry on the images of a source, with corrections of earlier poses."""
 
 from __future__ import annotations
 
@@ -27,20 +27,30 @@ from modp_ti.inputs.sources.exif import focal_length_35mm
 
 __all__ = ["ArrivingNames", "KltTracker", "open_klt"]
 
-FOLLOWED_SIDE = 640  # px: features are followed in images of this longer side at most
-MAX_ERROR = 2.5  # px of those: a point farther from where it is seen is not delivered
+FOLLOWED_SIDE = 640  # longer side [px] of the images in which features are tracked, at most
+MAX_ERROR = 2.5  # points with a larger reprojection error [px of these images] are not delivered
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
-# px of the followed image: one keyframe that moved by the first is told of, with all that moved by the second.
+# Send a correction once a keyframe has moved by `TOLD_FROM` px of the tracked image; include every keyframe that has
+# moved by `MOVED` px.
 TOLD_FROM = 2.0
 MOVED = 0.2
 DIAGONAL_35MM = 43.27  # mm
 
 
 def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = None) -> KltTracker:
-    """The tracker over the source's images, its camera known: the source's own, of EXIF, or estimated now.
+    """Open the images of a source and return a tracker for them.
 
-    Raises InputError for images that are missing, unreadable or of more than one size.
+    If the source has no intrinsics, they are estimated from its first images; the focal length in EXIF, or a typical
+    one, is the initial value.
+
+    Args:
+        source: Settings of the images.
+        seed: Seed of RANSAC.
+        progress: Called during the estimation of the camera.
+
+    Raises:
+        InputError: If the images are missing, unreadable or of several sizes, or do not fit the intrinsics.
     """
     images = open_source(source)
     reader = FrameReader(images, source)
@@ -67,7 +77,12 @@ def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = 
 
 
 class ArrivingNames:
-    """Names of a source's images, each once it is there; may be iterated over again, and goes on where it was."""
+    """Names of a source's images as they arrive. Each iteration starts at the first image again.
+
+    Args:
+        images: The source.
+        source: Its settings, which select the frames.
+    """
 
     def __init__(self, images: ImageSource, source: SourceSettings) -> None:
         self._arriving = images.arriving(source.start, source.stop, source.step)
@@ -88,7 +103,7 @@ class ArrivingNames:
 
     @property
     def there(self) -> Sequence[str]:
-        """Names of all images that can be read by now."""
+        """Names of all images that are available so far."""
         source = self._source
         known = list(self._images.names[source.start : source.stop : source.step])
         return known if len(known) > len(self._names) else list(self._names)
@@ -113,7 +128,7 @@ def _require_one_size(images: ImageSource, names: Sequence[str], width: int, hei
 def _estimated(
     reader: FrameReader, arrived: ArrivingNames, blank: Intrinsics, seed: int, progress: Progress | None
 ) -> tuple[Intrinsics, str]:
-    """The camera by EXIF and by the images, and what to tell the user."""
+    """Estimate the camera from EXIF and the images. Returns it with a note for the user."""
     width, height = blank.camera.width, blank.camera.height
     there = arrived.there
     film = focal_length_35mm(reader.images.path / there[0])
@@ -121,7 +136,7 @@ def _estimated(
         TYPICAL_FOCAL * max(width, height) if film is None else film / DIAGONAL_35MM * float(np.hypot(width, height))
     )
     stride = int(np.clip(len(there) // CALIBRATION_FRAMES, 1, CALIBRATION_STRIDE))
-    # A live source has few images yet: those that come next will do.
+    # A live source has few images so far, so the next ones are awaited and used without a stride.
     names = there[::stride] if len(there) >= CALIBRATION_FRAMES else arrived
     undistorter = blank.undistorter(_followed_scale(width, height))
 
@@ -160,7 +175,7 @@ def _read(images: ImageSource, name: str, width: int, height: int) -> NDArray[np
 
 @dataclass
 class _Told:
-    """A frame that was delivered, and the pose that the mapper has for it."""
+    """A delivered frame with the pose that the mapper has for it."""
 
     name: str
     view: View
@@ -168,12 +183,20 @@ class _Told:
 
 
 class KltTracker(Tracker):
-    """A `Tracker` that finds poses and points in the images of `reader`'s source, as they arrive.
+    """A `Tracker` that estimates poses and sparse points from the images of `reader`'s source as they arrive.
 
-    `events` may be iterated over once; it delivers frames and, where bundle adjustment has moved earlier ones, their
-    corrections. The tracker itself may be iterated over as often as wanted: it gives all frames with their last poses,
-    and tracks them first where that was not done. Frames that cannot be placed are left out and counted in `notes`,
-    which grow until the last frame. All of it depends on the images and the seed alone.
+    `events` can be iterated over once. It delivers frames, and corrections when bundle adjustment has moved earlier
+    ones. The tracker itself can be iterated over repeatedly: it tracks the sequence if that has not been done, and then
+    yields all frames with their final poses. Frames that cannot be localised are skipped and counted in `notes`, which
+    are complete after the last frame. The result depends only on the images, the settings and the seed.
+
+    Args:
+        reader: Reads the images with their masks.
+        names: Names of the images as they arrive.
+        intrinsics: Camera and lens distortion of the stored images.
+        source: Settings of the images: scale, held-out frames.
+        seed: Seed of RANSAC.
+        notes: Notes to begin with.
     """
 
     reads_ahead: ClassVar[bool] = True
@@ -204,9 +227,10 @@ class KltTracker(Tracker):
         self._ended = False
 
     def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
-        """Frames as they get their poses, and corrections of those before.
+        """Iterate once over frames, when their poses are known, and corrections of earlier ones.
 
-        Raises InputError for an image that is unreadable, and where no frame could be placed at all.
+        Raises:
+            InputError: If too many images are unreadable, their sizes differ, or no frame can be localised.
         """
         return self._progress
 
@@ -219,7 +243,7 @@ class KltTracker(Tracker):
 
     @property
     def notes(self) -> list[str]:
-        """What the source has to say, and what the tracker has found so far."""
+        """Notes of the source, and of the tracker so far."""
         return [*self._reader.images.notes, *self._notes]
 
     @property
@@ -303,7 +327,7 @@ class KltTracker(Tracker):
         )
 
     def _points(self, told: _Told) -> SparsePoints:
-        """Landmarks that the frame sees where they should be, in pixels of the delivered image."""
+        """Landmarks of a frame whose reprojection error is small, in pixels of the delivered image."""
         landmarks = self._odometry.map
         ids = told.view.ids
         xyz = landmarks.xyz[ids]
@@ -317,7 +341,7 @@ class KltTracker(Tracker):
     # ----------------------------------------------------------------------------------------------- corrections
 
     def _corrections(self, least: float) -> Iterator[PoseCorrection]:
-        """At most one correction: of the frames of keyframes that moved, where one moved by `least` pixels or more."""
+        """Yield one correction if a keyframe has moved by at least `least` px, with the frames of all moved ones."""
         landmarks = self._odometry.map
         moved = {k: self._shift(k, T) for k, T in self._told_keyframes.items()}
         if max(moved.values()) < least:
@@ -340,7 +364,7 @@ class KltTracker(Tracker):
         )
 
     def _depth(self, k: int) -> float:
-        """Median depth of what keyframe k sees."""
+        """Median depth of the landmarks that keyframe k sees."""
         landmarks = self._odometry.map
         keyframe = landmarks.keyframes[k]
         ids = keyframe.ids[landmarks.known[keyframe.ids]]
@@ -348,7 +372,7 @@ class KltTracker(Tracker):
         return float(np.median(landmarks.xyz[ids] @ T[2, :3] + T[2, 3])) if len(ids) else 1.0
 
     def _shift(self, k: int, told: NDArray[np.float64]) -> float:
-        """How far [px of the followed image] what keyframe k sees has moved since its pose was told."""
+        """Approximate image motion [px of the tracked image] of keyframe k since its pose was last delivered."""
         landmarks = self._odometry.map
         change = landmarks.keyframes[k].T_camera_world @ inverse_se3(told)
         turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))

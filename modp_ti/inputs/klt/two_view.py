@@ -1,4 +1,4 @@
-"""The beginning: two views of a scene whose features match, and the motion between them."""
+"""Two-view geometry: relative motion and structure from matched features."""
 
 from __future__ import annotations
 
@@ -12,15 +12,20 @@ from modp_ti.inputs.klt.lens import Lens
 
 __all__ = ["TwoViews", "two_views"]
 
-MAX_ERROR = 1.5  # px
+MAX_ERROR = 1.5  # px, RANSAC threshold
 FEWEST = 40  # points with parallax
 
 
 @dataclass(frozen=True)
 class TwoViews:
-    """T_b_a: (4, 4), translation of length 1. xyz: (N, 3) in the frame of a; good: (N,) which can be relied upon.
+    """Relative motion of two views with triangulated points.
 
-    angle: median parallax of the good points, degrees. planar: whether a homography told the motion.
+    Attributes:
+        T_b_a: (4, 4), with a translation of length 1.
+        xyz: (N, 3) points in the frame of a.
+        good: (N,) mask of the reliable points.
+        angle: Median parallax of the good points in degrees.
+        planar: Whether the motion comes from a homography.
     """
 
     T_b_a: NDArray[np.float64]
@@ -33,10 +38,17 @@ class TwoViews:
 def two_views(
     lens: Lens, pixels_a: NDArray[np.float64], pixels_b: NDArray[np.float64], min_angle: float, seed: int
 ) -> TwoViews | None:
-    """Motion between two views of the same features (N, 2); None where they do not tell it.
+    """Estimate the motion between two views from an essential matrix, or a homography for a planar scene.
 
-    The essential matrix or, where a homography explains as much, that of a plane. min_angle: least parallax, degrees.
-    A view that only turned has none.
+    Args:
+        lens: The camera of both views.
+        pixels_a: (N, 2) features in the first view.
+        pixels_b: (N, 2) the same features in the second view.
+        min_angle: Smallest median parallax in degrees. Pure rotation has no parallax.
+        seed: Seed of RANSAC.
+
+    Returns:
+        Motion and points; None if the motion cannot be estimated reliably.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 

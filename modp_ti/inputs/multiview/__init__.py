@@ -1,1 +1,1 @@
-"""Features, poses and points of several views: what trackers without points of their own are completed with."""
+"""Multi-view geometry: features, poses and triangulated points, for trackers that provide no points."""

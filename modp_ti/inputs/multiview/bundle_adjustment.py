@@ -1,4 +1,4 @@
-"""Bundle adjustment of poses and points by what is seen of them, by pycolmap and Ceres."""
+"""Bundle adjustment of poses and points with pycolmap and Ceres."""
 
 from __future__ import annotations
 
@@ -17,10 +17,14 @@ __all__ = ["Bundle", "adjusted_bundle"]
 
 @dataclass(frozen=True)
 class Bundle:
-    """What an adjustment has found.
+    """Result of a bundle adjustment.
 
-    poses: T_camera_world (4, 4) of the views that were free. points: (P,) numbers of those that were seen, xyz: (P, 3)
-    their places. camera: the one given, refined where that was asked for. cost: mean of an observation [px^2 / 2].
+    Attributes:
+        poses: T_camera_world (4, 4) of the free views, by view.
+        points: (P,) indices of the observed points.
+        xyz: (P, 3) their positions.
+        camera: The camera, refined if requested.
+        cost: Mean cost per observation [px^2 / 2].
     """
 
     poses: dict[int, NDArray[np.float64]]
@@ -44,13 +48,25 @@ def adjusted_bundle(
     focal: bool = False,
     distortion: bool = False,
 ) -> Bundle | None:
-    """Poses of the views `free` and points of least robust reprojection error; None where Ceres finds none.
+    """Minimise the reprojection error under a Cauchy loss over poses and points.
 
-    camera: of all views, its camera_id 1. poses: T_camera_world (4, 4) by the views' numbers; those that are not free
-    are held; where all are free, the first two hold the world. view, point: (M,), pixels: (M, 2): what is seen of
-    which point where. xyz: (C, 3) places of the points, by their numbers. steps: Levenberg-Marquardt steps at most.
-    loss_width: of Cauchy's loss [px]. tolerance: share of the cost below which a step is the last. focal, distortion:
-    whether these of the camera are refined too.
+    Args:
+        camera: Camera of all views, with camera_id 1.
+        poses: T_camera_world (4, 4) by view. Views that are not free are fixed. If all are free, the first two fix the
+            gauge.
+        view: (M,) view of each observation.
+        point: (M,) point of each observation.
+        pixels: (M, 2) pixel of each observation.
+        xyz: (C, 3) initial positions of the points.
+        free: Views whose poses are optimised.
+        steps: Levenberg-Marquardt steps at most.
+        loss_width: Scale of the Cauchy loss [px].
+        tolerance: Relative change of the cost below which the optimisation stops.
+        focal: Also optimise the focal length.
+        distortion: Also optimise the distortion.
+
+    Returns:
+        The optimised poses, points and camera; None if Ceres finds no usable solution.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -85,7 +101,7 @@ def adjusted_bundle(
     options.ceres.loss_function_scale = loss_width
     solver = options.ceres.solver_options
     solver.max_num_iterations = steps
-    solver.num_threads = 1  # sums of several threads depend on who comes first
+    solver.num_threads = 1  # with several threads, the order of summation and so the result would vary between runs
     solver.function_tolerance = tolerance
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     if not summary.is_solution_usable():

@@ -1,4 +1,4 @@
-"""A camera's pose from points that it sees: RANSAC for a start, robust Gauss-Newton to the end."""
+"""Camera pose from 2D-3D correspondences: P3P with RANSAC, refined by robust Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ STEPS = 10
 def ray_errors(
     T_camera_world: NDArray[np.float64], xyz: NDArray[np.float64], rays: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distance (N,) of points (N, 3) from rays (N, 2) in ideal coordinates; infinite behind the camera."""
+    """Reprojection errors in normalised coordinates.
+
+    Args:
+        T_camera_world: (4, 4).
+        xyz: (N, 3) world points.
+        rays: (N, 2) observed normalised coordinates.
+
+    Returns:
+        Errors (N,), infinite for points behind the camera.
+    """
     p = xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     before = p[:, 2] > 1e-9
     z = np.where(before, p[:, 2], 1.0)
@@ -29,9 +38,17 @@ def refine_pose(
     sigma: float,
     steps: int = STEPS,
 ) -> NDArray[np.float64]:
-    """Pose (4, 4) of least robust reprojection error (Cauchy's, of width `sigma`), by Gauss-Newton.
+    """Minimise the reprojection error under a Cauchy loss by Gauss-Newton.
 
-    xyz: (N, 3) world points. rays: (N, 2) where they are seen, ideal coordinates. sigma: in ideal coordinates too.
+    Args:
+        T_camera_world: (4, 4) initial pose.
+        xyz: (N, 3) world points.
+        rays: (N, 2) observed normalised coordinates.
+        sigma: Scale of the loss, in normalised coordinates.
+        steps: Gauss-Newton steps at most.
+
+    Returns:
+        T_camera_world (4, 4).
     """
     T = np.array(T_camera_world, dtype=np.float64)
     scale = max(float(np.median(np.abs(xyz @ T[2, :3] + T[2, 3]))), 1e-9) if len(xyz) else 1.0
@@ -66,16 +83,23 @@ def refine_pose(
 def pose_from_points(
     xyz: NDArray[np.float64], rays: NDArray[np.float64], max_error: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """Pose (4, 4) by P3P and RANSAC, refined, and which points (N,) agree with it; None where no pose does.
+    """Estimate a pose by P3P with RANSAC and refine it.
 
-    xyz: (N, 3). rays: (N, 2) ideal coordinates. max_error: in ideal coordinates.
+    Args:
+        xyz: (N, 3) world points.
+        rays: (N, 2) observed normalised coordinates.
+        max_error: Inlier threshold, in normalised coordinates.
+        seed: Seed of RANSAC.
+
+    Returns:
+        T_camera_world (4, 4) and the inlier mask (N,); None if no pose is found.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     if len(xyz) < 4:
         return None
     options = pycolmap.AbsolutePoseEstimationOptions()
-    # In pixels of a camera of focal length 1000, so that the library's own thresholds are of the right size.
+    # In pixels of a camera with focal length 1000, because the library has built-in thresholds in pixels.
     options.ransac.max_error = 1000.0 * max_error
     options.ransac.random_seed = seed
     options.ransac.confidence = 0.9999

@@ -1,4 +1,4 @@
-"""Matches between pairs of views, joined to tracks: one place in each of several views."""
+"""Feature tracks from pairwise matches, with at most one feature per view in each track."""
 
 from __future__ import annotations
 
@@ -17,18 +17,24 @@ def feature_tracks(
     matches: Sequence[tuple[int, int, Matches]],
     aside: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """View, feature and track number, (M,) each, of every feature that belongs to a track.
+    """Join pairwise matches to tracks.
 
-    pixels: (N, 2) per view. matches: (view a, view b, their matches). The clearest matches are joined first,
-    and one that would put two places of a view into one track is left out: it is wrong, or one before it was,
-    and the clearer is the better guess. SIFT gives a place several features where its direction is unclear;
-    they count as the first of them.
-    aside: (views,) True for held-out ones: what they show makes no track and joins none, and takes its place in those
-    that the others make.
+    Matches are joined in the order of their ratio, most distinctive first. A match that would put two positions of one
+    view into a track is dropped: either it or an earlier one is wrong, and the more distinctive one is more likely
+    right. SIFT detects several features at one position if the orientation is ambiguous; they count as the first one.
+
+    Args:
+        pixels: (N, 2) features of each view.
+        matches: (view a, view b, their matches).
+        aside: (views,) True for held-out views. They neither start nor join tracks, but their features are added to the
+            tracks of the other views.
+
+    Returns:
+        View, feature and track, (M,) each, of every feature that belongs to a track.
     """
     if aside is None:
         aside = np.zeros(len(pixels), dtype=bool)
-    # Among the others first.
+    # Matches between two held-out views must not create tracks.
     matches = [each for each in matches if not (aside[each[0]] and aside[each[1]])]
     offset = np.concatenate([[0], np.cumsum([len(each) for each in pixels])]).astype(np.int64)
     place = np.arange(offset[-1])
@@ -46,9 +52,9 @@ def feature_tracks(
     frame = np.searchsorted(offset, nodes, side="right") - 1
     links = np.searchsorted(nodes, np.concatenate(joined)[clearest])
 
-    alone = aside[frame].tolist()  # nodes that join no others
+    alone = aside[frame].tolist()  # nodes of held-out views, which must not join other tracks
     parent = list(range(len(nodes)))
-    views = [1 << int(i) for i in frame]  # bit i: the track has a place in view i
+    views = [1 << int(i) for i in frame]  # bit i: the track has a feature in view i
 
     def root(node: int) -> int:
         while parent[node] != node:

@@ -1,4 +1,4 @@
-"""Image features, and which of them look alike in two views with known poses."""
+"""SIFT features, and matching of features between two views with known poses."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ MAX_FEATURES = 2000
 RATIO = 0.8
 CONTRAST = 0.02
 
-# Descriptors are whole numbers with squares that add up to this number's square at most: their float32
-# products are exact, so that matches do not depend on how a matrix product is split over threads.
+# Descriptors are integers whose norm is at most this number. Their float32 dot products are exact, so that matches do
+# not depend on how a matrix product is split over threads.
 DESCRIPTOR_NORM = 512
 
 
@@ -23,8 +23,10 @@ DESCRIPTOR_NORM = 512
 class Features:
     """Features of one image.
 
-    pixels: (N, 2) in the stored image, centres at +0.5. descriptors: (N, 128) uint8. pixel: size of a pixel
-    of the image that was searched, in pixels of the stored one.
+    Attributes:
+        pixels: (N, 2) in the stored image, with pixel centres at +0.5.
+        descriptors: (N, 128) uint8.
+        pixel: Pixel size of the resized image used for detection, in pixels of the stored image.
     """
 
     pixels: NDArray[np.float64]
@@ -34,10 +36,11 @@ class Features:
 
 @dataclass(frozen=True)
 class Matches:
-    """Features of two views that look alike.
+    """Matches between the features of two views.
 
-    pairs: (M, 2) int64, their numbers in both. ratio: (M,) squared distance of their descriptors over that to
-    the second best: the smaller, the clearer.
+    Attributes:
+        pairs: (M, 2) int64 indices of the features in both views.
+        ratio: (M,) squared descriptor distance over that to the second-best match; smaller is more distinctive.
     """
 
     pairs: NDArray[np.int64]
@@ -48,7 +51,12 @@ class Matches:
 
 
 def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES) -> Features:
-    """The `most` clearest SIFT features of an image (H, W, 3) uint8 RGB, at a longer side of at most 1000 pixels."""
+    """Detect SIFT features with RootSIFT descriptors.
+
+    Args:
+        image: (H, W, 3) uint8 RGB. A longer side above 1000 px is reduced to that.
+        most: Number of features, the strongest ones.
+    """
     import cv2
 
     height, width = image.shape[:2]
@@ -57,13 +65,13 @@ def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES) -> Featu
     small = (max(1, round(width / pixel)), max(1, round(height / pixel)))
     if small != (width, height):
         gray = cv2.resize(gray, small, interpolation=cv2.INTER_AREA)
-    # Without the precise upscale every place is a quarter of a pixel too far to the right and below.
+    # Without the precise upscale, all keypoints are shifted by a quarter of a pixel to the right and down.
     sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     keypoints, raw = sift.detectAndCompute(gray, None)
     if raw is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), pixel)
 
-    # cv2 counts pixel centres from 0.
+    # In cv2 the first pixel's centre is 0.
     places = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
     pixels = (places + 0.5) * np.divide((width, height), small)
     raw = raw.astype(np.float64)
@@ -73,7 +81,12 @@ def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES) -> Featu
 
 
 def essential_matrix(T_a_world: NDArray[np.float64], T_b_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """E (3, 3) with x_b^T E x_a = 0 for the ideal coordinates x_a, x_b of one point in two cameras."""
+    """Essential matrix E (3, 3) with x_b^T E x_a = 0 for normalised coordinates x_a, x_b of a point in two views.
+
+    Args:
+        T_a_world: (4, 4) pose of the first view.
+        T_b_world: (4, 4) pose of the second view.
+    """
     T_b_a = T_b_world @ np.linalg.inv(T_a_world)
     x, y, z = T_b_a[:3, 3]
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T_b_a[:3, :3]
@@ -87,10 +100,15 @@ def match_features(
     essential: NDArray[np.float64],
     band: float,
 ) -> Matches:
-    """Features that are each other's clearly best match near the epipolar line.
+    """Find mutual best matches near the epipolar line that pass the ratio test.
 
-    rays: ideal coordinates (N, 2). band: allowed distance from the line in image b, as ideal coordinate
-    (pixels / focal).
+    Args:
+        descriptors_a: (Na, 128) uint8.
+        descriptors_b: (Nb, 128) uint8.
+        rays_a: (Na, 2) normalised coordinates.
+        rays_b: (Nb, 2) normalised coordinates.
+        essential: (3, 3) essential matrix from a to b; zeros for no epipolar constraint.
+        band: Largest distance from the epipolar line in view b, in normalised coordinates (pixels / focal length).
     """
     if len(descriptors_a) < 2 or len(descriptors_b) < 2:
         return Matches(np.zeros((0, 2), dtype=np.int64), np.zeros(0))
@@ -99,9 +117,9 @@ def match_features(
     lines = np.c_[rays_a, np.ones(len(rays_a))] @ essential.T  # (Na, 3)
     lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
     off = lines.astype(np.float32) @ np.c_[rays_b, np.ones(len(rays_b))].T.astype(np.float32)
-    similarity[~(np.abs(off) <= band)] = -1.0  # also where the lens model has no ray
+    similarity[~(np.abs(off) <= band)] = -1.0  # written so that NaN, where the lens model has no ray, is excluded
 
-    # Mutual best first, by passes over whole rows; the second best is looked for among these few only.
+    # First the mutual best matches, by passes over whole rows. The second best is needed only for these few.
     row = np.arange(len(a))
     best_b = similarity.argmax(axis=1)
     top = similarity[row, best_b]

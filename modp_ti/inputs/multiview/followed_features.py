@@ -1,4 +1,4 @@
-"""Corners followed from frame to frame of a video with known poses: quick, where neighbouring frames look alike."""
+"""Corner tracking through a video with known poses, which is fast where neighbouring frames are similar."""
 
 from __future__ import annotations
 
@@ -15,25 +15,29 @@ from modp_ti.inputs.sources import ImageSource
 
 __all__ = ["EPIPOLAR_BAND", "FollowedFeatures", "follow_features", "looks_like_video"]
 
-MAX_SIDE = 640  # longer side of the images that corners are followed in
-CORNERS = 800  # followed at a time
-REFILL_BELOW = 0.8  # share of them below which new ones are looked for
-MIN_DISTANCE = 1 / 80  # between new corners, as a share of the longer side
-QUALITY = 0.01  # of the weakest corner, as a share of the strongest
-WINDOW, LEVELS = 21, 3  # of the optical flow
-THERE_AND_BACK = 1.0  # [px] that a corner may be away from its start when it is followed back
-EPIPOLAR_BAND = 3.0  # [px] that a corner may leave the line where exact poses allow it
+MAX_SIDE = 640  # longer side [px] of the images in which corners are tracked, at most
+CORNERS = 800  # corners tracked at a time
+REFILL_BELOW = 0.8  # share of CORNERS below which new ones are detected
+MIN_DISTANCE = 1 / 80  # distance between new corners, as a share of the longer side
+QUALITY = 0.01  # response of the weakest corner, as a share of the strongest
+WINDOW, LEVELS = 21, 3  # window [px] and pyramid levels of the optical flow
+THERE_AND_BACK = 1.0  # largest forward-backward error [px]
+EPIPOLAR_BAND = 3.0  # largest distance [px] from the epipolar line, for exact poses
 
-# Frames that are looked at to tell whether a sequence is a video, and the share of corners that must survive a step.
+# Frame pairs that are tested to decide whether a sequence is a video, and the share of corners that must be tracked.
 SAMPLES = 8
 SURVIVING = 0.5
 
 
 @dataclass(frozen=True)
 class FollowedFeatures:
-    """What was seen where: frame, track (M,) int64; pixels (M, 2) of the stored image, centres at +0.5.
+    """Observations of tracked corners.
 
-    pixel: size of a pixel of the image that was searched, in pixels of the stored one.
+    Attributes:
+        frame: (M,) int64 frame of each observation.
+        track: (M,) int64 track of each observation.
+        pixels: (M, 2) in the stored image, with pixel centres at +0.5.
+        pixel: Pixel size of the resized images used for tracking, in pixels of the stored images.
     """
 
     frame: NDArray[np.int64]
@@ -43,7 +47,7 @@ class FollowedFeatures:
 
 
 class _Picture:
-    """A frame as the optical flow takes it: grey and reduced, with its geometry."""
+    """A frame for the optical flow: a resized grey image with its camera and pose."""
 
     def __init__(self, images: ImageSource, frame: PosedImage) -> None:
         import cv2
@@ -60,23 +64,23 @@ class _Picture:
         self._to_stored = np.divide((width, height), self.size)
 
     def stored(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Pixels of the stored image; cv2 counts pixel centres from 0."""
+        """Pixels of the stored image, for pixels of the resized image in cv2's convention (first centre at 0)."""
         return (places.astype(np.float64) + 0.5) * self._to_stored
 
     def rays(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Ideal coordinates (N, 2) of places in the reduced image."""
+        """Normalised coordinates (N, 2) of pixels in the resized image."""
         camera, undistorter = self.frame.undistorter.camera, self.frame.undistorter
         return (undistorter.points(self.stored(places)) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
 
     def places(self, rays: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Places in the reduced image of ideal coordinates."""
+        """Pixels in the resized image of normalised coordinates (N, 2)."""
         raw = self.frame.undistorter.raw
         pixels = self.frame.undistorter.distortion.distort(rays) * (raw.fx, raw.fy) + (raw.cx, raw.cy)
         return (pixels / self._to_stored - 0.5).astype(np.float32)
 
     @property
     def focal(self) -> float:
-        """Focal length in pixels of the reduced image."""
+        """Focal length in pixels of the resized image."""
         return self.frame.undistorter.raw.focal / self.pixel
 
 
@@ -87,11 +91,15 @@ def follow_features(
     progress: Progress | None = None,
     band: float = EPIPOLAR_BAND,
 ) -> FollowedFeatures:
-    """Corners of the frames, each followed for as long as it is found again.
+    """Detect corners and track each one for as long as it is found.
 
-    solves: (F,) False for frames (held-out ones) that nothing is followed through: the chain leads from the frame
-    before them to the frame after, and they are told where its corners lie in them. So no place in another frame
-    depends on their images. band: [px] that a corner may leave the line where the poses allow it.
+    Args:
+        images: Source of the images.
+        frames: The F frames with their poses.
+        solves: (F,) False for held-out frames. Corners are tracked past them, from the frame before to the frame after,
+            and then from there into them, so that no observation in another frame depends on their images.
+        progress: Called after each frame.
+        band: Largest distance [px] from the epipolar line.
     """
     chain = np.flatnonzero(solves)
     seen: list[tuple[int, NDArray[np.int64], NDArray[np.float64]]] = []
@@ -114,7 +122,7 @@ def follow_features(
             tracks = np.concatenate([tracks, np.arange(next_track, next_track + len(fresh))])
             next_track += len(fresh)
         tell(index, places, tracks, picture)
-        # Held-out frames behind this one, and those before the first, branch off from it.
+        # Corners are tracked from this frame into the held-out frames that follow, and into those before the first.
         behind = range(index + 1, int(chain[done + 1]) if done + 1 < len(chain) else len(frames))
         for other in [*(range(index) if done == 0 else ()), *behind]:
             aside = _Picture(images, frames[other])
@@ -134,7 +142,13 @@ def follow_features(
 
 
 def looks_like_video(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
-    """Whether neighbouring frames look so alike that corners can be followed: tried at a few places of the sequence."""
+    """Whether corners can be tracked between neighbouring frames, tested at a few places of the sequence.
+
+    Args:
+        images: Source of the images.
+        frames: The F frames with their poses.
+        solves: (F,) False for held-out frames, which are not used.
+    """
     chain = np.flatnonzero(solves)
     if len(chain) < 2:
         return False
@@ -148,7 +162,7 @@ def looks_like_video(images: ImageSource, frames: Sequence[PosedImage], solves: 
 
 
 def _new_corners(picture: _Picture, places: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Corners (N, 2) away from the places that are followed already."""
+    """Detect corners (N, 2) away from those that are already tracked."""
     import cv2
 
     distance = MIN_DISTANCE * max(picture.size)
@@ -163,10 +177,10 @@ def _new_corners(picture: _Picture, places: NDArray[np.float32]) -> NDArray[np.f
 def _followed(
     one: _Picture, other: _Picture, places: NDArray[np.float32], band: float = EPIPOLAR_BAND
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Places (K, 2) in the other picture of those places (N, 2) that are found there, and their numbers (K,).
+    """Track pixels (N, 2) to another picture. Returns positions (K, 2) and indices (K,) of those that were found.
 
-    The search begins where the turn between the two poses takes each place; found is what leads back to where it came
-    from and lies near the line that the poses allow.
+    The initial position is predicted from the rotation between the two poses. A result must pass the forward-backward
+    check and lie near the epipolar line.
     """
     import cv2
 
@@ -201,10 +215,10 @@ def _followed(
 def _near_line(
     one: _Picture, other: _Picture, rays_one: NDArray[np.float64], rays_other: NDArray[np.float64], band: float
 ) -> NDArray[np.bool_]:
-    """Which of the rays (N, 2) of two pictures may belong to one point of the world, as the poses are."""
+    """Mask (N,) of the correspondences within `band` px of their epipolar line."""
     E = essential_matrix(one.frame.T_camera_world, other.frame.T_camera_world)
     lines = np.c_[rays_one, np.ones(len(rays_one))] @ E.T
     length = np.linalg.norm(lines[:, :2], axis=1)
     off = np.abs((lines * np.c_[rays_other, np.ones(len(rays_other))]).sum(axis=1))
-    # Where the camera has hardly moved there is no line: off and length are both nothing.
+    # Without camera motion there is no epipolar line: both sides are about 0, and the correspondence is accepted.
     return off * other.focal <= band * np.maximum(length, 1e-12)

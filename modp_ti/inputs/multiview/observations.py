@@ -1,4 +1,4 @@
-"""`Observations`: which frame sees which point where."""
+"""`Observations`: positions at which frames observe points."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ __all__ = ["Observations"]
 
 @dataclass(frozen=True)
 class Observations:
-    """What is seen of which point where.
+    """Observations of points in frames.
 
-    frame, point: (M,) int64. rays: (M, 2) ideal coordinates. sigma: (M,) their uncertainty, one pixel of
-    detection.
+    Attributes:
+        frame: (M,) int64 frame of each observation.
+        point: (M,) int64 point of each observation.
+        rays: (M, 2) normalised coordinates.
+        sigma: (M,) uncertainty in normalised coordinates: one pixel of the image used for detection.
     """
 
     frame: NDArray[np.int64]
@@ -27,11 +30,11 @@ class Observations:
         return len(self.frame)
 
     def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Observations:
-        """Those of a mask (M,) or of places (K,)."""
+        """Select observations by a mask (M,) or indices (K,)."""
         return Observations(self.frame[kept], self.point[kept], self.rays[kept], self.sigma[kept])
 
     def beside(self, other: Observations) -> Observations:
-        """These and the other ones, which are of other points."""
+        """Concatenate with observations of other points, which are renumbered to follow these."""
         first = int(self.point.max()) + 1 if len(self) else 0
         return Observations(
             np.concatenate([self.frame, other.frame]),

@@ -1,4 +1,4 @@
-"""Points placed by the rays that see them, under poses that are known."""
+"""Triangulation of points from several views with known poses."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from modp_ti.inputs.multiview.observations import Observations
 
 __all__ = ["MAX_ERROR", "placed_anew", "point_errors", "solve_points", "surest_points"]
 
-MAX_ERROR = 2.0  # pixels of the image that the features were found in
+MAX_ERROR = 2.0  # largest reprojection error [px of the image used for detection]
 
-# Followed corners: points of narrower angles [degrees] are used where a frame would have fewer than ENOUGH points.
+# For tracked corners: points with less parallax [degrees] are used only where a frame would otherwise have fewer than
+# ENOUGH points.
 SURE_ANGLE = 4.0
 ENOUGH = 50
 
-# Two views agree on any match along the epipolar line: it takes a third to confirm a point. Measured on a
-# real sequence: one in ten points of two views was off by more than 6 % in depth, one in a hundred with more
-# views.
+# Two views agree on any match along the epipolar line, so a third one must confirm a point. On a real sequence, one in
+# ten points of two views was off by more than 6 % in depth, and one in a hundred with more views.
 MIN_VIEWS = 3
-MIN_ANGLE = 1.5  # degrees between the rays that fix a point
+MIN_ANGLE = 1.5  # smallest parallax of a point in degrees
 SOLVER_STEPS = 6
 ROUNDS = 3
 
@@ -27,11 +27,20 @@ ROUNDS = 3
 def solve_points(
     poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_], max_error: float = MAX_ERROR
 ) -> tuple[NDArray[np.float64], Observations]:
-    """Positions (P, 3) of the points under the poses (F, 4, 4), and the observations that agree with them.
+    """Triangulate points robustly.
 
-    A point is kept where at least MIN_VIEWS frames with `solves` see it before them, within max_error, under
-    rays MIN_ANGLE apart; only these frames decide on its place. The others' observations are kept where they
-    agree. Point numbers of the result are those of the rows of the positions.
+    A point is kept if at least MIN_VIEWS frames with `solves` observe it in front of them within `max_error`, with a
+    parallax of at least MIN_ANGLE. Only these frames determine its position. Observations of the other frames are kept
+    if they agree.
+
+    Args:
+        poses: (F, 4, 4) T_camera_world.
+        seen: Observations.
+        solves: (F,) False for held-out frames.
+        max_error: Largest reprojection error [px of the image used for detection].
+
+    Returns:
+        Positions (P, 3), and the observations that agree with them, whose points index the rows of the positions.
     """
     used = seen.where(solves[seen.frame])
     used = used.where(np.isfinite(used.rays).all(axis=1))
@@ -43,7 +52,7 @@ def solve_points(
             break
         xyz = _refined(poses, used, _nearest_to_rays(poses, used, count))
         error = point_errors(poses, used, xyz)
-        # The worst observation of a point goes first: it may be what moved the point away from the others.
+        # Remove a point's worst observations first: they may have pulled it away from the good ones.
         worst = np.zeros(count)
         np.maximum.at(worst, used.point, error)
         good = (error <= max_error) | (error < 0.5 * worst[used.point])
@@ -61,9 +70,18 @@ def solve_points(
 def placed_anew(
     poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], solves: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """The points (P, 3) moved to where frames with `solves` (F,) see them under the poses (F, 4, 4).
+    """Refine points after their poses have changed.
 
-    A point stays where fewer than two of these see it, or where no place near its own has a smaller robust error.
+    A point is unchanged if fewer than two frames with `solves` observe it, or if its robust error does not decrease.
+
+    Args:
+        poses: (F, 4, 4) T_camera_world.
+        seen: Observations.
+        xyz: (P, 3) initial positions.
+        solves: (F,) False for held-out frames, which are not used.
+
+    Returns:
+        Positions (P, 3).
     """
     used = seen.where(solves[seen.frame])
     used = used.where(np.bincount(used.point, minlength=len(xyz))[used.point] >= 2)
@@ -80,9 +98,18 @@ def placed_anew(
 def surest_points(
     poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], solves: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], Observations]:
-    """The points with rays SURE_ANGLE apart at least, and those that some frame needs to have ENOUGH of them.
+    """Select points with a parallax of at least SURE_ANGLE, and others where a frame has fewer than ENOUGH points.
 
-    Errors of the given poses turn into depth the more, the narrower the angle.
+    With less parallax, errors of the given poses cause larger errors in depth.
+
+    Args:
+        poses: (F, 4, 4) T_camera_world.
+        seen: Observations.
+        xyz: (P, 3) positions.
+        solves: (F,) False for held-out frames, whose rays do not count.
+
+    Returns:
+        The selected positions and their observations.
     """
     angle = _widest_angle(poses, seen.where(solves[seen.frame]), xyz)
     kept = angle >= SURE_ANGLE
@@ -96,7 +123,7 @@ def surest_points(
 
 
 def _nearest_to_rays(poses: NDArray[np.float64], seen: Observations, count: int) -> NDArray[np.float64]:
-    """Points (count, 3) with the least sum of squared distances to their rays."""
+    """Points (count, 3) that minimise the sum of squared distances to their rays."""
     rotation, translation = poses[seen.frame, :3, :3], poses[seen.frame, :3, 3]
     direction = np.einsum("mji,mj->mi", rotation, np.c_[seen.rays, np.ones(len(seen))])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -108,7 +135,7 @@ def _nearest_to_rays(poses: NDArray[np.float64], seen: Observations, count: int)
 
 
 def _refined(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gauss-Newton on the reprojection errors under a Cauchy loss."""
+    """Minimise the reprojection errors of the points under a Cauchy loss by Gauss-Newton."""
     rotation, translation = poses[seen.frame, :3, :3], poses[seen.frame, :3, 3]
     for _ in range(SOLVER_STEPS):
         p = np.einsum("mij,mj->mi", rotation, xyz[seen.point]) + translation
@@ -126,21 +153,27 @@ def _refined(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.flo
 
 
 def _summed(point: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Sums (count, ...) of the values (M, ...) of each point."""
+    """Sum the values (M, ...) of each point; returns (count, ...)."""
     columns = values.reshape(len(values), -1).T
     sums = [np.bincount(point, weights=column, minlength=count) for column in columns]
     return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
 
 
 def _solved(left: NDArray[np.float64], right: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
-    """Solutions (P, 3) of small symmetric systems; zero for a point that nothing is known about."""
+    """Solve symmetric systems (P, 3, 3) with damping. Points without observations give zero."""
     trace = np.trace(left, axis1=1, axis2=2)
     left = left + np.eye(3) * (damping * trace + (trace == 0))[:, None, None]
     return np.linalg.solve(left, right[..., None])[..., 0]
 
 
 def point_errors(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Reprojection errors (M,) in pixels of detection; infinite behind the camera."""
+    """Reprojection errors (M,) [px of the image used for detection]; infinite behind the camera.
+
+    Args:
+        poses: (F, 4, 4) T_camera_world.
+        seen: M observations.
+        xyz: (P, 3) positions.
+    """
     p = np.einsum("mij,mj->mi", poses[seen.frame, :3, :3], xyz[seen.point]) + poses[seen.frame, :3, 3]
     before = p[:, 2] > 1e-9
     z = np.where(before, p[:, 2], 1.0)
@@ -149,9 +182,9 @@ def point_errors(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np
 
 
 def _widest_angle(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle [degrees] per point (P,) between two of its rays that are nearly the farthest apart.
+    """Approximate largest angle [degrees] (P,) between two rays of each point.
 
-    They are the ray farthest from the point's first one, and the one farthest from that.
+    It is the angle between the ray farthest from the point's first ray, and the ray farthest from that one.
     """
     count = len(xyz)
     centre = -np.einsum("mji,mj->mi", poses[seen.frame, :3, :3], poses[seen.frame, :3, 3])

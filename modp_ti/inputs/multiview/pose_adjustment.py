@@ -1,4 +1,4 @@
-"""Given poses made exact to a pixel: bundle adjusted with the points that they see, and left in their world."""
+"""Bundle adjustment of given poses to pixel accuracy, in the world frame of the given poses."""
 
 from __future__ import annotations
 
@@ -16,26 +16,35 @@ from modp_ti.inputs.multiview.point_solving import solve_points
 __all__ = ["adjusted_poses"]
 
 STEPS = 30
-FEWEST = 8  # points that a pose rests upon, and that hold neighbouring frames together
+FEWEST = 8  # fewest points for a pose, and shared points that connect two frames
 
 
 def adjusted_poses(
     poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_], gates: Sequence[float]
 ) -> NDArray[np.float64]:
-    """Poses (F, 4, 4) world to camera of least robust reprojection error, in the world of the given ones.
+    """Bundle adjust poses together with the points that they observe.
 
-    Frames with `solves` (F,) are moved together with the points. The others keep their place by the nearest of these
-    and are then moved by the points that they see. gates: reprojection errors [px of detection] beyond which an
-    observation takes no part, one for each round, falling: those that contradict wrong poses are just the ones that
-    can mend them. Frames that no points hold together are adjusted apart from each other, each such stretch turned,
-    moved and scaled as a whole to lie on its given poses.
+    Frames with `solves` are adjusted jointly with the points. Each of the others moves rigidly with the nearest
+    adjusted frame in time, and is then localised by the points that it observes. Sets of frames without shared points
+    are adjusted separately; each set is aligned with its given poses by a similarity transform.
+
+    Args:
+        poses: (F, 4, 4) given T_camera_world.
+        seen: Observations.
+        solves: (F,) False for held-out frames.
+        gates: Largest reprojection error [px of the image used for detection] of the observations used in each round,
+            in decreasing order. It starts wide, because the observations that contradict a wrong pose are needed to
+            correct it.
+
+    Returns:
+        Adjusted T_camera_world (F, 4, 4), in the world frame of the given poses.
     """
     given = poses
     for gate in gates:
         xyz, agreeing = solve_points(poses, seen, solves, gate)
         before, poses = poses, poses.copy()
         moved = np.zeros(len(poses), dtype=bool)
-        # What is far off pulls less; in the last rounds one pixel is as usual.
+        # The loss widens with the gate; in the last rounds its scale is the usual 1 px.
         width = max(1.0, gate / 4)
         for stretch in _stretches(agreeing, solves):
             mine = agreeing.where(np.isin(agreeing.frame, stretch))
@@ -54,7 +63,7 @@ def adjusted_poses(
 
 
 def _stretches(seen: Observations, solves: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Numbers of the solving frames that points hold together, for each such set of them."""
+    """Sets of solving frames that are connected by shared points, with at least three frames each."""
     used = seen.where(solves[seen.frame])
     used = used.where(np.lexsort((used.frame, used.point)))
     follows = used.point[1:] == used.point[:-1]
@@ -75,10 +84,13 @@ def _adjusted_stretch(
     xyz: NDArray[np.float64],
     loss_width: float,
 ) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64], NDArray[np.float64]] | None:
-    """Poses by frame, numbers (P,) of points and their places (P, 3), brought onto the given poses as a whole."""
+    """Bundle adjust one set of frames and align it with the given poses.
+
+    Returns the poses by frame, the indices (P,) of the points, and their positions (P, 3); None if it fails.
+    """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-    # Rays in pixels of detection: a camera of that focal length, its middle at 0.
+    # A camera whose pixels are those of detection and whose principal point is 0.
     focal = 1.0 / float(np.median(seen.sigma))
     side = int(2 * focal)
     camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=side, height=side, params=[focal, 0.0, 0.0])
@@ -98,7 +110,7 @@ def _adjusted_stretch(
         return None
     adjusted = np.stack([bundle.poses[i] for i in views])
     s, R, t = _alignment(adjusted, given[views])
-    # x_given = s R x_adjusted + t; the camera's frame grows with the world.
+    # x_given = s R x_adjusted + t. The camera frames scale with the world.
     adjusted[:, :3, :3] = adjusted[:, :3, :3] @ R.T
     adjusted[:, :3, 3] = s * adjusted[:, :3, 3] - adjusted[:, :3, :3] @ t
     return dict(zip(views, adjusted, strict=True)), bundle.points, s * bundle.xyz @ R.T + t
@@ -107,9 +119,9 @@ def _adjusted_stretch(
 def _alignment(
     source: NDArray[np.float64], target: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Scale, rotation (3, 3) and translation (3,) from the world of the poses (N, 4, 4) `source` to that of `target`.
+    """Similarity transform between the worlds of two sets of poses (N, 4, 4): scale, rotation (3, 3), translation (3,).
 
-    By the cameras' places and directions alike, so that a straight way or a turn on the spot has a rotation as well.
+    It uses camera centres and orientations, so that the rotation is also determined for straight or stationary paths.
     """
     a, b = (np.stack([inverse_se3(T)[:3, 3] for T in poses]) for poses in (source, target))
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
@@ -120,13 +132,13 @@ def _alignment(
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     extent = float((a * a).sum())
     s = float((b * (a @ R.T)).sum()) / extent if extent > 0 else 1.0
-    if not s > 0:  # the given places are noise
+    if not s > 0:  # the given camera centres are noise
         s = 1.0
     return s, R, mean_b - s * R @ mean_a
 
 
 def _carry_along(poses: NDArray[np.float64], before: NDArray[np.float64], moved: NDArray[np.bool_]) -> None:
-    """Frames that were not moved stay where they were beside the nearest in time that was."""
+    """Move each frame that was not adjusted rigidly with the adjusted frame that is nearest in time, in place."""
     there = np.flatnonzero(moved)
     if len(there) == 0:
         return
@@ -138,7 +150,7 @@ def _carry_along(poses: NDArray[np.float64], before: NDArray[np.float64], moved:
 def _resected(
     T: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], width: float
 ) -> NDArray[np.float64]:
-    """The pose (4, 4) of a frame moved by the points that it sees, where that makes them agree better."""
+    """Refine a pose (4, 4) by the points that it observes. Returns `T` if this increases the median error."""
     seen = seen.where(np.isfinite(seen.rays).all(axis=1))
     if len(seen) < FEWEST:
         return T

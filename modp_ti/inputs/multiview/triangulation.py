@@ -1,4 +1,4 @@
-"""Sparse points for posed images without any: features matched or followed from view to view, and triangulated."""
+"""Sparse points for posed images that come without: features are matched or tracked, and triangulated."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from modp_ti.inputs.sources import ImageSource
 
 __all__ = ["adjusted_frames", "neighbouring_views", "triangulated_frames"]
 
-# Pairs of views that are matched: these many frames apart, and as many of the nearest others by pose. The
-# growing gaps give parallax where the frames are those of a video.
+# Views are matched with those GAPS frames apart, and with the NEIGHBOURS nearest others by pose. The growing gaps give
+# parallax in videos.
 GAPS = (1, 2, 3, 5)
 NEIGHBOURS = 2
-MAX_TURN = 45.0  # degrees between the optical axes of views that are matched
+MAX_TURN = 45.0  # largest angle in degrees between the optical axes of matched views
 
-# Up to this many frames, features are matched between them: the wait is short, and frames may lie far apart.
+# Up to this many frames, SIFT features are always matched: it takes little time, and the frames may be far apart.
 FEW_FRAMES = 60
 FEATURES_OF_MANY_FRAMES = 1000
 
-# Poses that are adjusted: features may leave the epipolar line so far [px], and points their pixels in each round,
-# before and after places that are seen again have been matched.
+# For poses that are adjusted: largest distance [px] of features from the epipolar line, and largest reprojection error
+# in each round, before and after revisited places have been matched.
 WIDE_BAND = 12.0
 FIRST_GATES = (16.0, 8.0)
 GATES = (16.0, 8.0, 4.0, 2.0, 2.0)
-# Views that are matched to find places again: a new one where no more than this share of the last one's corners are
-# still followed. Each is matched with so many of the nearest by pose.
+# Revisited places: a view is selected when at most STILL_SEEN of the last selected view's corners are still tracked.
+# Each is matched with the REVISITED nearest ones by pose.
 STILL_SEEN = 0.7
 REVISITED = 6
 
@@ -46,14 +46,21 @@ def triangulated_frames(
     solves: NDArray[np.bool_],
     progress: Progress | None = None,
 ) -> list[PosedImage]:
-    """The frames with points that keep their ids from view to view.
+    """Triangulate points for frames with known poses.
 
-    solves: (F,) False for frames that must not take part in where a point lies (held-out ones): they are only
-    told which of the points they see. The result depends on nothing but the images and poses.
+    With few frames, SIFT features are matched between neighbouring views. With many, as in a video, corners are tracked
+    from frame to frame, which takes a tenth of the time. If the frames are too far apart for tracking, fewer SIFT
+    features per view are matched.
 
-    A few frames have their features matched with those of views around them. Of many, as of a video, corners are
-    followed from frame to frame, which takes a tenth of the time; where the frames are too far apart for that, fewer
-    features are matched.
+    Args:
+        images: Source of the images.
+        frames: The F frames with their poses.
+        solves: (F,) False for held-out frames. They do not influence the positions of points, and are only given the
+            points that they observe.
+        progress: Called during the computation.
+
+    Returns:
+        The frames with points, whose ids are the same in all views. The result depends only on the images and poses.
     """
     follows = _are_followed(images, frames, solves)
     seen = _seen(images, frames, solves, follows, EPIPOLAR_BAND, progress)
@@ -66,11 +73,19 @@ def adjusted_frames(
     solves: NDArray[np.bool_],
     progress: Progress | None = None,
 ) -> tuple[list[PosedImage], str]:
-    """The same with poses that are bundle adjusted with the points; and a remark on what that has done.
+    """Triangulate points as `triangulated_frames` does, and bundle adjust the poses with them.
 
-    A frame that does not solve takes no part in the others' poses and gets its own by the points that it sees.
+    Args:
+        images: Source of the images.
+        frames: The F frames with their poses.
+        solves: (F,) False for held-out frames. They do not influence other poses, and are localised by the points that
+            they observe.
+        progress: Called during the computation.
+
+    Returns:
+        The frames with adjusted poses and points, and a note on the change of the reprojection error.
     """
-    # Imported here: readers need no compiler.
+    # Imported here, because readers must not load Taichi.
     from modp_ti.inputs.multiview.pose_adjustment import adjusted_poses
 
     follows = _are_followed(images, frames, solves)
@@ -106,7 +121,7 @@ def _seen(
     band: float,
     progress: Progress | None,
 ) -> Observations:
-    """What the frames see, followed or matched."""
+    """Observations of the frames, from tracked corners or matched features."""
     if follows:
         return _followed(images, frames, solves, band, progress)
     most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
@@ -117,7 +132,7 @@ def _seen(
 def _with_points(
     frames: Sequence[PosedImage], seen: Observations, solves: NDArray[np.bool_], follows: bool
 ) -> list[PosedImage]:
-    """The frames with the points that are certain enough under their poses."""
+    """Triangulate the observations and give each frame its points."""
     poses = np.stack([frame.T_camera_world for frame in frames])
     xyz, seen = solve_points(poses, seen, solves)
     if follows:
@@ -133,7 +148,7 @@ def _with_points(
 
 
 def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_]) -> tuple[float, int]:
-    """Reprojection error [px of detection] of points placed under these poses, wide gates open; how many they are."""
+    """Median reprojection error [px] of points triangulated with these poses and the widest gate, and their number."""
     xyz, agreeing = solve_points(poses, seen, solves, GATES[0])
     errors = point_errors(poses, agreeing, xyz)
     return (float(np.median(errors)) if len(errors) else float("nan")), len(xyz)
@@ -146,7 +161,7 @@ def _followed(
     band: float,
     progress: Progress | None,
 ) -> Observations:
-    """Corners followed along the frames."""
+    """Observations of corners tracked along the frames."""
     found = follow_features(images, frames, solves, progress, band)
     rays = np.zeros((len(found.frame), 2))
     for i, frame in enumerate(frames):
@@ -167,7 +182,7 @@ def _matched(
     band: float,
     progress: Progress | None,
 ) -> Observations:
-    """Features, `most` a view, matched between those of the frames `views` (V,) that may see the same."""
+    """Observations of SIFT features, at most `most` per view, matched between neighbouring frames of `views` (V,)."""
     features: list[Features] = []
     rays: list[NDArray[np.float64]] = []
     for done, i in enumerate(views.tolist()):
@@ -196,15 +211,20 @@ def _matched(
 
 
 def _ideal(frame: PosedImage, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Ideal coordinates (N, 2) of pixels of the stored image."""
+    """Normalised coordinates (N, 2) of pixels of the stored image."""
     camera = frame.undistorter.camera
     return (frame.undistorter.points(pixels) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
 
 
 def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b, of views that may see the same, for poses (F, 4, 4) world to camera.
+    """Choose pairs of views that may see the same points.
 
-    neighbours: how many of the nearest by pose a view is paired with, besides those that are near in the order.
+    Args:
+        poses: (F, 4, 4) T_camera_world.
+        neighbours: Number of nearest views by pose that each view is paired with, in addition to those near in order.
+
+    Returns:
+        Pairs (a, b) with a < b.
     """
     count = len(poses)
     axes = poses[:, 2, :3]
@@ -222,7 +242,7 @@ def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS)
 
 
 def _views_apart(seen: Observations, solves: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Solving frames (V,), the first and each that sees less than STILL_SEEN of the one taken before."""
+    """Solving frames (V,): the first, and each that sees at most STILL_SEEN of the last selected one's points."""
     of = [seen.point[seen.frame == i] for i in range(len(solves))]
     views: list[int] = []
     for i in np.flatnonzero(solves).tolist():

@@ -1,6 +1,6 @@
-"""A server for trackers in other programs: their frames, poses, points and corrections come through a socket.
+"""A server that receives frames, poses, points and corrections from a tracker in another program through a socket.
 
-`docs/tracker_server.md` has the messages byte by byte.
+`docs/tracker_server.md` specifies the messages byte by byte.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One sender's connection: whole messages in, one line out."""
+"""The connection to one sender, which reads whole messages and sends short replies."""
 
 from __future__ import annotations
 
@@ -10,23 +10,27 @@ from modp_ti.inputs.tracker_server.messages import HEADER, Header, Hello, Kind, 
 
 __all__ = ["GLANCE", "Connection", "SenderGoneError"]
 
-# Seconds for the first message once it has begun: whoever stops in it must not keep a tracker out.
+# Timeout [s] for the first message after its first byte, so that a stalled client does not block a tracker.
 FIRST_PATIENCE = 5.0
-# What is read and thrown away after an error, so that closing does not take our last line back from the sender.
+# Time [s] for which input is still read and discarded after an error. Closing a socket with unread input resets the
+# connection, and the sender would lose the error message.
 DRAIN_SECONDS = 1.0
-# Seconds after which a thread that waits looks whether it is still wanted.
+# Interval [s] at which waiting threads check whether they should stop.
 GLANCE = 0.2
 CHUNK = 1 << 20
 
 
 class SenderGoneError(Exception):
-    """The connection is over, or silent for too long. The text says how."""
+    """The connection has ended or timed out. The text says how."""
 
 
 class Connection:
     """Reads messages from a connected socket.
 
-    patience: seconds in which each must be there as a whole. closed: set, by another thread, when no more is wanted.
+    Args:
+        sock: The socket.
+        patience: Timeout [s] for each whole message.
+        closed: Set by another thread to stop reading.
     """
 
     def __init__(self, sock: socket.socket, patience: float, closed: Event) -> None:
@@ -36,9 +40,17 @@ class Connection:
         self._reset = False
 
     def receive(self, hello: Hello | None) -> tuple[Header, bytes]:
-        """The next message, whose header is judged before its payload is read.
+        """Read the next message. Its header is checked before the payload is read.
 
-        Raises ProtocolError for one that is malformed or begins beyond its bounds, SenderGoneError at the end.
+        Args:
+            hello: The connection's HELLO; None before it.
+
+        Returns:
+            The header and the payload.
+
+        Raises:
+            ProtocolError: If the header is invalid.
+            SenderGoneError: If the connection ends or times out.
         """
         patience = self._patience if hello else min(self._patience, FIRST_PATIENCE)
         deadline = time.monotonic() + patience
@@ -60,7 +72,7 @@ class Connection:
                 where = "in mid-message" if begun or data else "without a message"
                 raise SenderGoneError(f"was silent for {patience:g} s {where}") from None
             except ConnectionResetError:
-                # Said once, by a sender that died with our WELCOME unread; what it had sent may still be there.
+                # A sender that exits without reading WELCOME causes one reset. What it sent may still be readable.
                 if self._reset:
                     raise SenderGoneError("is gone: the connection was reset") from None
                 self._reset = True
@@ -73,7 +85,7 @@ class Connection:
         return bytes(data)
 
     def say(self, kind: Kind, payload: bytes = b"") -> None:
-        """Tell the sender something; it need not listen."""
+        """Send a message. Errors are ignored, because the sender need not read replies."""
         try:
             self._socket.settimeout(DRAIN_SECONDS)
             self._socket.sendall(encoded(kind, payload))
@@ -81,7 +93,7 @@ class Connection:
             pass
 
     def refuse(self, reason: str | ProtocolError) -> None:
-        """Tell the sender in one line why this is the end, and end it."""
+        """Send the reason as a one-line ERROR and close the connection."""
         self.say(Kind.ERROR, " ".join(str(reason).split()).encode())
         deadline = time.monotonic() + DRAIN_SECONDS
         try:
@@ -93,5 +105,5 @@ class Connection:
         self.close()
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._socket.close()

@@ -1,4 +1,4 @@
-"""The frames that were delivered, with the poses and points that they have by now."""
+"""The delivered frames with their corrected poses and points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Delivered", "History"]
 
 @dataclass(frozen=True)
 class Delivered:
-    """A frame as it went to the mapper; its image and points lie on disk under its name."""
+    """A frame as delivered to the mapper. Its image and points are stored on disk under its name."""
 
     name: str
     timestamp: float
@@ -25,7 +25,7 @@ class Delivered:
 
 
 class History:
-    """Delivered frames by index, as corrections have left them."""
+    """Delivered frames in order, with all corrections applied."""
 
     def __init__(self) -> None:
         self.frames: list[Delivered] = []
@@ -33,14 +33,19 @@ class History:
         self._known: set[int] = set()
 
     def add(self, frame: Delivered, points: SparsePoints) -> None:
+        """Add a delivered frame with the points that it observes."""
         ids = points.ids.tolist()
         self._known.update(ids)
-        for i in ids:  # what a later frame says of a point is newer than a correction before it
+        for i in ids:  # a later frame's position of a point is newer than an earlier correction
             self._moved.pop(i, None)
         self.frames.append(frame)
 
     def correct(self, correction: PoseCorrection) -> None:
-        """Revise poses. A frame that is not named moves as the world around the named ones on both its sides does."""
+        """Apply a correction.
+
+        A frame without a corrected pose moves with the interpolated motion of the nearest corrected frames before and
+        after it, or with the motion of the nearest one where only one side has one.
+        """
         named = correction.index.tolist()
         motions = [
             inverse_se3(self.frames[i].T_camera_world) @ T
@@ -64,7 +69,7 @@ class History:
                 self._moved[i] = xyz
 
     def placed(self, points: SparsePoints) -> SparsePoints:
-        """Points of a frame at the places that they have by now."""
+        """Replace the positions of a frame's points with the corrected ones."""
         if not self._moved:
             return points
         pairs = zip(points.ids.tolist(), points.xyz, strict=True)

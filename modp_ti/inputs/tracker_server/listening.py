@@ -1,4 +1,4 @@
-"""Where the server listens: a TCP address, of this machine alone unless another is asked for, or a Unix socket."""
+"""The listening socket: a Unix socket, or a TCP address, which by default only this machine can reach."""
 
 from __future__ import annotations
 
@@ -12,16 +12,24 @@ from modp_ti.files.errors import InputError
 __all__ = ["DEFAULT_ADDRESS", "listen", "open_to_others"]
 
 DEFAULT_ADDRESS = "127.0.0.1:7007"
-# A Unix socket's path may have so many bytes.
+# Largest size of a Unix socket's path in bytes.
 MAX_SOCKET_PATH = 107
-# Connections that the system lets wait while a tracker is heard.
+# Backlog: connections that the system queues while the server reads from another one.
 WAITING = 8
 
 
 def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
-    """A listening socket and what to call it: at `path` where that is given, else at "host:port".
+    """Open a listening socket.
 
-    Raises InputError where it cannot be.
+    Args:
+        address: TCP address as "host:port"; None for `DEFAULT_ADDRESS`.
+        path: Path of a Unix socket, which is used instead of `address` if it is given.
+
+    Returns:
+        The socket and its name: "host:port" or "unix:path".
+
+    Raises:
+        InputError: If the address or path is invalid, in use or not available.
     """
     if path is not None:
         return _at_path(path), f"unix:{path}"
@@ -46,7 +54,7 @@ def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
 
 
 def open_to_others(listener: socket.socket) -> bool:
-    """Whether other machines can reach it."""
+    """Whether other machines can reach the socket."""
     if listener.family == socket.AF_UNIX:
         return False
     return not ipaddress.ip_address(listener.getsockname()[0]).is_loopback
@@ -76,7 +84,7 @@ def _at_path(path: Path) -> socket.socket:
 
 
 def _remove_left_over(path: Path) -> None:
-    """Take away a socket that nobody listens at any more. Raises InputError for anything else in the place."""
+    """Delete a stale socket. Raises InputError if a program listens there or the path is another kind of file."""
     try:
         mode = path.lstat().st_mode
     except OSError:

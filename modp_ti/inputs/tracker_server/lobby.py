@@ -1,4 +1,4 @@
-"""Who has connected and not said anything yet: nobody who keeps silent stands in the way of one who speaks."""
+"""Accepted connections that have not sent anything yet. Idle connections do not block an active one."""
 
 from __future__ import annotations
 
@@ -9,29 +9,34 @@ from collections import OrderedDict
 
 __all__ = ["HELLO_PATIENCE", "Lobby"]
 
-# Seconds for the first word.
+# Timeout [s] for the first byte of a connection.
 HELLO_PATIENCE = 30.0
-# Connections that may wait without one; of more, the oldest go.
+# Idle connections that are kept. If there are more, the oldest are closed.
 MAX_SILENT = 16
 
 
 class Lobby:
-    """Accepts connections and hands out the first of them that has something to say.
+    """Accepts connections and returns the first one that has sent data.
 
-    dropped: connections that went without a word, or were sent away for their silence.
+    Args:
+        listener: The listening socket.
+        patience: Timeout [s] for the first byte, at most `HELLO_PATIENCE`.
+
+    Attributes:
+        dropped: Number of connections that were closed because they sent nothing.
     """
 
     def __init__(self, listener: socket.socket, patience: float) -> None:
         self.dropped = 0
         self._listener = listener
         self._patience = min(patience, HELLO_PATIENCE)
-        self._silent: OrderedDict[socket.socket, float] = OrderedDict()  # since when
+        self._silent: OrderedDict[socket.socket, float] = OrderedDict()  # idle connections and their accept times
         self._selector = selectors.DefaultSelector()
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
 
     def next(self, timeout: float) -> socket.socket | None:
-        """A connection from which there is something to read, its end at least; None where none came in that time."""
+        """Return a connection with data to read or at its end, or None after `timeout` seconds without one."""
         self._send_away(lambda since: time.monotonic() - since > self._patience)
         spoken = None
         for key, _ in self._selector.select(timeout):
@@ -45,14 +50,14 @@ class Lobby:
         return spoken
 
     def close(self) -> None:
-        """Send all away who wait."""
+        """Close all idle connections."""
         self._send_away(lambda since: True, counts=False)
         self._selector.close()
 
     def _accept(self) -> None:
         try:
             sock, _ = self._listener.accept()
-        except OSError:  # it went before it was let in, or there are too many open files
+        except OSError:  # the client has disconnected, or there are too many open files
             return
         self._silent[sock] = time.monotonic()
         self._selector.register(sock, selectors.EVENT_READ)

@@ -1,4 +1,4 @@
-"""The messages: what their bytes mean, and what is refused. `docs/tracker_server.md` shows them byte by byte."""
+"""Parsing and validation of the messages. `docs/tracker_server.md` specifies them byte by byte."""
 
 from __future__ import annotations
 
@@ -44,34 +44,36 @@ VERSION = 1
 # All numbers are little-endian, without padding.
 HEADER = struct.Struct("<4sHHII")  # magic, version, kind, length of the payload, 0
 HELLO = struct.Struct("<IIII4d8d")  # width, height, encoding, lens, fx fy cx cy, coefficients; then the tracker's name
-FRAME = struct.Struct("<IId16dII")  # number, state, time, T_camera_world, points, bytes of the image; then both
-CORRECTION = struct.Struct("<II")  # poses, points; then both
+FRAME = struct.Struct("<IId16dII")  # number, state, time, T_camera_world, counts of points and image bytes; then both
+CORRECTION = struct.Struct("<II")  # counts of poses and points; then both
 POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("pixel", "<f8", 2)])
 MOVED_POSE = np.dtype([("number", "<u4"), ("zero", "<u4"), ("T", "<f8", (4, 4))])
 MOVED_POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3)])
 
-# Nothing is allocated for a message beyond these.
+# Limits: larger messages are refused before anything is allocated for them.
 MAX_SIDE = 16_384  # [px]
 MAX_PIXELS = 36_000_000  # an image of 8192x4320 fits
 MAX_POINTS = 100_000  # of a frame
 MAX_MOVED_POSES = 200_000  # of a correction
 MAX_MOVED_POINTS = 1_000_000
 MAX_NAME = 64  # bytes
-MOST_BYTES_A_PIXEL = 4  # a JPEG or PNG image beyond that, and beyond what its headers take, is none
+MOST_BYTES_A_PIXEL = 4  # largest JPEG or PNG image, plus IMAGE_OVERHEAD bytes for its headers
 IMAGE_OVERHEAD = 65_536
 
-# A rotation with less than this defect is taken bit for bit: its numbers are float64 already.
+# A pose closer than this to a rigid one is used bit for bit, since its error is only float64 rounding.
 ROUNDING = 1e-12
 
 
 class ProtocolError(Exception):
-    """What the other side sent is no message, or none at its place. The text is the one line that it is told."""
+    """A message is malformed or out of place. Its text is the one-line error that is sent back."""
 
 
 class UnfitError(ProtocolError):
-    """A message in its right form and place says what cannot be: it is left out, and the next one heard.
+    """A well-formed message has unusable content. It is skipped, and the connection continues.
 
-    number: of the frame that it is about, where it is one.
+    Args:
+        text: The error in one line.
+        number: The frame that the message is about; None if it is not about one frame.
     """
 
     def __init__(self, text: str, number: int | None = None) -> None:
@@ -80,7 +82,7 @@ class UnfitError(ProtocolError):
 
 
 class Kind(IntEnum):
-    """What a message is. From 64 on: those of the server."""
+    """The kind of a message. The server sends kinds from 64 on."""
 
     HELLO = 1
     FRAME = 2
@@ -93,7 +95,7 @@ class Kind(IntEnum):
 
 
 class Encoding(IntEnum):
-    """How images are stored. Pixels of RGBA images (PNG's too) whose alpha is 0 are ignored."""
+    """The image format. Pixels with alpha 0 are ignored, in RGBA8 and in PNG with alpha."""
 
     JPEG = 1
     PNG = 2
@@ -103,16 +105,17 @@ class Encoding(IntEnum):
 
     @property
     def channels(self) -> int | None:
-        """Bytes a pixel of a raw encoding; None for a file format."""
+        """Bytes per pixel of a raw encoding; None for a file format."""
         return {Encoding.GREY8: 1, Encoding.RGB8: 3, Encoding.RGBA8: 4}.get(self)
 
     @property
     def suffix(self) -> str:
+        """Suffix of stored images."""
         return {Encoding.JPEG: ".jpg", Encoding.PNG: ".png"}.get(self, f".{self.name.lower()}")
 
 
 class State(IntEnum):
-    """What the tracker knows of a frame's pose."""
+    """State of a frame's pose: sent later, known, or lost for good."""
 
     LATER = 0
     KNOWN = 1
@@ -121,7 +124,12 @@ class State(IntEnum):
 
 @dataclass(frozen=True)
 class Header:
-    """kind: of the message. length: bytes of payload that follow."""
+    """The header of a message.
+
+    Attributes:
+        kind: The kind of the message.
+        length: Size of the payload in bytes.
+    """
 
     kind: Kind
     length: int
@@ -129,7 +137,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Hello:
-    """The first message: the camera whose images will come."""
+    """The first message: camera, image encoding and name of the tracker."""
 
     intrinsics: Intrinsics
     encoding: Encoding
@@ -137,7 +145,7 @@ class Hello:
 
     @property
     def image_bytes(self) -> int:
-        """The most that one image takes."""
+        """Largest accepted size of one image in bytes; for raw encodings, the exact size."""
         pixels = self.intrinsics.camera.width * self.intrinsics.camera.height
         channels = self.encoding.channels
         return pixels * MOST_BYTES_A_PIXEL + IMAGE_OVERHEAD if channels is None else pixels * channels
@@ -145,10 +153,15 @@ class Hello:
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame, or a pose that comes after it: then without an image.
+    """A FRAME message, or a POSE message, which has no image.
 
-    number: of the sender's choice. T_camera_world: (4, 4), None unless `state` is KNOWN. points: the pixels are those
-    of the image as sent. image: its bytes as sent.
+    Attributes:
+        number: Frame number chosen by the sender.
+        state: Whether the pose is known.
+        timestamp: Time in seconds.
+        T_camera_world: (4, 4); None unless `state` is KNOWN.
+        points: Points that the frame sees, in pixels of the image as sent.
+        image: The bytes of the image as sent.
     """
 
     number: int
@@ -161,7 +174,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class Correction:
-    """Revised poses (N, 4, 4) of frames by their numbers (N,), and places (M, 3) of points by their ids (M,)."""
+    """Revised poses and points.
+
+    Attributes:
+        numbers: (N,) the sender's numbers of the revised frames.
+        T_camera_world: (N, 4, 4) their poses.
+        ids: (M,) ids of the revised points.
+        xyz: (M, 3) their positions in the world.
+    """
 
     numbers: NDArray[np.int64]
     T_camera_world: NDArray[np.float64]
@@ -170,15 +190,20 @@ class Correction:
 
 
 def encoded(kind: Kind, payload: bytes) -> bytes:
-    """A whole message."""
+    """Encode a message with its header."""
     return HEADER.pack(MAGIC, VERSION, kind, len(payload), 0) + payload
 
 
 def parse_header(data: bytes, hello: Hello | None) -> Header:
-    """The header in 16 bytes. hello: what the connection began with, which bounds the payload; None at its start.
+    """Parse a message header.
 
-    Raises ProtocolError for what is none, for a kind that only the server sends and for a payload too long or too
-    short.
+    Args:
+        data: The 16 bytes of the header.
+        hello: The connection's HELLO, which limits the size of images; None before it.
+
+    Raises:
+        ProtocolError: If the header is invalid, its kind is unknown or unexpected here, or its payload is too long or
+            too short.
     """
     magic, version, kind, length, zero = HEADER.unpack(data)
     if magic != MAGIC:
@@ -210,7 +235,7 @@ def parse_header(data: bytes, hello: Hello | None) -> Header:
 
 
 def parse_hello(payload: bytes) -> Hello:
-    """Raises ProtocolError for a camera that cannot be."""
+    """Parse the payload of HELLO. Raises ProtocolError for an invalid camera, encoding or name."""
     width, height, encoding, lens, *numbers = HELLO.unpack_from(payload)
     (fx, fy, cx, cy), k = numbers[:4], numbers[4:]
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
@@ -243,15 +268,21 @@ def parse_hello(payload: bytes) -> Hello:
         require_plausible(camera, distortion, "HELLO")
     except InputError as error:
         raise ProtocolError(str(error)) from None
-    # A terminal shows it: nothing that it could take for more than text.
+    # The name is printed to the terminal, so control characters are removed.
     name = "".join(c if c.isalnum() or c in " ._-" else "?" for c in name)
     return Hello(Intrinsics(camera, distortion), Encoding(encoding), name)
 
 
 def parse_frame(payload: bytes, kind: Kind) -> Frame:
-    """The payload of a FRAME, or of a POSE, which is the same without an image.
+    """Parse the payload of a FRAME, or of a POSE, which has the same layout without an image.
 
-    Raises ProtocolError for sizes that disagree, UnfitError for numbers that are no pose, time or point.
+    Args:
+        payload: The payload.
+        kind: FRAME or POSE.
+
+    Raises:
+        ProtocolError: If sizes disagree, or the state is invalid here.
+        UnfitError: If the pose, the time stamp or a point is invalid.
     """
     number, state, timestamp, *matrix, count, length = FRAME.unpack_from(payload)
     what = f"{kind.name} {number}"
@@ -282,7 +313,7 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
 
 
 def parse_points(block: bytes, what: str) -> SparsePoints:
-    """Points of a frame. what: begins the message of the UnfitError for those that cannot be."""
+    """Parse the points of a frame. Raises UnfitError, whose message begins with `what`, if they are invalid."""
     table = np.frombuffer(block, dtype=POINT)
     if not all((np.abs(table[name]) <= FARTHEST).all() for name in ("xyz", "pixel")):
         raise UnfitError(f"{what}: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
@@ -293,7 +324,12 @@ def parse_points(block: bytes, what: str) -> SparsePoints:
 
 
 def parse_correction(payload: bytes) -> Correction:
-    """Raises ProtocolError for sizes that disagree, UnfitError for poses that are none and what is named twice."""
+    """Parse the payload of a CORRECTION.
+
+    Raises:
+        ProtocolError: If sizes disagree, or there is no pose.
+        UnfitError: If a pose or point is invalid, frames are not in increasing order, or a point is listed twice.
+    """
     poses, points = CORRECTION.unpack_from(payload)
     middle = CORRECTION.size + poses * MOVED_POSE.itemsize
     size = middle + points * MOVED_POINT.itemsize

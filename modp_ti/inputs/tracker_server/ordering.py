@@ -1,4 +1,4 @@
-"""Frames in their order, each once its pose is known, with the corrections between them."""
+"""Puts frames and corrections in order and holds frames back until their poses are known."""
 
 from __future__ import annotations
 
@@ -13,45 +13,48 @@ from modp_ti.inputs.tracker_server.messages import Correction, Frame, ProtocolEr
 
 __all__ = ["Ordering"]
 
-# What may wait behind a frame without a pose; images wait on disk.
+# Limits of what may wait behind a frame without a pose. Images wait on disk.
 MAX_WAITING = 2_000  # frames and corrections
-MAX_WAITING_BYTES = 256 << 20  # of points and poses
-MAX_WAITING_IMAGES = 4 << 30  # bytes, on disk
-# Corrections between two frames: each costs as much as all poses so far.
+MAX_WAITING_BYTES = 256 << 20  # bytes of points and poses
+MAX_WAITING_IMAGES = 4 << 30  # bytes of images on disk
+# Corrections between two frames. Each one costs time proportional to all frames so far.
 MAX_CORRECTIONS = 100
 NO_POINTS = SparsePoints(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
 
 class Ordering:
-    """Takes messages as they arrive, gives frames with poses and corrections in the order in which they began.
+    """Receives messages as they arrive, and yields posed frames and corrections in the order in which they were sent.
 
-    A frame whose pose comes later holds up all after it; one that is lost is left out.
+    A frame whose pose comes later delays everything after it. Lost frames are skipped.
+
+    Attributes:
+        lost: Number of frames that were skipped because they have no pose.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self._waiting: deque[Frame | Correction] = deque()
-        self._late: dict[int, Frame] = {}  # poses of frames that came without, to be delivered
+        self._late: dict[int, Frame] = {}  # POSE messages of frames that are not delivered yet
         self._undecided: set[int] = set()
         self._posed: set[int] = set()
         self._left_out: set[int] = set()
         self._bytes = 0
-        self._images: deque[int] = deque()  # bytes of the images of frames that wait
+        self._images: deque[int] = deque()  # image sizes in bytes of the waiting frames
         self._corrections = 0  # since the last frame
         self._last: Frame | None = None
 
     @property
     def begun(self) -> bool:
-        """Whether a frame has come."""
+        """Whether a frame has arrived."""
         return self._last is not None
 
     @property
     def undecided(self) -> int:
-        """Frames that still wait for their pose."""
+        """Number of frames whose pose has not arrived."""
         return len(self._undecided)
 
     def require_next(self, frame: Frame) -> None:
-        """Raises UnfitError where the frame does not come after those before it."""
+        """Raise UnfitError unless the frame's number and time stamp exceed those of the last frame."""
         if self._last is None:
             return
         if frame.number <= self._last.number:
@@ -64,7 +67,12 @@ class Ordering:
             )
 
     def add_frame(self, frame: Frame) -> None:
-        """Take a frame in; its image is of no interest here. Raises UnfitError as `require_next` does."""
+        """Add a frame; only the size of its image is kept.
+
+        Raises:
+            UnfitError: As for `require_next`.
+            ProtocolError: If too much waits for a pose.
+        """
         self.require_next(frame)
         self._corrections = 0
         self._left_out.discard(frame.number)
@@ -77,7 +85,11 @@ class Ordering:
         self._wait(frame)
 
     def add_pose(self, pose: Frame) -> None:
-        """What became of a frame's pose. Raises ProtocolError where that is not open."""
+        """Add the pose of a frame that was sent without one, or the fact that it is lost.
+
+        Raises:
+            ProtocolError: If no such frame waits for its pose, or too much waits for a pose.
+        """
         if pose.number in self._left_out:
             return
         if pose.number not in self._undecided:
@@ -91,7 +103,12 @@ class Ordering:
         self._hold(_size(pose))
 
     def add_correction(self, correction: Correction) -> None:
-        """Raises UnfitError where it names a frame that has no pose."""
+        """Add a correction. Skipped frames are removed from it.
+
+        Raises:
+            UnfitError: If it contains a frame without a pose.
+            ProtocolError: If there are too many corrections without a frame between them, or too much waits for a pose.
+        """
         self._corrections += 1
         if self._corrections > MAX_CORRECTIONS:
             raise ProtocolError(f"more than {MAX_CORRECTIONS} CORRECTIONs without a FRAME between them: send fewer")
@@ -105,7 +122,10 @@ class Ordering:
         self._wait(replace(correction, numbers=numbers, T_camera_world=correction.T_camera_world[heard]))
 
     def leave_out(self, number: int) -> None:
-        """A frame that is of no use, or its pose: what else is said of it is not heard. Not one that had a pose."""
+        """Skip a frame without a usable pose or image, and ignore later messages about it.
+
+        Frames that already have a pose are not affected.
+        """
         if number in self._posed:
             return
         self._left_out.add(number)
@@ -114,7 +134,7 @@ class Ordering:
             self._late[number] = Frame(number, State.LOST, 0.0, None, NO_POINTS, b"")
 
     def ready(self) -> Iterator[Frame | Correction]:
-        """What can be delivered by now: frames with their poses, and corrections of frames before them."""
+        """Yield the frames with known poses, and the corrections, that no earlier frame without a pose delays."""
         while self._waiting:
             item = self._waiting[0]
             if isinstance(item, Frame) and item.state is State.LATER:
@@ -134,7 +154,7 @@ class Ordering:
                 yield item
 
     def close(self) -> None:
-        """No pose will come any more: frames without count as lost."""
+        """End the stream: frames that still wait for a pose become lost."""
         for item in self._waiting:
             if isinstance(item, Frame) and item.number in self._undecided:
                 self._late[item.number] = replace(item, state=State.LOST)
@@ -156,5 +176,5 @@ class Ordering:
 
 
 def _size(item: Frame | Correction) -> int:
-    """Bytes that it holds in memory, about."""
+    """Approximate memory of a message in bytes."""
     return 48 * len(item.points) if isinstance(item, Frame) else 136 * len(item.numbers) + 32 * len(item.ids)

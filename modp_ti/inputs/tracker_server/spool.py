@@ -1,4 +1,4 @@
-"""What came through the server, kept on disk as it came, so that frames can be looked at again."""
+"""Storage of received images and points on disk, so that frames can be read again."""
 
 from __future__ import annotations
 
@@ -19,18 +19,21 @@ from modp_ti.inputs.tracker_server.messages import POINT, Encoding, Frame, Hello
 
 __all__ = ["Spool", "SpoolFullError"]
 
-# What must stay free on the disk [bytes].
+# Disk space that must stay free [bytes].
 KEPT_FREE = 1 << 30
 
 
 class SpoolFullError(Exception):
-    """The disk has no room for another frame. The text says so in a line."""
+    """The disk has no space for another frame. The text is one line."""
 
 
 class Spool(ImageSource):
-    """The images that have arrived, in a temporary folder of its own until `close`.
+    """An `ImageSource` of the received images, stored in a temporary folder until `close`.
 
-    A frame is named by its number at the sender.
+    Frames are named after the sender's frame numbers.
+
+    Args:
+        hello: The HELLO message, with camera and image encoding.
     """
 
     def __init__(self, hello: Hello) -> None:
@@ -44,9 +47,14 @@ class Spool(ImageSource):
         self._last: tuple[str, NDArray[np.uint8]] | None = None
 
     def add(self, frame: Frame) -> str:
-        """Keep the frame's image; its name. Raises UnfitError for an image that is not what HELLO said.
+        """Store a frame's image.
 
-        Raises SpoolFullError where the disk has no room.
+        Returns:
+            The name of the frame.
+
+        Raises:
+            UnfitError: If the image does not match HELLO or does not decode.
+            SpoolFullError: If the disk has no space.
         """
         self._require_image(frame)
         name = self.name(frame.number)
@@ -62,11 +70,11 @@ class Spool(ImageSource):
         return name
 
     def name(self, number: int) -> str:
-        """What the frame of this number is called."""
+        """The name of the frame with this number."""
         return f"{number:06d}{self._encoding.suffix}"
 
     def _require_image(self, frame: Frame) -> None:
-        """The size is read off the header: no decoder is asked to make an image of another one."""
+        """Check encoding and size from the image's header, so that no image of another size is ever decoded."""
         assert self.intrinsics is not None
         camera = self.intrinsics.camera
         what = f"FRAME {frame.number}"
@@ -108,18 +116,18 @@ class Spool(ImageSource):
         return self.intrinsics.camera.width, self.intrinsics.camera.height
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """See `ImageSource`. Raises InputError for an image that does not decode."""
+        """Read an image (H, W, 3); see `ImageSource`. Raises InputError if it does not decode."""
         return np.ascontiguousarray(self._decoded(name)[..., :3])
 
     def valid(self, name: str) -> NDArray[np.bool_] | None:
-        """Which pixels (H, W) the image's own alpha leaves; None where all."""
+        """Mask (H, W) of the pixels whose alpha is not 0; None if the image has no alpha channel."""
         if self._encoding not in (Encoding.PNG, Encoding.RGBA8):
             return None
         image = self._decoded(name)
         return None if image.shape[2] == 3 else image[..., 3] > 0
 
     def _decoded(self, name: str) -> NDArray[np.uint8]:
-        """(H, W, 3 or 4) uint8, RGB first. The last one is kept: it is checked first and then delivered."""
+        """Image (H, W, 3 or 4) uint8, RGB first. The last one is cached, since it is decoded to check it first."""
         if self._last is None or self._last[0] != name:
             self._last = name, self._decode(name)
         return self._last[1]
@@ -133,8 +141,8 @@ class Spool(ImageSource):
         import cv2
 
         log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:  # silent: the one line that the user gets is ours
-            # As in ImageFolder for JPEG; a PNG keeps its alpha.
+        try:  # OpenCV's log is silenced, because the error below already reports the problem in one line
+            # Same flags as ImageFolder for JPEG. PNG keeps its alpha channel.
             png = self._encoding is Encoding.PNG
             flags = cv2.IMREAD_UNCHANGED if png else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
             image = cv2.imdecode(data, flags)
@@ -149,13 +157,13 @@ class Spool(ImageSource):
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
 
     def keep_points(self, name: str, points: SparsePoints) -> None:
-        """Keep the points of a frame as they were delivered. Raises SpoolFullError where the disk has no room."""
+        """Store the points of a delivered frame. Raises SpoolFullError if the disk has no space."""
         table = np.zeros(len(points), dtype=POINT)
         table["id"], table["xyz"], table["pixel"] = points.ids, points.xyz, points.pixels
         self._write(name + ".points", table.tobytes())
 
     def points(self, name: str) -> SparsePoints:
-        """The points that were kept."""
+        """Read the stored points of a frame."""
         return parse_points((self.path / (name + ".points")).read_bytes(), name)
 
     def _write(self, name: str, data: bytes) -> None:
@@ -169,5 +177,5 @@ class Spool(ImageSource):
             raise SpoolFullError(f"{self.path.parent}: a frame cannot be kept: {error.strerror}; set TMPDIR") from None
 
     def close(self) -> None:
-        """Delete the folder."""
+        """Delete the temporary folder."""
         self._folder.cleanup()

@@ -1,4 +1,4 @@
-"""Tracker `socket`: another program tracks, and sends its frames, poses, points and corrections through a socket."""
+"""Tracker `socket`: another program tracks and sends its frames, poses, points and corrections through a socket."""
 
 from __future__ import annotations
 
@@ -37,19 +37,28 @@ from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError
 
 __all__ = ["TrackerServer", "open_tracker_server"]
 
-# Seconds that the server takes a breath after a connection that came to nothing, for each of them up to the most: who
-# connects in a loop must not keep a processor busy.
+# Pause [s] after a connection that failed before its first frame: BREATH times the number of such connections, at most
+# LONGEST_BREATH. Without it, a client that reconnects in a loop would keep a processor busy.
 BREATH, LONGEST_BREATH = 0.01, 0.5
-# Messages that may be of no use before that is the end: so many, and so many more for each frame.
+# Unusable messages that are skipped before the stream ends: FEW_UNFIT, plus UNFIT_SHARE of the frames received.
 FEW_UNFIT, UNFIT_SHARE = 3, 0.1
 
 
 def open_tracker_server(
     source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None
 ) -> TrackerServer:
-    """Listen where the configuration says; frames come once a sender is there.
+    """Start a server at the configured address.
 
-    Raises InputError for an address where this cannot be, and for settings that choose among files.
+    Args:
+        source: Settings of the images. `path`, `start`, `stop` and `step` must not be set.
+        tracker: Address or path of the socket, and timeout.
+        progress: Called when the server starts to wait for a tracker, and when the wait is over.
+
+    Returns:
+        The listening server. Frames arrive once a sender has connected.
+
+    Raises:
+        InputError: If the server cannot listen at this address, or if settings select files or frames.
     """
     if source.start or source.stop is not None or source.step != 1:
         raise InputError("tracker.kind: socket takes every frame that is sent: take source.start, stop and step out")
@@ -59,13 +68,23 @@ def open_tracker_server(
 
 
 class TrackerServer(Tracker):
-    """A live `Tracker` that listens from the start, in a thread that reads, checks and decodes what is sent.
+    """A live `Tracker` that listens on a socket and delivers what another program sends.
 
-    Up to `source.prefetch` frames (one at least) wait decoded for the mapper; then nothing more is read, and the
-    sender's writes wait. Connections that come to nothing before a frame was sent are dropped, counted in one note,
-    and the server stays open; one that says nothing keeps nobody out;
-    from the first frame on, whatever ends the connection ends the stream, and the run goes on with what it has. What
-    was sent is kept in a temporary folder until `close`.
+    A background thread reads, checks and decodes the messages. At most `source.prefetch` decoded frames and
+    corrections (at least one) wait for the mapper. When this queue is full, the server stops reading, and the sender's
+    writes block.
+
+    A connection that fails before its first frame is dropped and counted in a note; the server keeps listening. Idle
+    connections do not block an active sender. After the first frame, the end of the connection ends the stream, and the
+    run continues with the frames received so far. Received data are kept in a temporary folder until `close`.
+
+    Args:
+        source: Settings of the images: scale, masks, held-out frames, queue length.
+        tracker: Address or path of the socket, and timeout.
+        progress: Called when the server starts to wait for a tracker, and when the wait is over.
+
+    Attributes:
+        address: Where the server listens, as `host:port` or `unix:path`.
     """
 
     def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
@@ -81,26 +100,30 @@ class TrackerServer(Tracker):
         self._reader: FrameReader | None = None
         self._undistorter: Undistorter | None = None
         self._history = History()
-        self._indices: dict[int, int] = {}  # of the frames that went to the mapper, by their numbers
+        self._indices: dict[int, int] = {}  # indices of the delivered frames by the sender's frame numbers
         self._dropped, self._dropped_note = 0, ""
         self._name = ""
-        self._unfit: list[str] = []  # what was wrong with messages that were left out
+        self._unfit: list[str] = []  # error messages of the skipped messages
         self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
         self._closed = Event()
         self._ended = False
         self._say_waiting(0)
-        # A daemon, so that a process whose owner forgot to close ends all the same.
+        # A daemon thread, so that the process can exit without `close`.
         self._thread = Thread(target=self._serve, name="server", daemon=True)
         self._thread.start()
 
-    # ---- what the mapper takes, in its thread ----------------------------------------------------------------
+    # ---- called by the mapper, in its thread -----------------------------------------------------------------
 
     @property
     def notes(self) -> list[str]:
         return self._notes
 
     def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
-        """Frames and corrections as they arrive, once. Raises InputError where the run's own settings do not fit."""
+        """Iterate once over frames and corrections as they arrive.
+
+        Raises:
+            InputError: If the run's settings do not fit the received frames, or the server fails.
+        """
         while not self._ended:
             event = self._events.get()
             self._say_waiting(1)
@@ -116,7 +139,7 @@ class TrackerServer(Tracker):
                 yield event
 
     def __iter__(self) -> Iterator[TrackedFrame]:
-        """The frames delivered so far, with the poses and points that they have by now; then those that arrive."""
+        """Iterate over the delivered frames with their corrected poses and points, then over frames that arrive."""
         for index, frame in enumerate(self._history.frames[:]):
             assert self._spool is not None, "it holds the frames"
             points = self._history.placed(self._spool.points(frame.name))
@@ -126,7 +149,7 @@ class TrackerServer(Tracker):
                 yield event
 
     def close(self) -> None:
-        """Stop listening, let the sender go and delete what was kept."""
+        """Stop listening, disconnect the sender and delete the temporary files."""
         self._closed.set()
         self._thread.join()
         if self._spool is not None:
@@ -168,7 +191,7 @@ class TrackerServer(Tracker):
                     break
         except InputError as error:
             end = error
-        except Exception as error:  # a fault of ours must end the run and not leave it waiting
+        except Exception as error:  # a bug in this thread must end the run instead of leaving it waiting
             end = InputError(f"{self.address}: the server failed: {type(error).__name__}: {error}")
         finally:
             lobby.close()
@@ -178,7 +201,7 @@ class TrackerServer(Tracker):
             self._put(end)
 
     def _talk(self, connection: Connection) -> bool:
-        """Serve one connection to its end; whether that ends the stream too."""
+        """Serve one connection until it ends. Returns whether the stream has ended with it."""
         ordering = Ordering()
         hello: Hello | None = None
         problem = None
@@ -234,7 +257,7 @@ class TrackerServer(Tracker):
         return True
 
     def _leave_out(self, error: UnfitError, ordering: Ordering) -> None:
-        """Go on without a message. Raises ProtocolError before the first frame, and where they are too many."""
+        """Skip an unusable message. Raises ProtocolError before the first frame, and if there are too many."""
         self._unfit.append(str(error))
         if not ordering.begun or len(self._unfit) > FEW_UNFIT + UNFIT_SHARE * len(self._spool or ()):
             self._unfit.pop()
@@ -243,7 +266,7 @@ class TrackerServer(Tracker):
             ordering.leave_out(error.number)
 
     def _count_dropped(self, problem: str, count: int) -> None:
-        """One note for all connections that came to nothing, however many there are."""
+        """Update the single note about connections that failed before their first frame."""
         self._dropped += count
         many = "a connection" if self._dropped == 1 else f"{self._dropped} connections"
         were = "was" if self._dropped == 1 else "were"
@@ -253,18 +276,18 @@ class TrackerServer(Tracker):
         self._dropped_note = note
 
     def _prepare(self, hello: Hello) -> None:
-        """Make ready for the images of this camera. Raises InputError for settings that do not fit them."""
+        """Prepare to receive images of this camera. Raises InputError if the settings do not fit it."""
         if self._spool is not None:
-            self._spool.close()  # of a connection that sent no frame
+            self._spool.close()  # left by a connection that sent no frame
         undistorter = hello.intrinsics.undistorter(self._source.scale)
         spool = Spool(hello)
         self._reader = FrameReader(spool, self._source)
         self._undistorter, self._spool = undistorter, spool
 
     def _take(self, kind: Kind, payload: bytes, ordering: Ordering) -> None:
-        """Raises ProtocolError for what is malformed or at the wrong place, before it has had any effect.
+        """Process one FRAME, POSE or CORRECTION message.
 
-        Raises UnfitError for what is of no use, and nothing else.
+        Raises ProtocolError if it is malformed or out of place, and UnfitError if it is well-formed but unusable.
         """
         if kind is Kind.CORRECTION:
             ordering.add_correction(parse_correction(payload))
@@ -282,7 +305,7 @@ class TrackerServer(Tracker):
             self._notes.append(f"the tracker there is {self._name}")
 
     def _deliver(self, ordering: Ordering) -> None:
-        """Hand on what is ready, waiting for the mapper where it has enough."""
+        """Queue what is ready for the mapper; block while the queue is full."""
         for item in ordering.ready():
             if self._closed.is_set():
                 return
@@ -298,7 +321,7 @@ class TrackerServer(Tracker):
         name = self._spool.name(frame.number)
         tracked = self._tracked(index, Delivered(name, frame.timestamp, pose), points)
         self._spool.keep_points(name, tracked.points)
-        _ = tracked.pyramid  # kept by the frame, for the mapper
+        _ = tracked.pyramid  # computed and cached here, in this thread, to save the mapper time
         return tracked
 
     def _revised(self, correction: Correction) -> PoseCorrection:
