@@ -97,9 +97,7 @@ class Results:
         replace_text(self.folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 
     def remove_figures(self) -> None:
-        """Delete the scores and the report of an earlier run from the output folder, since this run was stopped without
-        its own.
-        """
+        """Delete scores and report of an earlier run from the output folder, as a stopped run has none of its own."""
         for name in FIGURES:
             (self.config.output / name).unlink(missing_ok=True)
 

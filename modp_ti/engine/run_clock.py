@@ -26,9 +26,7 @@ class RunClock:
         return self._mapped + (0.0 if self._mapping_since is None else now - self._mapping_since)
 
     def resume(self, total: float, mapping: float) -> None:
-        """Add the time that the run took until its snapshot. Time after the snapshot is not counted, as its work was
-        lost.
-        """
+        """Set the time that the run took until its snapshot. Later time is not counted, as its work was lost."""
         self._before, self._mapped = total, mapping
 
     def begin_mapping(self) -> None:

@@ -94,9 +94,7 @@ class _Session:
     # ---- the stream ------------------------------------------------------------------------------------------
 
     def _map_the_stream(self, resumed: Snapshot | None) -> None:
-        """Open the tracker, make the mapper for its first frame, and map all frames, or those after the snapshot
-        `resumed`.
-        """
+        """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
         self.tracker = open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
@@ -133,7 +131,7 @@ class _Session:
         self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
 
     def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
-        """Create the checkpointer. With `resumed`, restore the map and advance the stream to the snapshot's position."""
+        """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""
         self.checkpointer = checkpointer = Checkpointer(self.config, self.mapper, self.record, self.clock, self._say)
         if resumed is not None:
             with self.line.working(f"reading again what {resumed.path} was made of"):
@@ -193,9 +191,7 @@ class _Session:
     # ---- the finished map ------------------------------------------------------------------------------------
 
     def _versions(self) -> dict[str, MapVersion]:
-        """Return the map before refinement and, if the settings ask for it, after. The last version is the run's
-        result.
-        """
+        """Return the map before refinement and, if the settings ask for it, after. The last version is final."""
         config, checkpointer = self.config, self.checkpointer
         if len(self.mapper.pipeline.keyframes) == 0:
             raise InputError(
@@ -253,9 +249,7 @@ class _Session:
         self.line.summary(metrics)
 
     def _score(self, versions: dict[str, MapVersion], results: Results) -> list[FrameScore] | None:
-        """Score all frames and write the pictures of the last version. Returns None if interrupted; the map is complete
-        then.
-        """
+        """Score all frames and write the pictures of the last version. None if interrupted; the map is complete."""
         last = list(versions)[-1]
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:

@@ -25,7 +25,7 @@ class StreamDigest:
         self.events = 0
 
     def add(self, event: TrackedFrame | PoseCorrection) -> None:
-        """Add the next frame or correction. The image of a held-out frame is left out, as it does not affect the map."""
+        """Add a frame or correction. The image of a held-out frame is left out, as it does not affect the map."""
         self.events += 1
         if isinstance(event, PoseCorrection):
             self._take(event.index, event.T_camera_world, event.ids, event.xyz)

@@ -88,7 +88,7 @@ class Snapshot:
 
     @contextmanager
     def fitting(self) -> Iterator[None]:
-        """Convert errors inside this context to a one-line InputError, for snapshots whose parts do not fit together."""
+        """Convert errors inside this context to a one-line InputError saying that the parts do not fit together."""
         try:
             yield
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
