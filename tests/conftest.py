@@ -69,7 +69,7 @@ def shared_data() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
-    """Return a function that gives a folder by key. The first worker to ask fills it; it is read-only afterwards."""
+    """Return a function that gives a folder by key. The first worker to ask fills it; nobody may change it later."""
     base = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent

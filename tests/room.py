@@ -124,13 +124,13 @@ class Room:
 class RoomRecording:
     """A walk through the room: images, and the poses and points of a simulated tracker.
 
-    The tracked points have errors of 0.3 px in the image and 2 % in depth.
+    The tracked points have random errors of 0.3 px in the image and 2 % in depth (standard deviations).
 
     Attributes:
         room: The room.
         camera: The camera of all frames.
         T_camera_world: True pose (4, 4) of each frame.
-        points: About how many points are tracked.
+        points: Twice the number of points that are sampled in each of a few evenly spaced frames.
         seed: Seed of the points and their errors.
     """
 

@@ -72,13 +72,8 @@ def _cases() -> list[Case]:
     add("orbslam3", "CameraTrajectory.txt", anything() | TEXT | ORBSLAM3)
     add("tum_rgbd", "rgb.txt", anything("cut in half") | TEXT | TUM_RGBD)
     add("replica", "traj.txt", anything() | TEXT | REPLICA)
-    unseen = (
-        "missing",
-        "a folder",
-        "a link to itself",
-        "a pipe",
-        "a device",
-    )  # same as missing
+    # Corruptions that have the same effect as a missing file.
+    unseen = ("missing", "a folder", "a link to itself", "a pipe", "a device")
     add("sevenscenes", "seq/frame-000001.pose.txt", anything(*unseen) | TEXT | SEVENSCENES)
     add("modp", "trajectory.json", anything() | TEXT | MODP["trajectory.json"])
     for file in ("point_cloud/point_cloud_1.txt", "point_cloud/point_cloud_2.npy"):
