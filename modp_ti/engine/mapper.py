@@ -32,8 +32,8 @@ __all__ = ["Mapper"]
 class Mapper:
     """Maps frames of up to `width` x `height` pixels as they arrive.
 
-    `initialise` must be called first. A process has room for one map; call `initialise` again to free it before making
-    another.
+    `initialise` must be called first. A process has room for one map of a room's size; call `initialise` again to free
+    it before making another.
 
     Args:
         width: Largest image width [px].

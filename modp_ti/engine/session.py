@@ -302,7 +302,7 @@ class _Session:
                 self._say(problem)
         return metrics
 
-    # ---- beside it -------------------------------------------------------------------------------------------
+    # ---- interruption, viewer, notes -------------------------------------------------------------------------
 
     def _stopped(self) -> KeyboardInterrupt:
         """Write a snapshot and the map so far, and return the exception with the message for the user."""

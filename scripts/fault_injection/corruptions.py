@@ -45,7 +45,7 @@ __all__ = [
 Corruption = Callable[[Path], None]
 
 
-# ---- what can happen to any file --------------------------------------------------------------------------------
+# ---- any file ----------------------------------------------------------------------------------------------------
 
 
 def changed(content: Callable[[bytes], bytes]) -> Corruption:
@@ -100,7 +100,7 @@ TEXT: dict[str, Corruption] = {
 }
 
 
-# ---- what can happen to text --------------------------------------------------------------------------------------
+# ---- text --------------------------------------------------------------------------------------------------------
 
 
 def replaced(old: str, new: str) -> Corruption:
@@ -164,7 +164,7 @@ def rows_of(line: str, place: int, at: int) -> dict[str, Corruption]:
     }
 
 
-# ---- what can happen to binary files ------------------------------------------------------------------------------
+# ---- binary files ------------------------------------------------------------------------------------------------
 
 
 def patched(at: int, form: str, *values: float) -> Corruption:
@@ -275,7 +275,7 @@ def _placed(path: Sequence[str | int], value: object) -> Callable[[dict], None]:
     return change
 
 
-# ---- what is particular to each format --------------------------------------------------------------------------
+# ---- specific formats --------------------------------------------------------------------------------------------
 
 
 def laughs(levels: int) -> str:

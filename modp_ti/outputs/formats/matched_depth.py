@@ -139,7 +139,7 @@ def agreed_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[in
 
 
 def _warp(view: DepthView, other: DepthView) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return A (3, 3) and b (3,): pixel (x, y) at inverse depth w appears in `other` at A (x, y, 1) + w b."""
+    """Return A (3, 3), b (3,): pixel (x, y) at inverse depth w is at A (x, y, 1) + w b (homogeneous) in `other`."""
     T = other.T_camera_world @ inverse_se3(view.T_camera_world)
     K = other.camera.matrix()
     A = K @ T[:3, :3] @ np.linalg.inv(view.camera.matrix())

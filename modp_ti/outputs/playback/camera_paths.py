@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 __all__ = ["looking_at", "orbit", "smoothed"]
 
-# Weight that pulls the focus to the points at the scene's depth on the optical axes. It decides if the axes are
-# parallel.
+# Weight that pulls the focus to the points at the scene's depth on the optical axes. It determines the focus if the
+# axes are parallel.
 HELD = 0.1
 # The orbit is a full circle if the largest gap between the keyframes' directions is below LARGEST_GAP. Otherwise it
 # swings back and forth over these directions, without the fraction ENDS at both ends, where few keyframes saw the
