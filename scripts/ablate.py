@@ -1,7 +1,7 @@
-"""The paper's ablations on scenes of yours, as Markdown tables.
+"""Run the paper's ablations on your scenes and print them as Markdown tables.
 
-Every variant is a run of its own, online only unless --refine asks for more. Finished runs are kept in the output
-folder, and used again as long as their settings are the same.
+Every variant is a separate run, without post refinement unless --refine sets it. Finished runs are kept in the output
+folder and reused as long as their settings are the same.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from modp_ti.files.errors import InputError
 
 FULL = "full"
 OTHER_TRACKER = "other tracker"
-# Without the global views as many views a step are drawn from the local bank: the budget stays that of the full method.
+# Without global views, the local bank provides as many more views, so that each step keeps the budget of the full
+# method.
 VARIANTS: dict[str, dict[str, str]] = {
     "w/o EC": {"mapping.densify.error_compensation": "false"},
     "w/o MOHV": {"mapping.voxels.enabled": "false"},
@@ -40,7 +41,7 @@ VARIANTS: dict[str, dict[str, str]] = {
 QUALITY = {"PSNR": ("psnr", ".2f"), "SSIM": ("ssim", ".3f"), "LPIPS": ("lpips", ".3f")}
 GAUSSIANS = {"# Gaussians": ("gaussians", ",.0f")}
 FIRST_THIRD = {"held-out PSNR, first third": ("first_third_psnr", ".2f")}
-# The paper's tables: title, columns, rows.
+# The paper's tables as (title, columns, rows).
 TABLES = (
     ("Gaussian management", QUALITY | GAUSSIANS, ("w/o EC", "w/o MOHV", "w/o EC & MOHV", FULL)),
     ("Global consistent optimisation", QUALITY | FIRST_THIRD, ("w/o global cams", "w/o cam refinement", FULL)),
@@ -50,7 +51,7 @@ TABLES = (
 
 @documented_ending()
 def main() -> None:
-    """Run what is missing, then print and write the tables."""
+    """Run the missing variants, then print and write the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/ablate desk.yaml fox.yaml -o out/ablation",
@@ -87,7 +88,18 @@ def plan(
     trackers: Sequence[str] = (),
     variants: Iterable[str] = VARIANTS,
 ) -> dict[str, dict[str, Job]]:
-    """The jobs by scene and variant. trackers: empty, or for each scene the file that names another tracker."""
+    """Return the jobs by scene and variant.
+
+    Args:
+        scenes: Scene files by name.
+        output: Folder of the runs.
+        common: Overrides for every run.
+        trackers: For each scene, a scene file with another tracker; or empty.
+        variants: Names of the variants.
+
+    Raises:
+        InputError: If the number of `trackers` does not match.
+    """
     if trackers and len(trackers) != len(scenes):
         raise InputError(f"--tracker needs one file for each of the {len(scenes)} scenes, got {len(trackers)}")
     jobs = {
@@ -110,7 +122,7 @@ def _folder(variant: str) -> str:
 
 
 def summary(metrics: Mapping, folder: Path) -> Figures:
-    """The figures of one run for the tables: those of the refined map where there is one."""
+    """Return the figures of a run for the tables, from the refined map if there is one."""
     stage = "refined" if metrics.get("refined") else "online"
     return quality(metrics[stage]) | {
         "gaussians": metrics["gaussians"],
@@ -119,7 +131,11 @@ def summary(metrics: Mapping, folder: Path) -> Figures:
 
 
 def report(figures: Mapping[str, Mapping[str, Figures]]) -> str:
-    """The paper's tables by {scene: {variant: figures}}: the means over the scenes, then each scene."""
+    """Return the paper's tables as Markdown, first for the mean over the scenes, then for each scene.
+
+    Args:
+        figures: Figures by scene and variant.
+    """
     parts = {}
     if len(figures) > 1:
         variants = [v for v in (*VARIANTS, OTHER_TRACKER) if all(v in of_scene for of_scene in figures.values())]

@@ -1,8 +1,9 @@
-"""Speed and memory on this machine, as Markdown and JSON.
+"""Measure speed and memory on this machine, and print them as Markdown or write Markdown and JSON.
 
-What a step costs by stage and by pixel-Gaussian pair, which share of the machine's float32 arithmetic and memory
-bandwidth that is, how it grows, what the voxels cost, and the frames per second of whole runs. Every measurement is a
-process of its own; figures are medians after a warm-up. Where gsplat and a GPU are there, it renders the same scenes.
+The tables contain: the time of a step by stage and by pixel-Gaussian pair; its share of the machine's float32
+throughput and memory bandwidth; how it grows; the cost of the voxels; and the frames per second of whole runs. Every
+measurement runs in its own process. Figures are medians after a warm-up. If gsplat and a GPU are available, gsplat
+renders the same scenes.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from experiments import command_line, write_report
 
 from modp_ti.files.errors import InputError
 
-# width, height, Gaussians in view: a phone's frame, a webcam's, and full detail.
+# (width, height, Gaussians in view) of a phone's frame, a webcam's frame, and full detail.
 SIZES = [(270, 480, 12_500), (640, 480, 100_000), (1280, 720, 500_000)]
 DEMO = Path(__file__).resolve().parent.parent / "demo" / "scene.yaml"
 
 
 @documented_ending()
 def main() -> None:
-    """Measure, and print the tables; exit code 2 for bad input."""
+    """Measure and print the tables. The exit code is 2 for bad input."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/benchmark --quick -o out/benchmark",
@@ -57,11 +58,11 @@ def main() -> None:
 
 
 def collect(arguments: argparse.Namespace) -> dict[str, Any]:
-    """All figures, each kind under its name."""
+    """Run all measurements and return the figures by kind."""
     device, repeats = arguments.device, arguments.repeats
     runs = (arguments.scene or [str(DEMO)], device, command_line(arguments.settings))
     if not arguments.quick:
-        planned_runs(*runs, Path())  # bad input ends here, not after the minutes before the runs
+        planned_runs(*runs, Path())  # reports bad input now instead of after minutes of measuring
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = [cores] if device == "cuda" else sorted({1, cores})
     on = {"device": device, "threads": cores}
@@ -84,7 +85,7 @@ def collect(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def in_process(kind: str, **arguments: Any) -> Any:
-    """The figures of one measurement, from a process of its own. Raises InputError where it fails."""
+    """Run one measurement in its own process and return its figures. Raises InputError if it fails."""
     job = json.dumps({"kind": kind} | arguments)
     print(f"measuring {kind} {arguments.get('size', '')} ...", file=sys.stderr)
     command = [sys.executable, __file__, "--measure", job]
@@ -95,7 +96,7 @@ def in_process(kind: str, **arguments: Any) -> Any:
 
 
 def measure(kind: str, **arguments: Any) -> Any:
-    """One measurement, here."""
+    """Run one measurement in this process."""
     from benchmarks import growth, gsplat_renderer, machine, step, voxels
     from benchmarks.scene import Size
 

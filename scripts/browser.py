@@ -1,4 +1,4 @@
-"""Debian's Chromium without a screen, driven by Playwright: for pictures of the viewer's page, and for its test."""
+"""Headless Chromium, driven by Playwright, for screenshots and tests of the viewer's page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-# Where there is no GPU, WebGL is drawn by the processor.
+# Software WebGL for machines without a GPU.
 OPTIONS = [
     "--no-sandbox",
     "--use-gl=angle",
@@ -19,12 +19,12 @@ OPTIONS = [
     "--ignore-gpu-blocklist",
 ]
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-# Milliseconds that a page may take to come up, drawn by a busy processor.
+# Timeout for the page to load with software rendering on a busy machine [ms].
 PATIENCE = 120_000
 
 
 def missing() -> str | None:
-    """What there is not for `open_page`, and how to get it; None where all is there."""
+    """Return what `open_page` lacks and how to install it, or None if everything is installed."""
     try:
         import playwright.sync_api  # noqa: F401
     except ImportError:
@@ -36,7 +36,7 @@ def missing() -> str | None:
 
 @contextmanager
 def open_page(url: str, width: int = 1000, height: int = 640) -> Iterator[Page]:
-    """The viewer's page in a window of this size, once its scene is there."""
+    """Open the viewer's page in a window of this size, and yield it once the scene is shown."""
     from playwright.sync_api import sync_playwright
 
     executable = next(path for path in map(shutil.which, NAMES) if path)
@@ -47,7 +47,7 @@ def open_page(url: str, width: int = 1000, height: int = 640) -> Iterator[Page]:
             page.set_default_timeout(PATIENCE)
             page.goto(url)
             page.wait_for_selector("canvas")
-            # viser says where WebGL is drawn by the processor; here it always is.
+            # viser shows a notice about software WebGL, which is always used here.
             notice = page.locator(".mantine-Notification-closeButton")
             notice.first.wait_for()
             notice.first.click()
@@ -57,6 +57,6 @@ def open_page(url: str, width: int = 1000, height: int = 640) -> Iterator[Page]:
 
 
 def choose_mode(page: Page, mode: str) -> None:
-    """Choose what the page shows."""
+    """Select the display mode."""
     page.locator("input[role=combobox]:visible").first.click()
     page.get_by_role("option", name=mode, exact=True).click()

@@ -1,7 +1,7 @@
-"""The online map, its post refinement and offline 3DGS compared, and where the time goes, as the paper's tables.
+"""Compare the online map, its post refinement and offline 3DGS, and show where the time goes, as the paper's tables.
 
-Offline 3DGS gets as many view renders (forward and backward) as the online run with its first post refinement took.
-Finished runs are kept in the output folder, and used again as long as their settings are the same.
+Offline 3DGS gets as many view renders (forward and backward) as the online run with its first post refinement. Finished
+runs are kept in the output folder and reused as long as their settings are the same.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ COLUMNS = {
     "view renders": ("view_renders", ",.0f"),
     "time [s]": ("seconds", ",.0f"),
 }
-# The paper's columns by the names of metrics.json.
+# The paper's columns and their names in metrics.json.
 BREAKDOWN = {
     "Optim": "optimise",
     "Cam Select": "select",
@@ -49,7 +49,7 @@ BREAKDOWN = {
 
 @documented_ending()
 def main() -> None:
-    """Run what is missing, then print and write the tables."""
+    """Run the missing jobs, then print and write the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/compare desk.yaml -o out/comparison --steps 1000 3000",
@@ -78,7 +78,7 @@ def main() -> None:
         ]
         for scene, file in named_scenes(arguments.scenes).items()
     }
-    for (scene, file), of_scene in jobs.items():  # before the first of them runs for hours
+    for (scene, file), of_scene in jobs.items():  # reports bad settings before the first run, which may take hours
         for job in of_scene:
             job.check()
         if not arguments.no_offline:
@@ -96,27 +96,32 @@ def main() -> None:
 
 
 def refined_job(scene: str, file: Path, folder: Path, steps: int, common: Mapping[str, str]) -> Job:
-    """The online run with its post refinement: its metrics hold both maps."""
+    """Return the job of an online run with post refinement. Its metrics contain both maps."""
     return Job(
         f"{scene}, online + {steps:,} steps", file, folder / f"refined-{steps}", {**common, "refine.steps": str(steps)}
     )
 
 
 def offline_job(scene: str, file: Path, folder: Path, renders: int, common: Mapping[str, str]) -> Job:
-    """Offline 3DGS, which renders one view a step."""
+    """Return the job of offline 3DGS, which renders one view per step."""
     overrides = {**common, "mode": "offline", "offline.steps": str(renders)}
     return Job(f"{scene}, {OFFLINE}", file, folder / "offline", overrides)
 
 
 def counts(metrics: Mapping[str, Any], stage: str) -> Figures:
-    """Gaussians of a map, and views that were rendered forward and backward to make it."""
+    """Return the number of Gaussians of a map, and of the views rendered forward and backward to make it."""
     if "view_renders" not in metrics[stage]:
         raise InputError("metrics.json does not count view renders: made by an older version; run again with --fresh")
     return {name: metrics[stage][name] for name in ("gaussians", "view_renders")}
 
 
 def online_rows(runs: Sequence[Mapping[str, Any]], refinements: Sequence[int]) -> dict[str, Figures]:
-    """The rows of the online map and of each post refinement. refinements: the steps of each run."""
+    """Return the rows of the online map and of each post refinement.
+
+    Args:
+        runs: Metrics of the runs.
+        refinements: Refinement steps of each run.
+    """
     seconds = mapping_seconds(runs[0], refined=False)
     first = quality(runs[0]["online"]) | counts(runs[0], "online") | {"steps": 0, "seconds": seconds}
     rows: dict[str, Figures] = {ONLINE: first}
@@ -127,19 +132,24 @@ def online_rows(runs: Sequence[Mapping[str, Any]], refinements: Sequence[int]) -
 
 
 def offline_row(metrics: Mapping[str, Any]) -> Figures:
-    """The row of offline 3DGS, all of whose steps are optimisation."""
+    """Return the row of offline 3DGS, where every step optimises."""
     row = quality(metrics["offline"]) | counts(metrics, "offline")
     return row | {"steps": row["view_renders"], "seconds": mapping_seconds(metrics, refined=True)}
 
 
 def time_breakdown(metrics: Mapping[str, Any]) -> Figures:
-    """Percent of the online run's time by the paper's columns, and frames per second."""
+    """Return the online run's time by the paper's columns [%], and its frames per second."""
     percent = metrics["breakdown_percent"]
     return {label: percent[stage] for label, stage in BREAKDOWN.items()} | {"FPS": metrics["frames_per_second"]}
 
 
 def report(figures: Mapping[str, Mapping[str, Figures]], breakdown: Mapping[str, Figures]) -> str:
-    """The tables by {scene: {row: figures}} and {scene: percent}: the means over the scenes, then each scene."""
+    """Return the tables as Markdown, first for the mean over the scenes, then for each scene.
+
+    Args:
+        figures: Figures by scene and row.
+        breakdown: Time by scene [%].
+    """
     tables: dict[str, Mapping[str, Figures]] = {}
     times = dict(breakdown)
     if len(figures) > 1:

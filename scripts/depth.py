@@ -1,8 +1,8 @@
-"""Depth estimators against a depth sensor, on the pixels that a run asks them for, as a Markdown table.
+"""Compare depth estimators with a depth sensor at the pixels that a run queries, as a Markdown table.
 
-The scene is mapped online; at every keyframe each estimator is asked for the same pixels as the fused one. The
-sensor's depth images are 16-bit millimetres, named after the digits of their frame's name, from a camera beside the
-colour camera: `--rotation` and `--offset` carry them over. The map's one scale is the median ratio of sensor and
+The scene is mapped online. At every keyframe, each estimator gets the same pixels as the fused one. The sensor's depth
+images are 16-bit millimetres from a camera next to the colour camera, named after the digits in their frame's name.
+`--rotation` and `--offset` transform them to the colour camera. The map's scale is the median ratio of sensor depth and
 tracked depth.
 """
 
@@ -26,12 +26,12 @@ from modp_ti.inputs.trackers import open_tracker
 from pipelines.densify.depth import DepthEstimate, DepthEstimator, FusedDepth, GaussianProcessDepth
 from pipelines.online import OnlineMapper
 
-# The deviation below which version 0.1.0, which had the constant process alone, accepted a depth.
+# Deviation below which version 0.1.0, which only had the constant process, accepted a depth.
 FIRST_LIMIT = 0.06
 
 
 class Recorder:
-    """Answers as the fused estimator does, and keeps what each of its sources and the constant process say."""
+    """Depth estimator that answers like the fused one and records its sources' and the constant process's answers."""
 
     def __init__(self, fused: FusedDepth, constant: GaussianProcessDepth) -> None:
         self.fused = fused
@@ -48,7 +48,7 @@ class Recorder:
 
 
 def sensor_depth(folder: Path, frame: TrackedFrame, focal: float, rotation: NDArray, offset: NDArray) -> NDArray | None:
-    """Sensor depth (H, W) [m] in the frame's camera, NaN where there is none; None without a file."""
+    """Return the sensor depth (H, W) [m] in the frame's camera, NaN where unknown; None without a file."""
     digits = re.search(r"\d+", Path(frame.name).name)
     files = sorted(folder.glob(f"*{digits.group()}*")) if digits else []
     raw = cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED) if files else None
@@ -56,7 +56,7 @@ def sensor_depth(folder: Path, frame: TrackedFrame, focal: float, rotation: NDAr
         return None
     height, width = raw.shape
     camera = PinholeCamera(focal, focal, width / 2, height / 2, width, height)
-    # 65535 is the sensor's "nothing".
+    # The sensor marks missing depth with 65535.
     row, column = np.nonzero((raw > 0) & (raw < 20_000))
     points = camera.unproject(np.stack([column, row], axis=1) + 0.5, raw[row, column] / 1000.0) @ rotation.T + offset
     pixels = frame.camera.project(points)
@@ -68,7 +68,7 @@ def sensor_depth(folder: Path, frame: TrackedFrame, focal: float, rotation: NDAr
 
 
 def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
-    """Sensor depth over tracked depth at the frame's points."""
+    """Return sensor depth divided by tracked depth at the frame's points."""
     z = frame.points.depths(frame.T_camera_world)
     inside = frame.camera.contains(frame.points.pixels) & (z > 0)
     column, row = np.floor(frame.points.pixels[inside]).astype(int).T
@@ -78,7 +78,7 @@ def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
 
 @documented_ending()
 def main() -> None:
-    """Map, compare, print."""
+    """Map the scene, compare the estimators and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/depth redkitchen.yaml data/redkitchen/depth --frames 200",
@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path, help="scene.yaml")
     parser.add_argument("sensor", type=Path, help="folder of depth images")
     parser.add_argument("--focal", type=float, default=585.0, help="of the depth camera [px] (default 585)")
-    # Where redkitchen's tracked points fit best: a median error of 1.1 percent, 1.4 without the rotation.
+    # Best fit for redkitchen's tracked points: a median error of 1.1 percent, and 1.4 without the rotation.
     rotation, offset = (0.81, -1.13, 0.54), (0.011, 0.019, 0.008)
     parser.add_argument(
         "--rotation", type=float, nargs=3, default=rotation, help="depth to colour camera, axis times angle [degrees]"
@@ -139,7 +139,7 @@ def main() -> None:
     for name, below in [(names[0], FIRST_LIMIT), *((name, limit) for name in names)]:
         e, known = np.concatenate(error[name]), np.concatenate(deviation[name])
         own, both = known < below, sure & np.isfinite(known)
-        # Early in a run the map, for one, is sure of nothing.
+        # An estimator may accept no pixel, such as the map early in a run.
         there = f"{100 * np.median(e[own]):.2f} % | {100 * np.percentile(e[own], 90):.1f} %" if own.any() else "– | –"
         where_fused = f"{100 * np.median(e[both]):.2f} %" if both.any() else "–"
         print(f"| {name} | {below:g} | {100 * own.mean():.0f} % | {there} | {where_fused} |")

@@ -1,9 +1,9 @@
-"""MkDocs hooks: what the pages of the site have beyond the Markdown in docs/.
+"""MkDocs hooks that add to the Markdown pages of docs/.
 
-- CONTRIBUTING.md and CHANGELOG.md of the project's root become pages.
-- A link to an example program, alone on its line, is followed by the program.
-- `::: modp_ti.NAME` documents the public name wherever it is defined; a public name without an entry is a warning,
-  hence an error of scripts/docs.
+- CONTRIBUTING.md and CHANGELOG.md in the project's root become pages.
+- A link to an example program on its own line is followed by the program's code.
+- `::: modp_ti.NAME` documents the public name wherever it is defined. A public name without an entry causes a warning,
+  which scripts/docs treats as an error.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ documented: set[str] = set()
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages that lie beside docs/."""
+    """Add the pages that are stored outside docs/."""
     for name in ("CONTRIBUTING.md", "CHANGELOG.md"):
         text = (ROOT / name).read_text(encoding="utf-8").replace("](docs/", "](")
         files.append(File.generated(config, name.lower(), content=text))
@@ -34,7 +34,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Insert the example programs, and resolve the public names and the links to pages beside docs/."""
+    """Insert the example programs, and resolve public names and links to pages outside docs/."""
     folder = Path(config.docs_dir, page.file.src_uri).parent
     markdown = markdown.replace("](../CONTRIBUTING.md)", "](contributing.md)")
     markdown = PROGRAM.sub(lambda link: _with_program(link, folder), markdown)
@@ -42,7 +42,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_env(env: Any, config: Any, files: Files) -> None:
-    """Warn of public names that no page documents; all pages are rendered by now."""
+    """Warn about public names that no page documents. All pages have been rendered by now."""
     for name in modp_ti.__all__:
         if name not in documented and name != "__version__":
             log.warning("modp_ti.%s is public, but no page of docs/reference has an entry `::: modp_ti.%s`", name, name)

@@ -1,7 +1,7 @@
-"""Downloads sequences of TUM RGB-D and Replica, goes on where it was cut off, checks them and unpacks them.
+"""Download sequences of TUM RGB-D and Replica, resume interrupted downloads, verify and unpack them.
 
-The publishers name no checksums. The SHA-256 of a first download is written to `checksums.txt` beside the archives,
-and later downloads must agree with it: that finds a file that changed, not one that was wrong from the start.
+The publishers provide no checksums. The SHA-256 of the first download is written to `checksums.txt` next to the
+archives, and later downloads must match it. This detects files that changed, but not one that was wrong from the start.
 """
 
 from __future__ import annotations
@@ -29,18 +29,24 @@ REPLICA_SCENES = ("office0", "office1", "office2", "office3", "office4", "room0"
 
 CHECKSUMS = "checksums.txt"
 CHUNK = 1 << 20
-TIMEOUT = 60.0  # seconds without a byte
-# An archive may unpack to so many times its size: pictures hardly shrink.
+TIMEOUT = 60.0  # seconds without receiving data
+# Maximum ratio of unpacked size to archive size. Images hardly compress.
 MOST_GROWTH = 50
 
 
 class DownloadError(Exception):
-    """What went wrong, in one line."""
+    """A download failed. The message has one line."""
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """An archive, and the folder inside that is the sequence. licence: what its publishers ask for."""
+    """A sequence inside an archive.
+
+    Attributes:
+        url: Where to download the archive.
+        folder: The sequence's folder inside the archive.
+        licence: The publishers' licence.
+    """
 
     url: str
     folder: str
@@ -60,7 +66,7 @@ SEQUENCES: dict[str, Sequence] = {
     "fr1/desk": _tum(1, "desk"),
     "fr2/xyz": _tum(2, "xyz"),
     "fr3/office": _tum(3, "long_office_household"),
-    # One archive of some 12 GB holds all scenes; it is fetched once.
+    # All scenes share one archive of about 12 GB, which is downloaded once.
     **{
         f"replica/{s}": Sequence(REPLICA, f"Replica/{s}", "Replica's research licence, rendered by NICE-SLAM")
         for s in REPLICA_SCENES
@@ -69,17 +75,22 @@ SEQUENCES: dict[str, Sequence] = {
 
 
 def download(url: str, target: Path, say: Callable[[int, int | None], None] | None = None) -> None:
-    """Fetch `url` into `target`, going on with `target`.partial where an earlier attempt left it.
+    """Download `url` to `target`, resuming from `target`.partial if an earlier attempt left it.
 
-    say: called with bytes so far and, where the server tells, of all. Raises DownloadError where the server refuses or
-    the size is not what it announced.
+    Args:
+        url: The file's URL.
+        target: Where to store it.
+        say: Called with the bytes so far and the total, None if the server does not announce it.
+
+    Raises:
+        DownloadError: If the server refuses, or the size differs from the announced one.
     """
     if target.exists():
         return
     target.parent.mkdir(parents=True, exist_ok=True)
     partial, mark = target.with_name(target.name + ".partial"), target.with_name(target.name + ".etag")
     done = partial.stat().st_size if partial.exists() else 0
-    # Only the rest of the very same file is any good: the server judges by its own mark.
+    # The server must only send the rest if the file is unchanged, which it checks with this validator.
     validator = mark.read_text() if done and mark.exists() else None
     headers = {"Range": f"bytes={done}-", "If-Range": validator} if validator else {}
     try:
@@ -115,7 +126,7 @@ def download(url: str, target: Path, say: Callable[[int, int | None], None] | No
 
 
 def sha256(file: Path) -> str:
-    """Of the file's content, in hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with file.open("rb") as data:
         digest = hashlib.sha256()
         while chunk := data.read(CHUNK):
@@ -124,9 +135,13 @@ def sha256(file: Path) -> str:
 
 
 def verify(archive: Path) -> bool:
-    """Compare the archive with `checksums.txt` beside it; whether it was known. One that was not is written down.
+    """Compare an archive with `checksums.txt` next to it. An unknown archive's checksum is added to the file.
 
-    Raises DownloadError where it differs.
+    Returns:
+        Whether the archive was known.
+
+    Raises:
+        DownloadError: If the checksum differs.
     """
     listing = archive.with_name(CHECKSUMS)
     known = {}
@@ -146,10 +161,14 @@ def verify(archive: Path) -> bool:
 
 
 def unpack(archive: Path, folder: str, target: Path) -> int:
-    """Unpack what lies in `folder` of a .tgz or .zip archive into `target`; how many files.
+    """Unpack the content of `folder` in a .tgz or .zip archive to `target`, which appears whole or not at all.
 
-    `target` appears whole or not at all. Raises DownloadError, before anything is kept, for a member that leads out of
-    the folder, for links and devices, for an archive that is damaged and for one that grows beyond all measure.
+    Returns:
+        Number of files.
+
+    Raises:
+        DownloadError: If the archive is damaged, has a member outside its folder, a link or a device, or exceeds
+            MOST_GROWTH times its size. Nothing is kept then.
     """
     staging = target.with_name(target.name + ".partial")
     shutil.rmtree(staging, ignore_errors=True)
@@ -180,7 +199,7 @@ def unpack(archive: Path, folder: str, target: Path) -> int:
 
 
 def _members(archive: Path) -> Iterator[tuple[str, int, Callable[[], IO[bytes]]]]:
-    """Name, size and content of every file; a link or device raises DownloadError."""
+    """Yield name, size and content of every file. Raises DownloadError for links and devices."""
     if archive.suffix == ".zip":
         with zipfile.ZipFile(archive) as bundle:
             for entry in bundle.infolist():
@@ -189,7 +208,7 @@ def _members(archive: Path) -> Iterator[tuple[str, int, Callable[[], IO[bytes]]]
                 if not entry.is_dir():
                     yield entry.filename, entry.file_size, lambda entry=entry: bundle.open(entry)
         return
-    with tarfile.open(archive, "r|gz") as bundle:  # from front to back, without seeking
+    with tarfile.open(archive, "r|gz") as bundle:  # sequential reading, without seeking
         for entry in bundle:
             if entry.isdir():
                 continue
@@ -206,7 +225,7 @@ def _content(bundle: tarfile.TarFile, entry: tarfile.TarInfo) -> Iterator[IO[byt
 
 
 def _inside(name: str, folder: str, archive: Path) -> PurePosixPath | None:
-    """Where a member lies below `folder`; None outside. Raises DownloadError for a name that leads elsewhere."""
+    """Return a member's path below `folder`, or None if it is outside. Raises DownloadError for unsafe names."""
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in path.parts[0]:
         raise DownloadError(f"{archive}: holds a file that leads out of its folder ({name}): not unpacked")
@@ -217,7 +236,7 @@ def _inside(name: str, folder: str, archive: Path) -> PurePosixPath | None:
 
 
 def fetch(name: str, folder: Path, say: Callable[[str], None], sequences: dict[str, Sequence] = SEQUENCES) -> Path:
-    """Download, check and unpack the sequence `name` below `folder`; where it lies. Done work is not done again."""
+    """Download, verify and unpack a sequence below `folder`, and return its path. Finished steps are skipped."""
     sequence = sequences[name]
     target = folder / name
     if target.exists():
@@ -246,7 +265,7 @@ def fetch(name: str, folder: Path, say: Callable[[str], None], sequences: dict[s
 
 @documented_ending(DownloadError)
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/download fr1/desk -o data",

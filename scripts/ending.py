@@ -1,4 +1,4 @@
-"""How the scripts end: with the exit codes that `docs/commands.md` tells of."""
+"""Exit codes of the scripts, as documented in `docs/commands.md`."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ __all__ = ["documented_ending"]
 
 @contextmanager
 def documented_ending(*refusals: type[Exception]) -> Iterator[None]:
-    """Ends the program where the block fails, also as a decorator of `main`.
+    """Context manager and decorator of `main` that converts exceptions to the documented exit codes.
 
-    refusals: exceptions beside InputError that tell, in one line, what is wrong with the input.
+    Args:
+        *refusals: Exceptions that report bad input in one line, in addition to InputError.
     """
     try:
         yield

@@ -1,4 +1,7 @@
-"""Runs of a scene with several settings, kept on disk, and their figures as Markdown: for ablate.py and compare.py."""
+"""Runs scenes with several settings, keeps the results on disk and formats their figures.
+
+Used by ablate.py and compare.py.
+"""
 
 from __future__ import annotations
 
@@ -29,15 +32,22 @@ __all__ = [
     "write_report",
 ]
 
-# What one row of a table shows, by the names in its columns; None where a run does not have it.
+# Figures of one table row by name; None if a run does not have the figure.
 Figures = Mapping[str, float | None]
-# Seconds of metrics.json that are no mapping: they do not depend on the method.
+# Stages of metrics.json that are not mapping and do not depend on the method.
 NOT_MAPPING = ("compile", "track", "evaluate")
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a scene file, settings over it as {key: YAML text}, and the folder of its results."""
+    """One run.
+
+    Attributes:
+        label: Name for messages.
+        scene: Scene file.
+        folder: Output folder.
+        overrides: Settings as {key: YAML text}.
+    """
 
     label: str
     scene: Path
@@ -45,29 +55,29 @@ class Job:
     overrides: Mapping[str, str]
 
     def arguments(self) -> list[str]:
-        """The overrides as the command line takes them, the output folder among them."""
-        # A JSON text is a YAML text too, whatever stands in the path.
+        """Return the overrides, including the output folder, as `key=value` arguments."""
+        # JSON is valid YAML, whatever characters the path contains.
         return [f"{key}={value}" for key, value in self.overrides.items()] + [
             f"output={json.dumps(str(self.folder.resolve()))}"
         ]
 
     def check(self) -> dict[str, Any]:
-        """The resolved settings of the run; raises InputError where the scene does not take them."""
+        """Return the run's resolved settings. Raises InputError if they are not valid."""
         return load_scene(self.scene, self.arguments()).model_dump(mode="json")
 
     def is_done(self) -> bool:
-        """Whether the folder holds the results of a run with these very settings."""
+        """Return whether the folder holds the results of a run with exactly these settings."""
         written = self.folder / "config.yaml"
         if not written.is_file() or not (self.folder / "metrics.json").is_file():
             return False
         try:
             return load_scene(written).model_dump(mode="json") == self.check()
-        except InputError:  # written by another version
+        except InputError:  # from an incompatible version
             return False
 
 
 def named_scenes(files: Iterable[str]) -> dict[str, Path]:
-    """Scene files by short names: that of the file, or of its folder for one called `scene.yaml`."""
+    """Return the scene files by name, which is the file's, or the folder's if the file is called `scene.yaml`."""
     scenes: dict[str, Path] = {}
     for text in files:
         file = Path(text).resolve()
@@ -79,7 +89,7 @@ def named_scenes(files: Iterable[str]) -> dict[str, Path]:
 
 
 def command_line(settings: Iterable[str]) -> dict[str, str]:
-    """`--set key=value` texts as overrides; later ones win."""
+    """Parse `key=value` texts of `--set` into overrides. Later ones win."""
     overrides = {}
     for text in settings:
         key, equals, value = text.partition("=")
@@ -90,10 +100,16 @@ def command_line(settings: Iterable[str]) -> dict[str, str]:
 
 
 def execute(jobs: Sequence[Job], fresh: bool = False, say: Callable[[str], None] | None = None) -> list[dict[str, Any]]:
-    """The metrics of every job, those run that are not there yet, one after the other, each in a process of its own.
+    """Run the jobs that are not done, one after the other in their own processes, and return the metrics of all.
 
-    fresh: run all of them. Raises InputError before the first run where one has impossible settings, and where a run
-    fails; the finished ones are kept.
+    Args:
+        jobs: The jobs.
+        fresh: Run all of them, even if they are done.
+        say: Called with progress lines, None to print them to standard error.
+
+    Raises:
+        InputError: If a job has invalid settings (checked before the first run), or a run fails. Finished runs are
+            kept.
     """
     say = say or (lambda text: print(text, file=sys.stderr, flush=True))
     for job in jobs:
@@ -110,7 +126,7 @@ def _run(job: Job) -> None:
     command = [sys.executable, "-m", "modp_ti.run", str(job.scene)]
     for argument in job.arguments():
         command += ["--set", argument]
-    # To the terminal, but not into the Markdown: that alone is the output.
+    # Standard output carries only the Markdown.
     code = subprocess.run(command, stdout=sys.stderr, check=False).returncode
     if code:
         raise InputError(
@@ -119,25 +135,33 @@ def _run(job: Job) -> None:
 
 
 def load_metrics(folder: Path) -> dict[str, Any]:
-    """metrics.json of a run's folder."""
+    """Read metrics.json in a run's folder."""
     return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
 
 
 def quality(section: Mapping[str, Any]) -> dict[str, float | None]:
-    """psnr, ssim, lpips of a section of metrics.json: of the held-out frames, or of all where none is held out."""
+    """Return psnr, ssim and lpips of a section of metrics.json: of the held-out frames, or of all if there are none."""
     scores = section["held_out"] if section["held_out"]["count"] else section["all"]
     return {name: scores[name] for name in ("psnr", "ssim", "lpips")}
 
 
 def mapping_seconds(metrics: Mapping[str, Any], refined: bool) -> float:
-    """Seconds of a run without compiling, the tracker's preparation and evaluation; with refinement where asked."""
+    """Return a run's time [s] without compiling, the tracker's preparation and evaluation.
+
+    Args:
+        metrics: Content of metrics.json.
+        refined: Whether to include the post refinement.
+    """
     seconds = metrics["seconds"]
     left_out = sum(seconds.get(stage, 0.0) for stage in NOT_MAPPING)
     return seconds["total"] - left_out - (0.0 if refined else seconds.get("refine", 0.0))
 
 
 def first_third_psnr(folder: Path, stage: str) -> float | None:
-    """Mean PSNR of the held-out frames (all where none is) among the first third of the frames, from scores.csv."""
+    """Return the mean PSNR over the first third of the frames from scores.csv.
+
+    It covers the held-out frames, or all if there are none. None if the file does not exist.
+    """
     file = folder / "scores.csv"
     if not file.is_file():
         return None
@@ -152,7 +176,7 @@ def first_third_psnr(folder: Path, stage: str) -> float | None:
 
 
 def mean_figures(scenes: Sequence[Figures]) -> Figures:
-    """The mean of every figure over the scenes; None where a scene does not have it."""
+    """Return the mean of every figure over the scenes, None if a scene lacks it."""
     result: dict[str, float | None] = {}
     for name in scenes[0]:
         values = [figures[name] for figures in scenes]
@@ -162,7 +186,13 @@ def mean_figures(scenes: Sequence[Figures]) -> Figures:
 
 
 def markdown_table(corner: str, columns: Mapping[str, tuple[str, str]], rows: Mapping[str, Figures]) -> str:
-    """A table; columns: {header: (name of the figure, format)}. A figure that is None shows as a dash."""
+    """Return a Markdown table. Missing figures appear as a dash.
+
+    Args:
+        corner: Header of the first column.
+        columns: {header: (name of the figure, format)}.
+        rows: Figures by label.
+    """
     lines = [f"| {corner} | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for label, figures in rows.items():
         cells = [label]
@@ -174,7 +204,7 @@ def markdown_table(corner: str, columns: Mapping[str, tuple[str, str]], rows: Ma
 
 
 def write_report(folder: Path, name: str, text: str, figures: Any) -> None:
-    """NAME.md and NAME.json in the folder; the Markdown is printed too."""
+    """Print the Markdown text, and write NAME.md and NAME.json to the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.md").write_text(text + "\n", encoding="utf-8")
     (folder / f"{name}.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")

@@ -1,9 +1,9 @@
-"""Faults, made on purpose, and what became of the run: tables for docs/reliability.md.
+"""Fault injection for docs/reliability.md: cause faults, check the outcome of the run and print tables.
 
-kills      a small run is killed at random moments and resumed; its map must be that of a run in peace, byte for byte
-stream     a recording with a tenth of its frames corrupted, beside the same one in order
-soak       a long recording, and the memory that the process holds meanwhile
-malformed  inputs of every reader, corrupted in hundreds of ways: one clear line each
+kills      kill a small run at random moments and resume it; the map must be identical to that of an undisturbed run
+stream     map a recording with a tenth of its frames corrupted, and the intact one for comparison
+soak       map a long recording and measure the memory of the process
+malformed  corrupt the inputs of every reader in hundreds of ways; each must give one clear line
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ Part = Callable[[argparse.Namespace, Say], str]
 
 
 def kills(arguments: argparse.Namespace, say: Say) -> str:
-    """Table of the kills."""
+    """Return the table of the kills."""
     from fault_injection.kills import kill_and_resume, kills_table
 
     return kills_table(kill_and_resume(arguments.output / "kills", arguments.kills, arguments.seed, say))
 
 
 def stream(arguments: argparse.Namespace, say: Say) -> str:
-    """Table of the recording with faulty frames."""
+    """Return the table of the recording with faulty frames."""
     from fault_injection.stream import map_both, stream_table
 
     return stream_table(map_both(arguments.output / "stream", arguments.seed, say))
 
 
 def soak(arguments: argparse.Namespace, say: Say) -> str:
-    """Table of the soak."""
+    """Return the table of the soak test."""
     from fault_injection.soak import soak as run_soak
     from fault_injection.soak import soak_table
 
@@ -44,7 +44,7 @@ def soak(arguments: argparse.Namespace, say: Say) -> str:
 
 
 def malformed(arguments: argparse.Namespace, say: Say) -> str:
-    """Table of the malformed inputs."""
+    """Return the table of the malformed inputs."""
     from fault_injection.malformed import malformed_inputs, markdown
 
     return markdown(list(malformed_inputs()))
@@ -54,7 +54,7 @@ PARTS: dict[str, Part] = {"kills": kills, "stream": stream, "soak": soak, "malfo
 
 
 def main() -> None:
-    """Make the faults, then print and write the tables; exit code 2 where a run fails that should not."""
+    """Run the tests, then print and write the tables. The exit code is 2 if a run fails unexpectedly."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/faults kills --kills 10 -o out/faults",

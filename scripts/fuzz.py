@@ -1,9 +1,9 @@
-"""Coverage-guided fuzzing of readers: bytes that reach new branches are kept and changed further.
+"""Coverage-guided fuzzing of the readers: inputs that reach new branches are kept and mutated further.
 
-Each reader runs in a process of its own, which starts with the samples and with what tests/corpus/READER keeps. What a
-reader must never do stops it: raise anything but an InputError, warn, take more than --rss MiB or 20 seconds. Such an
-input is written to tests/corpus/READER/crash-..., where the tests replay it from then on: once it is mended, it stays
-there. --keep adds the smallest of the inputs that reach what the corpus did not.
+Each reader runs in its own process and starts with the samples and the corpus in tests/corpus/READER. A reader stops if
+it raises anything but an InputError, warns, exceeds --rss MiB or takes more than 20 seconds. The input is then saved as
+tests/corpus/READER/crash-..., which the tests replay; it stays there after the fault is fixed. --keep adds the smallest
+inputs that reach code which the corpus did not.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LONGEST = 1 << 14  # bytes of an input
 
 
 def main() -> None:
-    """Fuzz one reader after the other and print a table."""
+    """Fuzz the readers one after the other and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("reader", nargs="*", help="which of them; all where none is named")
     parser.add_argument("--seconds", type=int, default=60, help="for each (default %(default)s)")
@@ -43,7 +43,7 @@ def main() -> None:
     for kernels in (
         "online",
         "torch_checkpoint",
-    ):  # compiled by Taichi and PyTorch: nothing to be instrumented, much to import
+    ):  # compiled by Taichi and PyTorch, so there is nothing to instrument
         import_module(f"pipelines.{kernels}")
     with atheris.instrument_imports(include=["modp_ti"]):
         from fault_injection.readers import READERS, import_readers
@@ -59,7 +59,7 @@ def main() -> None:
 
 
 def one(name: str, options: argparse.Namespace) -> bool:
-    """Fuzz a reader in a process of its own, print its row, and say whether it was stopped."""
+    """Fuzz a reader in its own process, print its row, and return whether a fault stopped it."""
     kept = CORPUS / name
     kept.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="modp-ti-fuzz-") as folder:
@@ -93,14 +93,14 @@ def one(name: str, options: argparse.Namespace) -> bool:
 
 
 def _reason(text: str) -> str:
-    """What stopped the fuzzer, in a line."""
+    """Return one line that says why the fuzzer stopped."""
     python = re.findall(r"^ *=* ?(\w[\w.]*(?:Error|Exception|Warning)\b.*)$", text, re.MULTILINE)
     native = re.findall(r"==\d+== ERROR: (.*)", text)
     return (python[-1] if python else native[-1] if native else "it did not start").replace("|", "/")[:160]
 
 
 def fuzz(name: str, folder: Path, kept: Path, options: argparse.Namespace) -> NoReturn:
-    """Fuzz a reader in this process, which libFuzzer ends."""
+    """Fuzz a reader in this process. libFuzzer ends the process."""
     import atheris
     from fault_injection.readers import READERS, seeds
 

@@ -1,12 +1,13 @@
-"""How true an exported mesh is: that of a map of the demo room against the room's own surface.
+"""Measure the accuracy of an exported mesh of the demo room against the room's true surface.
 
     modp-ti run demo/scene.yaml
     modp-ti export out/demo --format mesh
     python scripts/mesh_accuracy.py out/demo
 
-prints the share of the mesh's vertices that lie within one percent of the room's size of the true surface, and the
-share of the true surface, as far as a frame that was mapped saw it, that has a vertex within the same distance. Once
-for all of it, once for the room alone: a tenth of what the frames see is a picture four metres behind the window.
+prints precision, the share of vertices close to the true surface, and recall, the share of the true surface seen by
+mapped frames that has a vertex close to it. The distances are 0.5, 1 and 2 percent of the room's size. Both are given
+for the whole scene and for the room alone, because a tenth of what the frames see is a picture four metres behind the
+window.
 """
 
 from __future__ import annotations
@@ -30,22 +31,22 @@ from modp_ti.outputs.formats.mesh import read_mesh
 from modp_ti.outputs.formats.open3d_io import open3d
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 
-# The longest side of the room inside [m], and of it the share that counts as right.
+# Longest inner side of the room [m], and the tolerance as a fraction of it.
 ROOM = 4.8
 TOLERANCE = 0.01
-# Points of the true surface are thinned to one in a cube of this edge [m].
+# Voxel size for thinning the points of the true surface [m].
 SPACING = 0.01
 
 
 def unprojected(camera: PinholeCamera, T_camera_world: NDArray, depth: NDArray) -> NDArray[np.float64]:
-    """World points (N, 3) of the pixels of a depth image (H, W) that have one."""
+    """Return the world points (N, 3) of a depth image (H, W), without unknown pixels."""
     row, column = np.nonzero(depth > 0)
     p = camera.unproject(np.stack([column, row], axis=1) + 0.5, depth[row, column])
     return (p - T_camera_world[:3, 3]) @ T_camera_world[:3, :3]
 
 
 def true_surface(camera: PinholeCamera, poses: Iterable[NDArray], depths: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Points (N, 3) of the room [m] that views with true T_camera_world (4, 4) and depth (H, W) see."""
+    """Return the room's points (N, 3) [m] that are seen in depth images (H, W) from true T_camera_world (4, 4)."""
     o3d = open3d()
     seen = o3d.geometry.PointCloud()
     for T, depth in zip(poses, depths, strict=True):
@@ -55,7 +56,7 @@ def true_surface(camera: PinholeCamera, poses: Iterable[NDArray], depths: Iterab
 
 
 def precision_recall(vertices: NDArray, surface: NDArray, tolerance: float) -> tuple[float, float]:
-    """Share of vertices (V, 3) with a surface point (N, 3) within tolerance, and the other way round."""
+    """Return precision and recall of vertices (V, 3) against surface points (N, 3) for a distance tolerance."""
     o3d = open3d()
     mesh, true = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (vertices, surface))
     to_surface, to_mesh = mesh.compute_point_cloud_distance(true), true.compute_point_cloud_distance(mesh)
@@ -63,9 +64,10 @@ def precision_recall(vertices: NDArray, surface: NDArray, tolerance: float) -> t
 
 
 def in_the_room(run: FinishedRun, truth: list[NDArray], points: NDArray) -> NDArray[np.float64]:
-    """Points (N, 3) of the map's world in the room's, by the similarity that fits the cameras.
+    """Align map points (N, 3) to the room by the similarity that fits the cameras.
 
-    Its rotation is that of the cameras themselves: their places, nearly on a line, would leave a turn around it open.
+    The rotation is estimated from the camera rotations, because the camera centres are nearly collinear and leave the
+    rotation around that line undetermined.
     """
     turns = sum(there[:3, :3].T @ here[:3, :3] for here, there in zip(run.poses, truth, strict=True))
     U, _, Vt = np.linalg.svd(turns)
@@ -78,7 +80,7 @@ def in_the_room(run: FinishedRun, truth: list[NDArray], points: NDArray) -> NDAr
 
 @documented_ending()
 def main() -> None:
-    """Print the two shares."""
+    """Print precision and recall."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("out", type=Path, help="output folder of a run of the demo")
     parser.add_argument("--mesh", type=Path, help="empty: OUT/mesh.ply")
@@ -89,10 +91,10 @@ def main() -> None:
         raise InputError(f"{run.folder}: not a run of the demo room: its surface is not known")
     mesh = read_mesh(arguments.mesh or run.folder / "mesh.ply")
     initialise("cpu")
-    tracker = open_synthetic(config.source, config.tracker, RoomRenderer(texel=1.0))  # nobody looks at its light
+    tracker = open_synthetic(config.source, config.tracker, RoomRenderer(texel=1.0))  # its lighting is not used
     vertices = in_the_room(run, tracker.ground_truth(), np.asarray(mesh.vertices))
     poses = [tracker.ground_truth()[index] for index in run.mapped]
-    depths = (tracker.depth(index) for index in run.mapped)  # rays against its primitives, no map and no mesh
+    depths = (tracker.depth(index) for index in run.mapped)  # ray-cast, independent of map and mesh
     surface = true_surface(tracker.camera, poses, depths)
     for name, least in (("all", -np.inf), ("the room", LIT_LOWER[0])):
         parts = vertices[vertices[:, 0] >= least], surface[surface[:, 0] >= least]

@@ -1,4 +1,4 @@
-"""A picture of an exported mesh from the camera of a frame, in its colours and in grey by its slope.
+"""Render an exported mesh from a frame's camera, in its colours and in grey shaded by slope.
 
 modp-ti export OUT --format mesh
 python scripts/mesh_picture.py OUT picture.png --frame 100
@@ -20,12 +20,12 @@ from modp_ti.outputs.formats.mesh import read_mesh
 from modp_ti.outputs.formats.open3d_io import open3d
 from modp_ti.outputs.playback.finished_run import open_run
 
-# What no ray hits.
+# Value of pixels where no ray hits the mesh.
 BACKGROUND = 1.0
 
 
 def pictures(mesh, camera: PinholeCamera, T_camera_world: NDArray) -> tuple[NDArray, NDArray]:
-    """The mesh as a camera sees it, both (H, W, 3) in [0, 1]: in its vertices' colours, and lit from the camera."""
+    """Render a mesh from a camera: vertex colours, and grey lit from the camera. Both are (H, W, 3) in [0, 1]."""
     o3d = open3d()
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
@@ -48,7 +48,7 @@ def pictures(mesh, camera: PinholeCamera, T_camera_world: NDArray) -> tuple[NDAr
 
 @documented_ending()
 def main() -> None:
-    """Draw both side by side."""
+    """Write both pictures side by side."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="output folder of a run")
     parser.add_argument("picture", type=Path, help="PNG or JPEG to write")

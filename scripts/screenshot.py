@@ -1,4 +1,4 @@
-"""A picture of the viewer's page: `scripts/screenshot URL FILE.png`."""
+"""Take a screenshot of the viewer's page: `scripts/screenshot URL FILE.png`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from modp_ti.files.errors import InputError
 
 @documented_ending()
 def main() -> None:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("url", help="what `modp-ti run --view` or `modp-ti view` printed")
     parser.add_argument("file", help="PNG to write")

@@ -1,7 +1,7 @@
-"""Plays the frames of any scene into a run of `tracker: {kind: socket}`, as a tracker in another program would.
+"""Send the frames of any scene to a run with `tracker: {kind: socket}`, as an external tracker would.
 
-The messages are written here after docs/tracker_server.md, with the standard library and NumPy: an example to start
-from.
+The messages are implemented from docs/tracker_server.md with only the standard library and NumPy, as an example to
+start from.
 """
 
 from __future__ import annotations
@@ -28,13 +28,15 @@ NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
 
 class ServerError(Exception):
-    """The server has told us why it goes no further, or is not there."""
+    """The server reported an error, closed the connection or cannot be reached."""
 
 
 class Sender:
-    """The other side of `tracker: {kind: socket}`.
+    """Client for `tracker: {kind: socket}`.
 
-    address: "host:port", or the path of a Unix socket. wait: seconds in which the run may still start to listen.
+    Args:
+        address: "host:port", or the path of a Unix socket.
+        wait: How long to wait for the run to listen [s].
     """
 
     def __init__(self, address: str, wait: float = 60.0) -> None:
@@ -50,7 +52,17 @@ class Sender:
         coefficients: Sequence[float] = (),
         name: str = "",
     ) -> None:
-        """The camera. intrinsics: fx, fy, cx, cy in pixels, pixel centres at +0.5. Waits for the answer."""
+        """Send the camera and wait for the server's answer.
+
+        Args:
+            width: Image width [px].
+            height: Image height [px].
+            intrinsics: fx, fy, cx, cy [px], with pixel centres at +0.5.
+            encoding: Encoding of the images, such as RGB8.
+            lens: Number of the lens model.
+            coefficients: Up to 8 distortion coefficients.
+            name: Name of the tracker.
+        """
         k = [*coefficients, *[0.0] * (8 - len(coefficients))]
         self.send(HELLO, struct.pack("<IIII4d8d", width, height, encoding, lens, *intrinsics, *k) + name.encode())
         self.expect(WELCOME)
@@ -64,7 +76,16 @@ class Sender:
         points: tuple[NDArray, NDArray, NDArray] = NO_POINTS,
         state: int | None = None,
     ) -> None:
-        """A frame. points: (N, 3) in the world, (N, 2) pixels and (N,) ids. state: where the pose is not known yet."""
+        """Send a frame.
+
+        Args:
+            number: The frame's number.
+            timestamp: Time stamp [s].
+            image: The encoded image.
+            T_camera_world: (4, 4) pose, None if not known yet.
+            points: World points (N, 3), their pixels (N, 2) and ids (N,).
+            state: LATER, KNOWN or LOST, None to derive it from the pose.
+        """
         state = state if state is not None else LATER if T_camera_world is None else KNOWN
         self.send(FRAME, _frame(number, state, timestamp, T_camera_world, points, image))
 
@@ -74,7 +95,13 @@ class Sender:
         T_camera_world: NDArray[np.float64] | None,
         points: tuple[NDArray, NDArray, NDArray] = NO_POINTS,
     ) -> None:
-        """The pose of a frame that was sent without; None where there will be none."""
+        """Send the pose of a frame that was sent without one.
+
+        Args:
+            number: The frame's number.
+            T_camera_world: (4, 4) pose, None if tracking was lost.
+            points: World points (N, 3), their pixels (N, 2) and ids (N,).
+        """
         self.send(POSE, _frame(number, LOST if T_camera_world is None else KNOWN, 0.0, T_camera_world, points, b""))
 
     def correction(
@@ -84,7 +111,14 @@ class Sender:
         ids: NDArray[np.integer] | None = None,
         xyz: NDArray[np.float64] | None = None,
     ) -> None:
-        """Revised poses (N, 4, 4) of frames, by their numbers in growing order, and places (M, 3) of points."""
+        """Send revised poses and points.
+
+        Args:
+            numbers: (N,) numbers of the frames, ascending.
+            T_camera_world: (N, 4, 4) poses.
+            ids: (M,) ids of the points, or None.
+            xyz: (M, 3) positions of the points, or None.
+        """
         ids, xyz = (np.zeros(0), np.zeros((0, 3))) if ids is None or xyz is None else (ids, xyz)
         payload = struct.pack("<II", len(numbers), len(ids))
         for number, T in zip(numbers, T_camera_world, strict=True):
@@ -94,19 +128,23 @@ class Sender:
         self.send(CORRECTION, payload)
 
     def end(self) -> int:
-        """No more will come. Returns how many frames went to the mapper, once the last of them has."""
+        """Announce the end and wait until the last frame has been passed to the mapper.
+
+        Returns:
+            Number of frames that were passed to the mapper.
+        """
         self.send(END, b"")
         return struct.unpack("<I", self.expect(DONE))[0]
 
     def send(self, kind: int, payload: bytes) -> None:
-        """Any message. Waits while the run has enough frames to work on."""
+        """Send a message. Blocks while the run has enough frames to work on."""
         try:
             self.socket.sendall(struct.pack("<4sHHII", b"MODP", 1, kind, len(payload), 0) + payload)
         except OSError as error:
             raise ServerError(self._last_words() or f"the connection is gone: {error}") from None
 
     def expect(self, kind: int) -> bytes:
-        """The payload of the server's next message. Raises ServerError where that is an error."""
+        """Receive the payload of the server's next message. Raises ServerError if the message is of another kind."""
         _, _, answer, length, _ = struct.unpack("<4sHHII", self._read(16))
         payload = self._read(length)
         if answer != kind:
@@ -165,10 +203,18 @@ def _connected(address: str, deadline: float) -> socket.socket:
 def play(
     scene: Path, overrides: Sequence[str], address: str, wait: float, late: int = 0, rate: float | None = None
 ) -> int:
-    """Send the scene's frames as its tracker delivers them; how many the server took.
+    """Send a scene's frames as its tracker delivers them.
 
-    address, wait: see `Sender`. late: frames after which a frame's pose and points follow it; 0 sends them with it.
-    rate: frames a second at most.
+    Args:
+        scene: Scene file.
+        overrides: `KEY=VALUE` settings.
+        address: See `Sender`.
+        wait: See `Sender`.
+        late: Send poses and points this many frames after their images; 0 sends them together.
+        rate: Maximum frames per second, None for no limit.
+
+    Returns:
+        Number of frames that were passed to the mapper.
     """
     from fields.frames.pose_correction import PoseCorrection
     from fields.runtime.backend import initialise
@@ -176,7 +222,7 @@ def play(
     from modp_ti.inputs.trackers import open_tracker
 
     config = load_scene(scene, overrides)
-    initialise("cpu", config.threads, config.seed)  # the demo's frames are rendered
+    initialise("cpu", config.threads, config.seed)  # needed to render the demo's frames
     tracker = open_tracker(config)
     waiting: deque = deque()
     next_time = time.monotonic()
@@ -185,12 +231,12 @@ def play(
         for event in tracker.events():
             if isinstance(event, PoseCorrection):
                 assert sender is not None, "frames come before their corrections"
-                for each in waiting:  # the frames that it revises need poses first
+                for each in waiting:  # the frames that it revises must have poses
                     _send_pose(sender, each)
                 waiting.clear()
                 sender.correction(event.index, event.T_camera_world, event.ids, event.xyz)
                 continue
-            if sender is None:  # not before there is something to say: who connects and is silent is let go
+            if sender is None:  # connect late, as the server drops silent clients
                 camera = c = event.camera
                 sender = Sender(address, wait)
                 sender.hello(c.width, c.height, (c.fx, c.fy, c.cx, c.cy), RGBA8, name="send_frames")
@@ -223,7 +269,7 @@ def _points(frame) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/send_frames scene.yaml --to 127.0.0.1:7007 --late 3",
@@ -236,7 +282,7 @@ def main() -> None:
     parser.add_argument("--wait", type=float, default=60.0, help="seconds in which the run may still start to listen")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override of the scene file")
     arguments = parser.parse_args()
-    from ending import documented_ending  # here: `Sender` is used without the rest, too
+    from ending import documented_ending  # imported here because `Sender` is also used on its own
 
     with documented_ending(ServerError):
         taken = play(arguments.scene, arguments.set, arguments.to, arguments.wait, arguments.late, arguments.rate)

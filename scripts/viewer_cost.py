@@ -1,8 +1,8 @@
-"""What the viewer costs a mapper: processor time with it against without it, in turns within one process.
+"""Measure the viewer's cost: CPU time with and without it, in alternating blocks of one process.
 
-A small map of the demo room is refined for blocks of steps. In every other block the viewer looks on, with a real
-browser in each of its modes and without one; what its threads take is counted, what the browser takes is not. The
-medians of neighbouring blocks' ratios are printed, beside what the viewer believes that it costs.
+A small map of the demo room is refined in blocks of steps. Every other block runs with the viewer, with a real browser
+in each of its modes and without one. The time of the viewer's threads counts; that of the browser does not. The script
+prints the median ratio of neighbouring blocks next to the viewer's own estimate.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from modp_ti.outputs.viewer.modes import MODES
 from pipelines.settings import MappingSettings, RefineSettings
 
 CLOSED = "no browser"
-# Seconds between the last step of a block and the clock's reading, for what the viewer still has to send.
+# Delay before the clock is read at the end of a block, for pending messages of the viewer [s].
 SETTLE = 0.3
 
 
 class Turns:
-    """Observes a refinement: lets the viewer look on in every other block of steps, and times the blocks.
+    """Observes a refinement, enables the viewer in every other block of steps and times the blocks.
 
-    clock: what the viewer is to take for time: the process's, as far as blocks with it go.
+    Its `clock` serves as the viewer's clock. It returns the CPU time of the blocks with the viewer.
     """
 
     def __init__(self, block: int) -> None:
@@ -41,7 +41,7 @@ class Turns:
         self.viewer: LiveViewer | None = None
         self.seconds: dict[bool, list[float]] = {False: [], True: []}
         self._with = False
-        self._before = 0.0  # of all blocks with the viewer that are over
+        self._before = 0.0  # of all finished blocks with the viewer
         self._began = time.process_time()
 
     def clock(self) -> float:
@@ -60,13 +60,13 @@ class Turns:
         self._began = time.process_time()
 
     def cost(self) -> list[float]:
-        """Percent that each block with the viewer took beyond the mean of the blocks around it."""
+        """Return the extra time of each block with the viewer, relative to the mean of its neighbours [%]."""
         without, seen = self.seconds[False], self.seconds[True]
         return [100 * (s / (0.5 * (a + b)) - 1) for s, a, b in zip(seen, without, without[1:], strict=False)]
 
 
 def measure(mapper: Mapper, mode: str, block: int, pairs: int) -> tuple[list[float], float]:
-    """Percent of each block with the viewer in this mode, and what the viewer believes."""
+    """Return the cost of each block in this mode, and the viewer's own estimate, both in percent."""
     turns = Turns(block)
     viewer = turns.viewer = LiveViewer(ViewSettings(port=0), print, turns.clock)
     try:
@@ -81,14 +81,14 @@ def measure(mapper: Mapper, mode: str, block: int, pairs: int) -> tuple[list[flo
 
 
 def refine(mapper: Mapper, steps: int, progress: Callable[[int, float], None] | None = None) -> None:
-    """Steps that change little: the map stays as it is, and all blocks have the same work."""
+    """Run refinement steps that hardly change the map, so that all blocks have the same work."""
     settings = RefineSettings(views=1, min_contribution=0.0, position_decay=1.0, scale_decay=1.0)
     mapper.refine(steps, settings, progress)
 
 
 @documented_ending()
 def main() -> None:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=12, help="of the demo room that are mapped (default 12)")
     parser.add_argument("--block", type=int, default=60, help="steps of a block (default 60)")

@@ -1,4 +1,4 @@
-"""Taichi, started anew for every test module; marks; what is made once for all modules and workers."""
+"""Shared fixtures and hooks: a fresh Taichi per test module, test marks, and data shared by modules and workers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 pytest_plugins = ["tests.spread"]
 
-# Kernels that the tests compile have a cache of their own: Taichi's holds 100 MB, and the whole suite fills more.
+# The tests use their own kernel cache: Taichi's default is limited to 100 MB, which the whole suite exceeds.
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modp-ti" / "test-kernels"
 os.environ.setdefault("TI_OFFLINE_CACHE_FILE_PATH", str(CACHE))
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(1 << 30))
@@ -28,7 +28,7 @@ SHARED_DATA = HERE.parents[1] / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests by what they need, and put the slow modules first, so that no worker ends alone with one of them."""
+    """Mark tests by what they need, and run slow modules first, so that no worker is left with one at the end."""
     for item in items:
         if "shared_data" in getattr(item, "fixturenames", ()):
             item.add_marker("real_data")
@@ -39,7 +39,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """A run that leaves out the GPU's kernels must not pass for one that tested them."""
+    """Report skipped GPU tests, so that such a run is not mistaken for one that tested the GPU's kernels."""
     left_out = [r for r in terminalreporter.getreports("skipped") if "tests/pipelines/gpu/" in r.nodeid]
     if left_out:
         terminalreporter.write_line(
@@ -51,13 +51,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def taichi_on_the_cpu() -> None:
-    """Fields of an earlier module are gone: Taichi 1.7.4 writes beyond its memory once fields fill its first GB."""
+    """Free the fields of earlier modules: Taichi 1.7.4 writes out of bounds once fields fill its first GB."""
     initialise("cpu")
 
 
 @pytest.fixture
 def shared_data() -> Callable[[str], Path]:
-    """The folder of a real data set; skips the test where it is not there."""
+    """Return a function that gives the folder of a real data set, and skips the test if it is missing."""
 
     def folder(name: str) -> Path:
         if not (SHARED_DATA / name).is_dir():
@@ -69,7 +69,7 @@ def shared_data() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
-    """A folder that the first worker to ask for it fills, by a key. Nobody may write to it afterwards."""
+    """Return a function that gives a folder by key. The first worker to ask fills it; nobody may change it later."""
     base = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent
@@ -88,14 +88,14 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 @pytest.fixture(scope="session")
 def room() -> Room:
-    from tests.room import Room  # which loads Open3D
+    from tests.room import Room  # imported here because it loads Open3D
 
     return Room()
 
 
 @pytest.fixture(scope="session")
 def room_recording(room: Room) -> RoomRecording:
-    """Nine frames of 80x60 in the room."""
+    """A recording of nine frames of 80x60 in the room."""
     from tests.room import RoomRecording, pinhole, walk
 
     return RoomRecording(room, pinhole(80, 60), walk(9))

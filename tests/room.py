@@ -1,4 +1,4 @@
-"""A small furnished room whose geometry is known: Open3D's primitives, cast by its ray tracer."""
+"""A small furnished room with known geometry, built from Open3D primitives and ray-cast by Open3D."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 
-LOW, HIGH = np.array([-2.5, -2.0, 0.0]), np.array([2.5, 2.0, 2.6])  # the walls, z up [m]
-CELLS = np.array([0.7, 0.22])  # of the textures [m]
+LOW, HIGH = np.array([-2.5, -2.0, 0.0]), np.array([2.5, 2.0, 2.6])  # corners of the room, z up [m]
+CELLS = np.array([0.7, 0.22])  # cell sizes of the textures [m]
 LIGHT = np.array([0.3, -0.5, 0.81])
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T_camera_world (4, 4) of a camera at `eye` that looks at `target`, z of the world up."""
+    """Return T_camera_world (4, 4) of a camera at `eye` that looks at `target`, with the world's z up."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -33,7 +33,10 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 
 
 def walk(frames: int, step: float = 0.04) -> list[NDArray[np.float64]]:
-    """T_camera_world (4, 4) of a camera that goes along the room, `step` metres a frame, and looks across it."""
+    """Return T_camera_world (4, 4) of a camera that moves along the room by `step` metres per frame.
+
+    The camera looks across the room.
+    """
     t = step * np.arange(frames)
     eyes = np.stack([-1.4 + t, -1.3 + 0.1 * np.sin(2 * t), 1.3 + 0.08 * np.sin(3 * t)], axis=1)
     targets = np.stack([-0.8 + 0.7 * t, np.full(frames, 1.6), np.full(frames, 0.8)], axis=1)
@@ -41,12 +44,12 @@ def walk(frames: int, step: float = 0.04) -> list[NDArray[np.float64]]:
 
 
 def pinhole(width: int, height: int) -> PinholeCamera:
-    """The room's camera: 67 degrees across, the principal point in the middle."""
+    """Return the room's camera, with a horizontal field of view of 67 degrees and a centred principal point."""
     return PinholeCamera(0.75 * width, 0.75 * width, width / 2, height / 2, width, height)
 
 
 class Room:
-    """Walls, two boxes, a sphere and a cylinder, each with a texture of its own."""
+    """Walls, two boxes, a sphere and a cylinder, each with its own texture."""
 
     def __init__(self) -> None:
         make = o3d.t.geometry.TriangleMesh
@@ -62,14 +65,19 @@ class Room:
             self._scene.add_triangles(mesh.translate(place))
         rng = np.random.default_rng(11)
         self._base = rng.uniform(0.35, 0.75, (len(pieces), 3))
-        # Values at the corners of a lattice that repeats, for each of the textures' two cell sizes.
+        # Values at the corners of a periodic lattice, for each of the textures' two cell sizes.
         grey, colour = rng.uniform(-1.0, 1.0, (2, 32, 32, 32, 1)), rng.uniform(-1.0, 1.0, (2, 32, 32, 32, 3))
         self._lattice = 0.8 * grey + 0.2 * colour
 
     def cast(
         self, eye: NDArray[np.float64], rays: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """Parameter t (N,) at which rays (N, 3) from `eye` hit, what they hit (N,), and the normal there (N, 3)."""
+        """Cast rays and return parameter t (N,), index of the object (N,) and normal (N, 3) of each hit.
+
+        Args:
+            eye: (3,) origin of all rays.
+            rays: (N, 3) directions.
+        """
         six = np.concatenate([np.broadcast_to(eye, rays.shape), rays], axis=1).astype(np.float32)
         hit = self._scene.cast_rays(o3d.core.Tensor(six), nthreads=1)
         return (
@@ -81,12 +89,12 @@ class Room:
     def depth(
         self, camera: PinholeCamera, T_camera_world: NDArray[np.float64], pixels: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """z (N,) of what is seen at pixels (N, 2)."""
+        """Return the z-depth (N,) at pixels (N, 2)."""
         rays = camera.unproject(pixels, np.ones(len(pixels))) @ T_camera_world[:3, :3]
         return self.cast(inverse_se3(T_camera_world)[:3, 3], rays)[0]
 
     def image(self, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Picture (H, W, 3), RGB, of four rays a pixel."""
+        """Return an RGB image (H, W, 3) with four rays per pixel."""
         fine = pinhole(2 * camera.width, 2 * camera.height)
         x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
         pixels = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -99,7 +107,7 @@ class Room:
         return np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
 
     def _texture(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Smooth noise (N, 3) at places (N, 3): lattice values between which it is interpolated."""
+        """Return smooth noise (N, 3) at points (N, 3), interpolated from lattice values."""
         found = np.zeros((len(xyz), 3))
         for lattice, cell in zip(self._lattice, CELLS, strict=True):
             low = np.floor(xyz / cell).astype(np.int64)
@@ -114,10 +122,16 @@ class Room:
 
 @dataclass(frozen=True)
 class RoomRecording:
-    """A walk through the room as a user has it: pictures, and what a tracker made of them.
+    """A walk through the room: images, and the poses and points of a simulated tracker.
 
-    T_camera_world: the true poses (4, 4). xyz (P, 3), seen and pixels: the points, which of them each frame sees and
-    where, all but the points' own error of 0.3 px and 2 % of their depth.
+    The tracked points have random errors of 0.3 px in the image and 2 % in depth (standard deviations).
+
+    Attributes:
+        room: The room.
+        camera: The camera of all frames.
+        T_camera_world: True pose (4, 4) of each frame.
+        points: Twice the number of points that are sampled in each of a few evenly spaced frames.
+        seed: Seed of the points and their errors.
     """
 
     room: Room
@@ -132,7 +146,7 @@ class RoomRecording:
 
     @cached_property
     def observations(self) -> tuple[NDArray[np.float64], list[NDArray[np.int64]], list[NDArray[np.float64]]]:
-        """xyz (P, 3), and for each frame the points (S,) that it sees and their pixels (S, 2)."""
+        """Points xyz (P, 3), and for each frame the indices (S,) of the points that it sees and their pixels (S, 2)."""
         rng = np.random.default_rng(self.seed)
         size = [self.camera.width, self.camera.height]
         found = []
@@ -155,7 +169,7 @@ class RoomRecording:
         return true + 0.02 * rng.normal(size=(len(true), 1)) * (true - eye), seen, places
 
     def frames(self) -> list[TrackedFrame]:
-        """The recording as a mapper takes it in, ten frames a second."""
+        """Return the recording as tracked frames at ten frames per second."""
         xyz, seen, pixels = self.observations
         return [
             TrackedFrame(i, i / 10, f"{i:04d}", (image / 255).astype(np.float32), self.camera, T, points)
@@ -170,7 +184,12 @@ class RoomRecording:
         ]
 
     def write(self, folder: Path, gains: NDArray[np.float64] | None = None) -> None:
-        """`images/NNNN.png`, their exposures times `gains` (F,), and a COLMAP model in `sparse/0`."""
+        """Write the recording to a folder.
+
+        Args:
+            folder: Gets the images as `images/NNNN.png` and a COLMAP model in `sparse/0`.
+            gains: (F,) factors on the images' brightness, None for 1.
+        """
         (folder / "images").mkdir(parents=True)
         names = [f"{i:04d}.png" for i in range(len(self.T_camera_world))]
         gains = np.ones(len(names)) if gains is None else gains
@@ -190,7 +209,18 @@ def write_colmap(
     pixels: list[NDArray[np.float64]],
     text: bool = False,
 ) -> None:
-    """A COLMAP model of posed images: each sees the points `seen` (S,) of xyz (P, 3) at `pixels` (S, 2)."""
+    """Write a COLMAP model of posed images.
+
+    Args:
+        folder: An existing folder.
+        camera: The camera of all images.
+        names: Names of the images.
+        T_camera_world: Pose (4, 4) of each image.
+        xyz: (P, 3) points.
+        seen: Indices (S,) of the points that each image sees.
+        pixels: Pixels (S, 2) of these points.
+        text: Write the text format instead of the binary one.
+    """
     model = pycolmap.Reconstruction()
     parameters = [camera.fx, camera.fy, camera.cx, camera.cy]
     model.add_camera_with_trivial_rig(

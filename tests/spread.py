@@ -1,13 +1,13 @@
-"""How far every threshold of the suite lies from what is measured: `pytest --spread N`, `scripts/spread`.
+"""Checks how close each threshold of the test suite is to the measured values: `pytest --spread N`, `scripts/spread`.
 
-A test that passes may hang on rounding, on one random draw or on where an optimiser happened to end. With `--spread N`
-(N from 1) the same promises are asked of the N-th disturbance: another stream from every seed, one to three threads,
-and inputs moved by one unit in the last place where a test's scene passes them through `disturbed`. All must hold.
+A passing test may depend on rounding, on one random draw or on where an optimiser converged. `--spread N` (N from 1)
+runs the tests under the N-th disturbance: every seed gives another random stream, one to three threads are used, and
+inputs that a test passes through `disturbed` move by one unit in the last place. All tests must still pass.
 
-With `--spread-report FILE` each assertion that compares numbers appends its slack to the file: the signed distance of
-the value from its bound (for `assert_allclose` and `approx`, one less the share of the tolerance that is used up).
-`python -m tests.spread FILE` reads the files of several disturbances and lists the assertions whose smallest slack is
-less than `MARGIN` times the spread of the slacks: their thresholds would fail on another machine or draw.
+With `--spread-report FILE`, each assertion that compares numbers appends its slack to the file. The slack is the signed
+distance of the value from its bound; for `assert_allclose` and `approx`, it is one minus the used fraction of the
+tolerance. `python -m tests.spread FILE` reads the files of several disturbances and lists the assertions whose smallest
+slack is less than `MARGIN` times the spread of the slacks. Their thresholds could fail on another machine or draw.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 __all__ = ["disturbance", "disturbed"]
 
-# A bound lies this many spreads beyond the worst of the draws.
+# Required distance between a bound and the worst draw, in units of the spread.
 MARGIN = 1.0
 NUMBER = r"(?:np\.\w+\()?(-?(?:\d+\.?\d*(?:e[+-]?\d+)?|inf))\)?"
 COMPARISON = re.compile(rf"(?<![\w.]){NUMBER} (<=|>=|<|>) {NUMBER}(?![\w.])")
@@ -40,17 +40,20 @@ _slacks: dict[tuple[str, int, str], float] = {}
 
 
 def disturbance() -> int:
-    """N of `--spread N`; 0 in an ordinary run."""
+    """Return N of `--spread N`, 0 in an ordinary run."""
     return _number
 
 
 def disturbed(values: NDArray) -> NDArray:
-    """A copy of the values in an ordinary run; under `--spread`, each one unit in the last place up or down."""
+    """Return a copy of the values; under `--spread`, each moves up or down by one unit in the last place.
+
+    Zeros stay, because their neighbours are denormal numbers.
+    """
     if not _number:
         return values.copy()
     up = _default_rng([_number, values.size]).random(values.shape) < 0.5
     moved = np.nextafter(values, np.where(up, np.inf, -np.inf).astype(values.dtype))
-    return np.where(values == 0, values, moved)  # beside zero lie denormal numbers, which kernels flush
+    return np.where(values == 0, values, moved)  # zero's neighbours are denormal numbers, which kernels flush
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -75,7 +78,7 @@ _default_rng = np.random.default_rng
 
 
 def _other_stream(seed: object = None) -> np.random.Generator:
-    """`np.random.default_rng`, of another stream for every disturbance; a generator stays what it is."""
+    """Replacement for `np.random.default_rng` with another stream per disturbance. Generators are passed through."""
     if isinstance(seed, int | np.integer):
         seed = [int(seed), _number]
     elif isinstance(seed, list | tuple):
@@ -91,7 +94,7 @@ def _keep(site: tuple[str, int, str], slack: float) -> None:
 
 
 def _caller() -> tuple[str, int]:
-    """File below the project, and line, of the nearest frame of a test."""
+    """Return file (below `tests/`) and line of the innermost stack frame of a test."""
     frame = sys._getframe(2)
     while "/tests/" not in frame.f_code.co_filename or frame.f_code.co_filename == __file__:
         frame = frame.f_back
@@ -99,7 +102,7 @@ def _caller() -> tuple[str, int]:
 
 
 def _used(actual: object, desired: object, rtol: object, atol: object) -> float:
-    """The largest share of the tolerance that a difference takes."""
+    """Return the largest fraction of the tolerance that a difference uses."""
     a, d = np.broadcast_arrays(np.asarray(actual, dtype=np.float64), np.asarray(desired, dtype=np.float64))
     finite = np.isfinite(a) & np.isfinite(d)
     allowed = np.broadcast_to(atol + rtol * np.abs(d), a.shape)[finite]
@@ -129,21 +132,24 @@ def _record_approx() -> None:
 
 
 def pytest_assertion_pass(item: pytest.Item, lineno: int, orig: str, expl: str) -> None:
-    """Needs `-o enable_assertion_pass_hook=true`, which `scripts/spread` sets."""
+    """Record the slack of a passing comparison.
+
+    The hook needs `-o enable_assertion_pass_hook=true`, which `scripts/spread` sets.
+    """
     if _report is None:
         return
     if orig.partition("\n")[0] not in linecache.getline(str(item.path), lineno):
-        return  # an assertion of a plugin
+        return  # assertion of a plugin
     site = (str(item.path).rpartition("/tests/")[2], lineno, orig)
     for left, operator, right in COMPARISON.findall(expl.partition("\n")[0]):
         slack = float(right) - float(left)
         _keep(site, slack if operator[0] == "<" else -slack)
-        for bound, above in _bounds_before(orig):  # of a chain, the explanation holds the last comparison alone
+        for bound, above in _bounds_before(orig):  # in a chain, the explanation contains only the last comparison
             _keep((*site[:2], f"{orig} [{bound}]"), float(left) - bound if above else bound - float(left))
 
 
 def _bounds_before(source: str) -> Iterator[tuple[float, bool]]:
-    """Numbers that stand before the value in `low < value < high`, and whether the value lies above them."""
+    """Yield the bound before the value in `low < value < high`, and whether the value lies above it."""
     try:
         test = ast.parse(source.strip(), mode="eval").body
     except SyntaxError:
@@ -168,7 +174,7 @@ def pytest_runtest_teardown(item: pytest.Item) -> None:
 
 
 def table(files: list[Path]) -> list[tuple[float, str]]:
-    """(smallest slack in spreads, row) of every assertion, those nearest to failing first."""
+    """Return (smallest slack in spreads, row) of every assertion, the closest to failing first."""
     slacks: dict[tuple[str, str, str], dict[int, float]] = defaultdict(dict)
     for file in files:
         for line in file.read_text().splitlines():

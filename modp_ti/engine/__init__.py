@@ -1,1 +1,1 @@
-"""A run: frames from a tracker through the mapper to an output folder, with snapshots on the way."""
+"""The run loop: read frames from a tracker, map them, write snapshots and the output folder."""

@@ -1,4 +1,4 @@
-"""Ctrl-C: the first one asks a run to stop after the step that it is at, the second stops it at once."""
+"""Ctrl-C handling: the first one stops a run after its current step, the second stops it immediately."""
 
 from __future__ import annotations
 
@@ -11,14 +11,20 @@ __all__ = ["Interruption", "RunStopped"]
 
 
 class RunStopped(Exception):  # noqa: N818 - it is no error
-    """The user has asked for it, and the map stands between two steps."""
+    """The user pressed Ctrl-C, and the run stopped between two steps with a consistent map."""
 
 
 class Interruption:
-    """A context in which the first Ctrl-C is only noted; after it Ctrl-C is what it was before.
+    """Context manager that records the first Ctrl-C and restores the default handler for the second.
 
-    Where somebody else has taken Ctrl-C already, as a live source has, or it is ignored, it is left to them. asked:
-    whether it was pressed. say: called when it was.
+    It does nothing outside the main thread, or if SIGINT already has another handler (as with a live source) or is
+    ignored.
+
+    Args:
+        say: Called when Ctrl-C is pressed while the run is not waiting for a frame.
+
+    Attributes:
+        asked: Whether Ctrl-C has been pressed.
     """
 
     def __init__(self, say: Callable[[], None]) -> None:
@@ -38,13 +44,16 @@ class Interruption:
         self._give_back()
 
     def check(self) -> None:
-        """Between two steps: raise RunStopped where Ctrl-C has been pressed."""
+        """Raise `RunStopped` if Ctrl-C has been pressed. Call it between two steps."""
         if self.asked:
             raise RunStopped
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """While nothing is done to the map but waiting for the next frame, Ctrl-C raises RunStopped there and then."""
+        """While the run waits for the next frame, let Ctrl-C raise `RunStopped` immediately.
+
+        The map is not being changed at that point, so there is no step to finish.
+        """
         self.check()
         self._waits = True
         try:

@@ -1,4 +1,4 @@
-"""`LiveViewer`: looks on while a map grows, and shows it."""
+"""`LiveViewer`: shows the map in a browser while it grows."""
 
 from __future__ import annotations
 
@@ -32,24 +32,33 @@ from pipelines.pipeline import FrameReport
 
 __all__ = ["LiveViewer"]
 
-# Of what the viewer may cost, this share is planned with: what its threads take from the mapper by turns of Python's
-# lock and by crowding the caches is not measured.
+# Fraction of the allowed cost that is budgeted. The rest covers what is not measured: contention for the GIL and for
+# the caches between the viewer's threads and the mapper.
 PLANNED = 0.7
-# Of that, this share is for the numbers and the current frame, which are cheap; the rest is for pictures and splats.
+# Fraction of the budget for the numbers and the current frame, which are cheap. The rest goes to pictures and splats.
 FOR_NUMBERS = 0.25
-# Least seconds between two updates of the numbers.
+# Minimum time between two updates of the numbers [s].
 NUMBERS_EVERY = 0.1
-# Width of the current frame's picture [px], of about that.
+# Maximum width of the current frame's picture [px]; the finest pyramid level within it is shown.
 THUMBNAIL = 320
-# Seconds for which a paused run waits for a browser to come back before it goes on.
+# Time after which a paused run resumes if all browsers have disconnected [s].
 PATIENCE = 10.0
 
 
 @dataclass(frozen=True)
 class Update:
-    """What is to be shown; None leaves a part as it is. Everything is on the host, and nobody else changes it.
+    """What the page should show next. A part that is None stays as it is.
 
-    The last three are finished by the publishing thread. picture: of which browser.
+    All arrays are on the host and owned by the update. The publishing thread computes the final form of `splats` and
+    `picture`.
+
+    Attributes:
+        numbers: Markdown text.
+        frame: The current frame.
+        points: (N, 3) tracked points in the world.
+        keyframes: (N, 4, 4) T_camera_world of the keyframes, and the camera of the first.
+        splats: Gaussians by name, as from `GaussianField.to_numpy`.
+        picture: The browser's id, and a function that computes its picture.
     """
 
     numbers: str | None = None
@@ -60,7 +69,7 @@ class Update:
     picture: tuple[int, Callable[[], NDArray[np.uint8]]] | None = None
 
     def over(self, waiting: Update) -> Update:
-        """This, with what only `waiting` has."""
+        """Return this update, with missing parts taken from the older update `waiting`."""
         return Update(
             *(
                 getattr(waiting, part.name) if getattr(self, part.name) is None else getattr(self, part.name)
@@ -70,13 +79,19 @@ class Update:
 
 
 class LiveViewer:
-    """An `Observer` with a page in the browser. It never waits for a browser, and keeps its cost below a share.
+    """An `Observer` that serves a page with the growing map.
 
-    The mapping thread alone touches the map: between frames and steps, and at most as often as the cost allows, it
-    renders what a browser asks for and copies what is shown. A thread of the viewer makes pictures and messages of it,
-    viser's threads send them. say: called with a line where the viewer has to give up, which the run outlives.
+    It never waits for a browser, and keeps its cost below `settings.max_cost` percent of the mapping time. Only the
+    mapping thread accesses the map: between frames and steps, as often as the cost allows, it renders the requested
+    pictures and copies what is shown. A viewer thread turns them into images and messages, and viser's threads send
+    them.
 
-    Raises InputError where the page cannot be served.
+    Args:
+        settings: The viewer's settings.
+        say: Called with one line if the viewer fails. The run continues without it.
+
+    Raises:
+        InputError: If the page cannot be served.
     """
 
     def __init__(self, settings: ViewSettings, say: Callable[[str], None], clock=time.perf_counter) -> None:
@@ -101,19 +116,19 @@ class LiveViewer:
         self._frames: int | None = None
         self._began = clock()
         self._numbers_at = -np.inf
-        self._visited = False  # by a browser, so far
-        self._behind = True  # the splats on the page are not those of the map
+        self._visited = False  # whether any browser has connected
+        self._behind = True  # the page's splats are older than the map
         self._failed = False
 
     def close(self) -> None:
-        """Serve no longer."""
+        """Stop serving the page."""
         self._updates.close()
         self._publisher.join(timeout=5.0)
         self.page.close()
 
     @property
     def cost(self) -> float:
-        """Seconds so far: of the mapping thread, and of the viewer's threads on a processor."""
+        """Seconds spent on the viewer so far: wall time of the mapping thread plus CPU time of the viewer's threads."""
         return self.numbers_limit.cost + self.pictures_limit.cost
 
     # ---- the observer ----------------------------------------------------------------------------------------
@@ -121,7 +136,7 @@ class LiveViewer:
     def begin(self, mapper: Mapper, frames: int | None) -> None:
         self._mapper, self._frames = mapper, frames
         self._began = self._clock()
-        self._serving.since_last()  # browsers that came before took nothing from the mapping
+        self._serving.since_last()  # do not charge for browsers that connected before mapping began
 
     def on_frame(self, frame: TrackedFrame, report: FrameReport | None) -> None:
         self._frame = frame
@@ -143,7 +158,7 @@ class LiveViewer:
     # ---- the mapping thread ----------------------------------------------------------------------------------
 
     def _changed(self) -> None:
-        """The map has changed: show what is due, and hold while paused. Whatever fails ends the viewer, not the run."""
+        """Publish what is due after a change of the map, and block while paused. Errors end the viewer, not the run."""
         if self._failed:
             return
         try:
@@ -177,13 +192,13 @@ class LiveViewer:
                 self._show_map()
 
     def _settle(self) -> None:
-        """Give the page its units, once there is a keyframe to tell them."""
+        """Set the page's units, once the first keyframe provides the scene depth."""
         store = self._mapper.pipeline.keyframes
         if len(store):
             self.page.settle(store.scene_depth, store[0].T_camera_world)
 
     def _hold(self) -> None:
-        """Wait at the gate. Browsers are served at once: there is no mapping to be slowed."""
+        """Block while paused. Browsers are served without a cost limit, as there is no mapping to slow down."""
         alone_since: float | None = None
 
         def serve() -> None:
@@ -204,7 +219,7 @@ class LiveViewer:
         self._serving.since_last()
 
     def _overview(self) -> Update:
-        """Numbers, current frame, points and keyframes."""
+        """Collect the numbers, the current frame, the points and the keyframes."""
         store, gaussians = self._mapper.pipeline.keyframes, self._mapper.pipeline.gaussians
         cost = 100.0 * self.cost / max(self._clock() - self._began - self.waited, 1e-9)
         paused = "  \n**paused**" if self._gate.paused else ""
@@ -224,7 +239,7 @@ class LiveViewer:
         )
 
     def _show_map(self) -> None:
-        """The splats, or the picture that one browser waits for, unless the publisher is not done with the last."""
+        """Publish the splats or one browser's picture, unless the publisher still holds the previous one."""
         pipeline, waiting = self._mapper.pipeline, self._updates.waiting
         if not len(self.page.requests) or len(pipeline.keyframes) == 0 or len(pipeline.gaussians) == 0:
             return
@@ -238,7 +253,7 @@ class LiveViewer:
                 self._render(camera, self.page.requests.mode)
 
     def _render(self, browser: BrowserCamera, mode: str) -> None:
-        """Render for a browser; the publisher makes a picture of it."""
+        """Render the map for one browser. The publishing thread converts the result to a picture."""
         pipeline = self._mapper.pipeline
         images, store = pipeline.renderer.images, pipeline.keyframes
         seen_from = pinhole_of(browser, self.page.units, images.max_width, images.max_height)
@@ -256,9 +271,9 @@ class LiveViewer:
                 seen = self._mapper.render(k.camera, k.T_camera_world)
                 finish = partial(error_picture, view, camera, T, photograph, seen)
         except ValueError:
-            return  # from amidst large Gaussians there is more to draw than there is room for
+            return  # a viewpoint inside large Gaussians can exceed the renderer's capacity
         finally:
-            images.resize(*size)  # which clears the buffers: no cost for the mapper's next step
+            images.resize(*size)  # also clears the buffers, so that the mapper's next step does not pay for it
         self._updates.put(Update(picture=(browser.client, finish)))
 
     # ---- the publishing thread -------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""`Mapper`: a map of the frames that one hands over, from one's own loop as from that of a run."""
+"""`Mapper`: maps frames that the caller provides. `modp-ti run` uses the same class."""
 
 from __future__ import annotations
 
@@ -30,12 +30,21 @@ __all__ = ["Mapper"]
 
 
 class Mapper:
-    """Maps frames of up to `width` x `height` pixels while they come; `initialise` must have been called.
+    """Maps frames of up to `width` x `height` pixels as they arrive.
 
-    settings: of the online loop, or those of the offline baseline, which makes its map in `finish`. pipeline: what
-    makes the map, with its Gaussians, keyframes and renderer. frames: what is kept of the frames so far.
+    `initialise` must be called first. A process has room for one map of a room's size; call `initialise` again to free
+    it before making another.
 
-    A process has room for one map of a room's size; `initialise` frees it for another.
+    Args:
+        width: Largest image width [px].
+        height: Largest image height [px].
+        settings: Settings of the online loop, or of the offline baseline, which builds its map in `finish`. None for
+            the online loop's defaults.
+        seed: Seed of the random numbers.
+
+    Attributes:
+        pipeline: The online or offline mapper, with its Gaussians, keyframes and renderer.
+        frames: Metadata and tracked points of all frames so far, without their images.
     """
 
     def __init__(
@@ -51,9 +60,18 @@ class Mapper:
         self._finished = True
 
     def add(self, frame: TrackedFrame) -> FrameReport | None:
-        """Take in the next frame; what it did to the map, None where it is held out, which leaves the map alone.
+        """Process the next frame.
 
-        Frames come in the order of their indices. Raises ValueError for one that does not, or is too large.
+        Frames must come in increasing order of their indices.
+
+        Args:
+            frame: The frame with its pose and points. A held-out frame does not change the map.
+
+        Returns:
+            What the frame did to the map, or None if it is held out.
+
+        Raises:
+            ValueError: If the frame is out of order or larger than the mapper's images.
         """
         size, images = frame.camera, self.pipeline.renderer.images
         if size.width > images.max_width or size.height > images.max_height:
@@ -69,12 +87,19 @@ class Mapper:
         return report
 
     def _keep(self, frame: TrackedFrame) -> None:
-        """Keep what is kept of every frame, as far as there is room beside the map."""
+        """Store the frame's metadata, and its points as far as the memory budget allows."""
         self.frames.add(frame, with_points=self.pipeline.takes_observations(len(frame.points)))
         self.pipeline.count_beside(self.frames.points.nbytes)
 
     def correct(self, correction: PoseCorrection) -> None:
-        """Take over poses and points that the tracker has revised. Raises InputError for frames that have not come."""
+        """Apply poses and points that the tracker has revised, for example after a loop closure.
+
+        Args:
+            correction: The revised poses and points.
+
+        Raises:
+            InputError: If the correction refers to a frame that has not been added yet.
+        """
         if correction.index[-1] > self.frames.index[-1]:
             raise InputError(
                 f"the tracker corrects frame {correction.index[-1]} after frame {self.frames.index[-1]}, "
@@ -84,9 +109,15 @@ class Mapper:
         self.frames.correct(correction, report.motion, report.moved)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> None:
-        """What follows the last frame of the online loop, or all steps of the offline one.
+        """Run what follows the last frame of the online loop, or the whole optimisation of the offline baseline.
 
-        Done already, it waits for more frames. progress: of the offline loop, see `OfflineMapper.optimise`.
+        Does nothing if no frame was added since the last call. More frames may follow.
+
+        Args:
+            progress: Callback of the offline baseline, see `OfflineMapper.optimise`.
+
+        Raises:
+            InputError: If the offline baseline has no tracked points to start from.
         """
         if self._finished:
             return
@@ -103,10 +134,16 @@ class Mapper:
         progress: Callable[[int, float], None] | None = None,
         done: int = 0,
     ) -> None:
-        """Finish the map, and optimise it for all keyframes alike. More frames may follow.
+        """Call `finish`, then optimise the map on all keyframes equally. More frames may follow.
 
-        settings: all but its own number of steps. progress, done: see `pipelines.refinement.refine`. Raises ValueError
-        for an offline map, which has been.
+        Args:
+            steps: Number of refinement steps. It replaces `settings.steps`.
+            settings: The other settings of the refinement, None for the defaults.
+            progress: Callback, see `pipelines.refinement.refine`.
+            done: Steps that were done before, see `pipelines.refinement.refine`.
+
+        Raises:
+            ValueError: If the map is an offline one, whose optimisation already covers all frames.
         """
         if not self.pipeline.can_be_refined:
             raise ValueError("an offline map is not refined: give its settings more steps")
@@ -116,13 +153,22 @@ class Mapper:
 
     @property
     def finished(self) -> bool:
-        """Whether the frames so far have had what follows the last one."""
+        """Whether `finish` has run since the last frame was added."""
         return self._finished
 
     def restore(self, state: MapState, frames: DeliveredFrames, again: Iterable[TrackedFrame], finished: bool) -> None:
-        """Become what another mapper of the same settings was: `pipeline.state()`, `frames` and `finished` of it.
+        """Restore the state of another mapper with the same settings.
 
-        again: the same frames as it took in, held-out ones left out. Raises as `OnlineMapper.restore`.
+        Args:
+            state: The other mapper's `pipeline.state()`.
+            frames: The other mapper's `frames`.
+            again: The frames that it processed, without the held-out ones.
+            finished: The other mapper's `finished`.
+
+        Raises:
+            KeyError: If the state does not fit this mapper.
+            TypeError: If the state does not fit this mapper.
+            ValueError: If the state does not fit this mapper.
         """
         self.pipeline.restore(state, again)
         self.frames = frames
@@ -130,7 +176,7 @@ class Mapper:
         self._finished = finished
 
     def trajectory(self) -> list[NDArray[np.float64]]:
-        """Refined T_camera_world (4, 4) of every frame so far."""
+        """Return the refined T_camera_world (4, 4) of every frame so far."""
         store = self.pipeline.keyframes
         return [store.corrected(i, T) for i, T in zip(self.frames.index, self.frames.T_tracked, strict=True)]
 
@@ -140,10 +186,18 @@ class Mapper:
         T_camera_world: NDArray[np.float64] | None = None,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> RenderedView:
-        """The map through a camera of up to the mapper's size, from T_camera_world (4, 4).
+        """Render the map.
 
-        T_camera_world: None for where the last frame was taken. Raises ValueError where that is nowhere, or the size is
-        beyond the mapper's.
+        Args:
+            camera: The camera, at most as large as the mapper's images.
+            T_camera_world: (4, 4) pose, None for the refined pose of the last frame.
+            background: RGB colour behind the map.
+
+        Returns:
+            Colour (not clipped), depth and opacity.
+
+        Raises:
+            ValueError: If `T_camera_world` is None before the first frame, or the camera is too large.
         """
         if T_camera_world is None:
             if not self.frames.index:
@@ -153,7 +207,7 @@ class Mapper:
         return self.pipeline.renderer.render(camera, T_camera_world, self.pipeline.near, background)
 
     def version(self) -> MapVersion:
-        """The map as it stands, on the host."""
+        """Return a copy of the current map on the host."""
         store = self.pipeline.keyframes
         return MapVersion(
             self.pipeline.gaussians.to_numpy(),
@@ -163,11 +217,17 @@ class Mapper:
         )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the map as it stands; the path.
+        """Write the current map. All files appear together or not at all.
 
-        A folder, which then holds `splats.ply`, `trajectory.txt` and `colmap/` as the output of a run does, and what
-        it held besides; or, where the path ends in .ply, the Gaussians alone. All appears together or not at all.
-        Raises InputError where it cannot be written.
+        Args:
+            path: A folder, which gets `splats.ply`, `trajectory.txt`, `frames.json` and `colmap/` as in a run's output
+                and keeps its other files; or a path that ends in `.ply`, for the Gaussians alone.
+
+        Returns:
+            The path as a `Path`.
+
+        Raises:
+            InputError: If the files cannot be written.
         """
         path = Path(path)
         if path.suffix == ".ply":

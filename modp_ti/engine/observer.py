@@ -1,4 +1,4 @@
-"""What may look on while a scene is mapped, between the steps of its session."""
+"""`Observer`: the interface of objects that are notified while a scene is mapped."""
 
 from __future__ import annotations
 
@@ -12,28 +12,49 @@ __all__ = ["Observer", "Unobserved"]
 
 
 class Observer(Protocol):
-    """Is called by the mapping thread, the only one that touches the map; it waits for the call to return.
+    """Receives events of a run, such as finished frames and steps.
 
-    waited: seconds that calls have held the mapping because a person asked for it; no work of the mapper.
+    The mapping thread makes the calls and waits for them to return. No other thread may access the map.
+
+    Attributes:
+        waited: Total time for which calls held the mapping at a person's request [s]. It does not count as mapping
+            time.
     """
 
     waited: float
 
     def begin(self, mapper: Mapper, frames: int | None) -> None:
-        """The map, still empty, and how many frames will come, where that is known."""
+        """Called before the first frame.
+
+        Args:
+            mapper: The mapper with its still empty map.
+            frames: Number of frames that will come, None if unknown.
+        """
 
     def on_frame(self, frame: TrackedFrame, report: FrameReport | None) -> None:
-        """A frame has been taken in; None for one that is held out."""
+        """Called after each frame.
+
+        Args:
+            frame: The frame.
+            report: What the frame did to the map, None for a held-out frame.
+        """
 
     def on_step(self, stage: str, step: int, steps: int, psnr: float) -> None:
-        """A step of refinement or of offline optimisation is done. psnr: mean of its views."""
+        """Called after each step of refinement or offline optimisation.
+
+        Args:
+            stage: "refining" or "optimising".
+            step: Number of the step, from 1.
+            steps: Total number of steps.
+            psnr: Mean PSNR of the step's views [dB].
+        """
 
     def on_stage(self, stage: str) -> None:
-        """The map is finished, and something else goes on with it: it must not be touched any more."""
+        """Called when the map is finished and another stage begins. The map must not be accessed from here on."""
 
 
 class Unobserved:
-    """Nobody looks on."""
+    """An observer that does nothing."""
 
     waited = 0.0
 

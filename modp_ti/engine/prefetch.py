@@ -1,4 +1,4 @@
-"""Reading ahead: the next frames are made ready in a thread while the mapper works on the current one."""
+"""Prefetching: a thread reads the next frames while the mapper works on the current one."""
 
 from __future__ import annotations
 
@@ -16,24 +16,28 @@ Item = TypeVar("Item", bound=TrackedFrame | PoseCorrection)
 
 
 class FramesAhead(Iterator[Item]):
-    """The frames of `frames` in their order, up to `ahead` of them read and their pyramids built before they are due.
+    """Iterator over `frames` that reads up to `ahead` of them in advance and builds their image pyramids.
 
-    Corrections of poses come in their places between them; one counts as a frame.
+    The order is kept. Pose corrections stay in their places between the frames, and each counts as one frame.
 
-    One thread reads. Taichi's kernels hold Python's lock while they run; OpenCV and NumPy, which do nearly all of
-    decoding, undistorting and resizing, give it up and so work beside them. An error of `frames` is raised at the frame
-    that it befell, after all frames before it. With `ahead` 0 there is no thread.
+    A single thread reads. Taichi's kernels hold the GIL while they run. OpenCV and NumPy, which do nearly all of the
+    decoding, undistortion and resizing, release it and therefore run in parallel. An error of `frames` is raised in its
+    place, after all earlier frames.
 
-    A context manager: leaving it ends the thread, once the frame that it is at is read.
+    Use it as a context manager: on exit, the thread ends after the frame that it is reading.
+
+    Args:
+        frames: Frames and corrections of a tracker.
+        ahead: Number of frames to read in advance. With 0, no thread is used.
     """
 
     def __init__(self, frames: Iterable[Item], ahead: int) -> None:
         self._frames = iter(frames)
         self._ready: SimpleQueue[Item | BaseException] = SimpleQueue()
-        self._free = Semaphore(ahead)  # frames that may still be read ahead
+        self._free = Semaphore(ahead)  # number of frames that may still be read ahead
         self._end: BaseException | None = None
         self._closed = False
-        # A daemon, so that a process whose owner forgot to close ends all the same: it only reads.
+        # A daemon thread, so that the process can exit even if this object was not closed. It only reads.
         self._thread = Thread(target=self._read, name="frames ahead", daemon=True) if ahead else None
         if self._thread is not None:
             self._thread.start()
@@ -67,8 +71,8 @@ class FramesAhead(Iterator[Item]):
             try:
                 item = next(self._frames)
                 if isinstance(item, TrackedFrame):
-                    _ = item.pyramid  # kept by the frame, for the mapper
-            except BaseException as error:  # StopIteration too: whatever ends the frames comes after the last of them
+                    _ = item.pyramid  # cached in the frame, for the mapper
+            except BaseException as error:  # includes StopIteration, so that the end comes after the last frame
                 self._ready.put(error)
                 return
             self._ready.put(item)

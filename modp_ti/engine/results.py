@@ -1,4 +1,4 @@
-"""The output folder of a run: everything that is written at its end, made aside and put in place at once."""
+"""The output folder of a run. Files are written to a temporary folder and moved into place together."""
 
 from __future__ import annotations
 
@@ -29,16 +29,23 @@ from modp_ti.outputs.report.record import RunRecord
 __all__ = ["Results", "metrics_of"]
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
-# Versions of a map that metrics.json has room for; null where a run does not make one.
+# Map versions with a key in metrics.json; the value is null if the run did not make that version.
 MAPS = ("online", "refined", "offline")
 
 
-# What is written of a finished map alone.
+# Files that are only written for a finished map.
 FIGURES = ("metrics.json", "scores.csv", "report.html")
 
 
 class Results:
-    """The files of a run's last map, in `folder` beside `config.output` until `writing` ends."""
+    """Writes the output files of a run.
+
+    Inside `writing`, files go to the temporary `folder` next to `config.output`.
+
+    Args:
+        config: The scene's settings.
+        frames: Metadata of all frames.
+    """
 
     def __init__(self, config: SceneConfig, frames: DeliveredFrames) -> None:
         self.config = config
@@ -48,9 +55,10 @@ class Results:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Files are written inside, and appear in the output folder together when all went well.
+        """Move the files that are written inside this context to the output folder together, if no error occurred.
 
-        Raises InputError where they cannot be written.
+        Raises:
+            InputError: If the files cannot be written.
         """
         with appearing(self.config.output) as self.folder:
             (self.folder / "renders").mkdir()
@@ -58,14 +66,23 @@ class Results:
             dump_scene(self.config, self.folder / "config.yaml")
 
     def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> MapVersion:
-        """Write what `formats.map_folder.write_map` does; return the map as a reader of it gets it."""
+        """Write the map with `formats.map_folder.write_map`.
+
+        Returns:
+            The map with its Gaussians as read back from `splats.ply`.
+        """
         write_map(self.folder, version, self.frames, self._names, keyframes, near)
         return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
 
     def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
-        """Write the pictures of a frame: its image where asked for, and beside the map (H, W, 3) where held out.
+        """Write the pictures of a frame and keep those that the report may show.
 
-        Those that the report may show are kept for it.
+        The image is written if `export.images` is set. A held-out frame also gets a picture of image and render side by
+        side.
+
+        Args:
+            frame: The frame.
+            render: (H, W, 3) render from the frame's pose.
         """
         if self.config.export.images:
             write_image(self.folder / "colmap", self._names[frame.index], frame)
@@ -75,12 +92,12 @@ class Results:
             self._album.keep(frame.index, frame.image, render)
 
     def write_scores(self, scores: list[FrameScore], metrics: dict) -> None:
-        """Write the scores of all frames, and the run's figures."""
+        """Write `scores.csv` and `metrics.json`."""
         write_scores(self.folder / "scores.csv", scores)
         replace_text(self.folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 
     def remove_figures(self) -> None:
-        """Take away what an earlier run has left in the output folder that this one, stopped, has not made."""
+        """Delete scores and report of an earlier run from the output folder, as a stopped run has none of its own."""
         for name in FIGURES:
             (self.config.output / name).unlink(missing_ok=True)
 
@@ -93,9 +110,18 @@ class Results:
         keyframes: KeyframeStore,
         truth: list[NDArray[np.float64]],
     ) -> str | None:
-        """Write `report.html`; None, or in one line why there is none.
+        """Write `report.html`.
 
-        truth: true T_camera_world (4, 4) of all frames, or none.
+        Args:
+            record: Notes taken during the run.
+            metrics: Content of `metrics.json`.
+            scores: Scores of all frames in all versions.
+            versions: Map versions by name; the last one is the final map.
+            keyframes: The map's keyframes.
+            truth: Ground-truth T_camera_world (4, 4) of all frames, or an empty list.
+
+        Returns:
+            None, or one line that says why there is no report.
         """
         mapped = {keyframe.index for keyframe in keyframes}
         try:
@@ -113,7 +139,7 @@ class Results:
                 comparisons=self._album.comparisons(last, self.folder / "renders"),
             )
             write_report(self.folder / "report.html", run)
-        except Exception as error:  # whatever it is, the map is finished and must not be lost
+        except Exception as error:  # the map is finished; no error of the report may lose it
             return f"report.html could not be made: {error!r}"
         return None
 
@@ -121,9 +147,13 @@ class Results:
 def metrics_of(
     scores: list[FrameScore], versions: dict[str, MapVersion], frames: DeliveredFrames, seconds: dict[str, float]
 ) -> dict:
-    """What metrics.json says of the maps, of the points under their poses, and of the time.
+    """Return the entries of `metrics.json` about the maps, the reprojection errors and the time.
 
-    seconds: of the stages, and `total`.
+    Args:
+        scores: Scores of all frames in all versions.
+        versions: Map versions by name; the last one is the final map.
+        frames: All frames, with their tracked points.
+        seconds: Time of each stage and `total` [s].
     """
     points, last = frames.points, list(versions.values())[-1]
     anew = {
@@ -142,7 +172,7 @@ def metrics_of(
 
 
 def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
-    """A version's means over all frames and over those held out, and what it took."""
+    """Mean scores of one version over all frames and over the held-out ones, with its size and cost."""
     of = [score for score in scores if score.stage == stage]
     return {
         "all": summary(of),
@@ -153,13 +183,13 @@ def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[
 
 
 def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
-    """A PNG with the frame on the left and the render on the right."""
+    """Write a PNG with the frame on the left and the render on the right."""
     pair = np.hstack([image, render])
     write_picture(path, np.round(pair * 255.0).astype(np.uint8))
 
 
 def _seconds(stages: dict[str, float]) -> dict[str, float]:
-    """Seconds of each stage of metrics.json, and what is left of the total."""
+    """Return the time of each stage [s], and the remainder of the total as `other`."""
     seconds = {"total": round(stages["total"], 3)}
     seconds |= {stage: round(stages.get(stage, 0.0), 3) for stage in STAGES}
     seconds["other"] = round(stages["total"] - sum(stages.get(stage, 0.0) for stage in STAGES), 3)

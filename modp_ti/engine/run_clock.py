@@ -1,4 +1,4 @@
-"""`RunClock`: how long a run has taken, over all the processes that it took."""
+"""`RunClock`: the time that a run has taken, summed over all processes of a resumed run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["RunClock"]
 
 
 class RunClock:
-    """Seconds of the whole run and of its mapping, with those that came before this process (`total`, `mapping`)."""
+    """Measures the time of the whole run (`total`) and of its mapping (`mapping`) [s], including earlier processes."""
 
     def __init__(self, clock=time.perf_counter) -> None:
         self._clock = clock
@@ -26,12 +26,16 @@ class RunClock:
         return self._mapped + (0.0 if self._mapping_since is None else now - self._mapping_since)
 
     def resume(self, total: float, mapping: float) -> None:
-        """Count what a run took until its snapshot; what came after it was lost."""
+        """Set the time that the run took until its snapshot. Later time is not counted, as its work was lost."""
         self._before, self._mapped = total, mapping
 
     def begin_mapping(self) -> None:
         self._mapping_since = self._clock()
 
     def end_mapping(self, waited: float = 0.0) -> None:
-        """The last frame is mapped. waited: seconds in which a person had it wait."""
+        """Stop the mapping clock after the last frame.
+
+        Args:
+            waited: Time for which a person paused the mapping [s]. It is subtracted.
+        """
         self._mapped, self._mapping_since = self.mapping - waited, None

@@ -1,4 +1,4 @@
-"""One run: frames from the tracker through the mapper to the files of the output folder."""
+"""A run from start to end: read frames from the tracker, map them, evaluate the map and write the output folder."""
 
 from __future__ import annotations
 
@@ -37,19 +37,29 @@ __all__ = ["build_mapper", "run_scene"]
 
 
 def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
-    """Map the scene of `config` and write its output folder, which is returned.
+    """Map a scene and write its output folder.
 
-    Nothing but snapshots is written before the map is finished; the files then appear together. resumed: where to go on
-    from, instead of from the beginning. Raises InputError for input that cannot be used. Ctrl-C, once the frames are
-    coming, ends it after the step that it is at: a snapshot and the map so far are written, then KeyboardInterrupt is
-    raised, which says so.
+    All files except snapshots are written after the map is finished, and appear together.
+
+    Args:
+        config: The scene's settings.
+        console: Receives progress and notes, None for no output.
+        resumed: Snapshot to continue from, None to start from the first frame.
+
+    Returns:
+        The output folder.
+
+    Raises:
+        InputError: If the input cannot be used.
+        KeyboardInterrupt: After Ctrl-C, with a message. If mapping has begun, the current step is finished, and a
+            snapshot and the map so far are written first.
     """
     with ExitStack() as held:
         return _Session(config, console or Console(quiet=True), held).run(resumed)
 
 
 class _Session:
-    """A run on its way, and what its stages share. held: takes what is to be closed at its end, however it ends."""
+    """A run in progress, with the state that its stages share. `held` closes the run's resources when it ends."""
 
     def __init__(self, config: SceneConfig, console: Console, held: ExitStack) -> None:
         self.config = config
@@ -58,7 +68,7 @@ class _Session:
         self.clock = RunClock()
         self.record = RunRecord()
         self.line = ProgressLine(console)
-        self.observer = self._open_observer()  # there before anything that takes minutes
+        self.observer = self._open_observer()  # opened first, as what follows may take minutes
         self.stop = Interruption(lambda: self._print("stopping after this step; Ctrl-C again stops at once"))
         try:
             self.backend = initialise(config.device, config.threads, config.seed)
@@ -66,13 +76,13 @@ class _Session:
             raise InputError(str(error)) from None
         self.record.device = describe(self.backend)
         self._print(f"device: {self.record.device}")
-        # There once the first frame is.
+        # Set once the first frame has arrived.
         self.tracker: Tracker
         self.mapper: Mapper
         self.checkpointer: Checkpointer
 
     def run(self, resumed: Snapshot | None) -> Path:
-        """All of it; the output folder."""
+        """Run all stages and return the output folder."""
         self._map_the_stream(resumed)
         self._say_which_frames_were_refused()
         self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
@@ -84,7 +94,7 @@ class _Session:
     # ---- the stream ------------------------------------------------------------------------------------------
 
     def _map_the_stream(self, resumed: Snapshot | None) -> None:
-        """Open the tracker, make the mapper for its first frame, and map what comes; or what comes after `resumed`."""
+        """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
         self.tracker = open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
@@ -113,7 +123,7 @@ class _Session:
             except RunStopped:
                 raise self._stopped() from None
             self.clock.end_mapping(self.observer.waited)
-        # How a live tracker's frames ended.
+        # A live tracker adds notes at its end.
         self._say(*(note for note in self.tracker.notes if note not in notes))
 
     def _open_lpips(self, camera: PinholeCamera) -> None:
@@ -121,7 +131,7 @@ class _Session:
         self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
 
     def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
-        """What takes the snapshots; with the map and the stream at the place where `resumed` was taken."""
+        """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""
         self.checkpointer = checkpointer = Checkpointer(self.config, self.mapper, self.record, self.clock, self._say)
         if resumed is not None:
             with self.line.working(f"reading again what {resumed.path} was made of"):
@@ -131,7 +141,7 @@ class _Session:
             self._say(f"{checkpointer.path} is of an earlier run: the first one of this run takes its place")
 
     def _map(self, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
-        """Take in all frames and corrections, in their order, and finish the map. Raises RunStopped between two."""
+        """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
         mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
         line.start_mapping(self.tracker.frame_count, "reading" if offline else "mapping", len(mapper.frames))
         size = None
@@ -163,7 +173,7 @@ class _Session:
             line.stop()
 
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
-        """A step of the offline map is done."""
+        """Callback after a step of the offline optimisation."""
         self.line.optimised(step, gaussians, psnr)
         self.record.optimised(step, gaussians, psnr)
         self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
@@ -175,13 +185,13 @@ class _Session:
             self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
 
     def _left_out(self) -> dict[str, int]:
-        """How many frames did not touch the map because something is wrong with them, by what."""
+        """Count the frames that did not touch the map because they are faulty, by reason."""
         return {"unreadable": len(self.tracker.unreadable), **self.mapper.pipeline.refused}
 
     # ---- the finished map ------------------------------------------------------------------------------------
 
     def _versions(self) -> dict[str, MapVersion]:
-        """The map as it was made, and as it is refined where it is to be; the last one is the run's."""
+        """Return the map before refinement and, if the settings ask for it, after. The last version is final."""
         config, checkpointer = self.config, self.checkpointer
         if len(self.mapper.pipeline.keyframes) == 0:
             raise InputError(
@@ -200,7 +210,7 @@ class _Session:
         return versions
 
     def _refine(self) -> None:
-        """Refine the map, or go on with it. Raises RunStopped between two steps."""
+        """Refine the map, or continue its refinement. Raises RunStopped between two steps."""
         refine = self.config.refine
         self.line.start_refining(refine.steps, self.checkpointer.refined)
         try:
@@ -209,7 +219,7 @@ class _Session:
             self.line.stop()
 
     def _refined(self, step: int, psnr: float) -> None:
-        """A step of refinement is done."""
+        """Callback after a step of refinement."""
         steps = self.config.refine.steps
         self.line.refined(step, psnr)
         self.record.refined(step, psnr)
@@ -218,7 +228,7 @@ class _Session:
         self.stop.check()
 
     def _write(self, versions: dict[str, MapVersion]) -> None:
-        """Write the map, score it as a reader gets it, and write what came of it."""
+        """Write the map, evaluate the map as read back from its file, and write the scores and the report."""
         pipeline = self.mapper.pipeline
         results = Results(self.config, self.mapper.frames)
         last = list(versions)[-1]
@@ -239,7 +249,7 @@ class _Session:
         self.line.summary(metrics)
 
     def _score(self, versions: dict[str, MapVersion], results: Results) -> list[FrameScore] | None:
-        """Score all frames, and keep the last map's pictures; None where that was interrupted: the map is whole."""
+        """Score all frames and write the pictures of the last version. None if interrupted; the map is complete."""
         last = list(versions)[-1]
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
@@ -259,7 +269,7 @@ class _Session:
             self.line.stop()
 
     def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
-        """Write the scores, the metrics, which are returned, and the report."""
+        """Write the scores, the metrics and the report, and return the metrics."""
         pipeline, frames, checkpointer = self.mapper.pipeline, self.mapper.frames, self.checkpointer
         truth = self.tracker.ground_truth()
         caught = pipeline.caught()
@@ -292,10 +302,10 @@ class _Session:
                 self._say(problem)
         return metrics
 
-    # ---- beside it -------------------------------------------------------------------------------------------
+    # ---- interruption, viewer, notes -------------------------------------------------------------------------
 
     def _stopped(self) -> KeyboardInterrupt:
-        """Leave a snapshot and the map so far; what is to be said of it."""
+        """Write a snapshot and the map so far, and return the exception with the message for the user."""
         resumable = self.checkpointer.keep()
         frames, keyframes, output = self.mapper.frames, self.mapper.pipeline.keyframes, self.config.output
         said = f"interrupted after {len(frames)} frames"
@@ -311,10 +321,10 @@ class _Session:
         return KeyboardInterrupt(f"{said}; modp-ti run --resume {output} goes on" if resumable else said)
 
     def _open_observer(self) -> Observer:
-        """The viewer where the scene asks for it."""
+        """Start the live viewer if the settings ask for it."""
         if not self.config.view.enabled:
             return Unobserved()
-        # Imported here: viser is an extra.
+        # Imported here because viser is an optional dependency.
         from modp_ti.engine.live_viewer import LiveViewer
 
         viewer = LiveViewer(self.config.view, self._say)
@@ -323,7 +333,7 @@ class _Session:
         return viewer
 
     def _say(self, *notes: str) -> None:
-        """Show remarks, and keep them for the report."""
+        """Print notes, and keep them for the report."""
         for note in notes:
             self._print(f"note: {note}")
             self.record.notes.append(note)
@@ -333,7 +343,11 @@ class _Session:
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
-    """The mapper of the scene's mode, for images of this camera. Raises InputError where its settings do not fit."""
+    """Create the mapper for the scene's mode and for images of this camera.
+
+    Raises:
+        InputError: If the settings do not fit the images.
+    """
     settings = config.offline if config.mode == "offline" else config.mapping
     try:
         return Mapper(camera.width, camera.height, settings, config.seed)
@@ -344,7 +358,7 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
 def _timed(
     frames: Iterator[TrackedFrame | PoseCorrection], watch: Stopwatch, stop: Interruption
 ) -> Iterator[TrackedFrame | PoseCorrection]:
-    """The frames and corrections, the time that the mapper waits for each counted as reading."""
+    """Yield the frames and corrections, counting the time that the mapper waits for each of them as `read`."""
     while True:
         with watch.measure("read"), stop.waiting():
             frame = next(frames, None)

@@ -1,1 +1,1 @@
-"""Everything that begins with a map, growing or finished: scores, formats, report, viewer, playback."""
+"""Consumers of growing and finished maps: evaluation, file formats, report, viewer, playback."""

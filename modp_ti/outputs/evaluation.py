@@ -1,4 +1,4 @@
-"""Evaluation: the map against the frames, as the paper reports it."""
+"""Evaluation of a map against its frames, with the metrics of the paper."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ __all__ = [
     "umeyama",
 ]
 
-# Frames in memory at a time, to load each version of the map once for all of them.
+# Batch size. Each version of the map is loaded once per batch, whose frames are all held in memory.
 EVALUATED_TOGETHER = 32
 
 
 class EvaluatedMap(Protocol):
-    """What evaluation needs of a mapper: where a map is loaded, and how it is seen and compared."""
+    """The part of a mapper that evaluation uses: storage for the map, the renderer and the loss."""
 
     gaussians: GaussianField
     renderer: Renderer
@@ -42,14 +42,18 @@ class EvaluatedMap(Protocol):
 
     @property
     def near(self) -> float:
-        """Depth [scene units] below which nothing is drawn."""
+        """Depth below which nothing is drawn [scene units]."""
 
 
 @dataclass(frozen=True)
 class MapVersion:
-    """A map at one time: Gaussians by name as `GaussianField.to_numpy`, T_camera_world and exposure of every frame.
+    """A copy of a map at one point of a run.
 
-    view_renders: views that were rendered and differentiated to make it.
+    Attributes:
+        gaussians: Arrays by name, as from `GaussianField.to_numpy`.
+        trajectory: T_camera_world (4, 4) of every frame.
+        exposures: Exposure (3, 4) of every frame, or None.
+        view_renders: Number of views that were rendered and differentiated to make the map.
     """
 
     gaussians: dict[str, NDArray]
@@ -60,9 +64,16 @@ class MapVersion:
 
 @dataclass(frozen=True)
 class FrameScore:
-    """Scores of one frame in one version of the map; lpips is None where it has no weights.
+    """Scores of one frame in one version of the map.
 
-    stage: "online", "refined" or "offline". index: position among the frames. psnr: [dB].
+    Attributes:
+        index: Position among the frames.
+        name: The frame's name.
+        held_out: Whether the frame was kept from the map.
+        stage: "online", "refined" or "offline".
+        psnr: PSNR [dB].
+        ssim: SSIM.
+        lpips: LPIPS, None if its weights are not available.
     """
 
     index: int
@@ -75,7 +86,7 @@ class FrameScore:
 
 
 def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
-    """Means over the frames, as they stand in metrics.json; null where there is nothing to take the mean of."""
+    """Return the mean scores over the frames, as in metrics.json. A mean is None if there is nothing to average."""
 
     def mean(values: list[float | None], digits: int) -> float | None:
         return None if not values or None in values else round(float(np.mean(values)), digits)
@@ -98,10 +109,23 @@ def score_frame(
     lpips: Lpips | None = None,
     exposure: NDArray[np.float64] | None = None,
 ) -> tuple[FrameScore, NDArray[np.float32]]:
-    """Scores and render (H, W, 3) of `frame` seen from T_camera_world (4, 4) in the renderer's map.
+    """Render a frame's view in the renderer's current map and score it.
 
-    The render is developed with the frame's exposure (3, 4) and vignette, and clipped to [0, 1]. Masked pixels do not
-    count and are shown as in the frame.
+    The render is developed with the frame's exposure and vignette and clipped to [0, 1]. Masked pixels do not count,
+    and have the frame's colours in the returned render.
+
+    Args:
+        renderer: Holds the map.
+        loss: Computes PSNR and SSIM.
+        frame: The frame to compare with.
+        T_camera_world: (4, 4) pose to render from.
+        near: Depth below which nothing is drawn [scene units].
+        stage: Name of the map's version, stored in the score.
+        lpips: The LPIPS network, None to leave it out.
+        exposure: (3, 4) affine colour transform of the frame, None for the identity.
+
+    Returns:
+        The score, and the render (H, W, 3).
     """
     rgba = frame.rgba
     renderer.forward(frame.camera, T_camera_world, near)
@@ -121,9 +145,17 @@ def evaluate(
     lpips: Lpips | None,
     rendered: Callable[[str, TrackedFrame, NDArray[np.float32]], None],
 ) -> list[FrameScore]:
-    """Scores of every frame in every version of the map by name, version by version.
+    """Score every frame in every version of the map.
 
-    rendered: called with the version's name, the frame and its render (H, W, 3). The last version stays in the mapper.
+    Args:
+        mapper: Receives the maps in turn. The last version stays loaded.
+        frames: All frames.
+        versions: Map versions by name.
+        lpips: The LPIPS network, None to leave it out.
+        rendered: Called with the version's name, the frame and its render (H, W, 3).
+
+    Returns:
+        The scores, ordered by version.
     """
     scores: dict[str, list[FrameScore]] = {name: [] for name in versions}
     frames = iter(frames)
@@ -141,7 +173,16 @@ def evaluate(
 def umeyama(
     source: NDArray[np.float64], target: NDArray[np.float64], with_scale: bool = True
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Scale s, rotation R (3, 3), translation t (3,) of least |s R source + t - target|^2 [Umeyama 1991]."""
+    """Find the similarity that minimises |s R source + t - target|^2 [Umeyama 1991].
+
+    Args:
+        source: (N, 3) points.
+        target: (N, 3) corresponding points.
+        with_scale: Whether to estimate the scale; 1 otherwise.
+
+    Returns:
+        Scale s, rotation R (3, 3) and translation t (3,).
+    """
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     a, b = source - mean_source, target - mean_target
     U, singular, Vt = np.linalg.svd(b.T @ a)
@@ -154,7 +195,13 @@ def umeyama(
 def absolute_trajectory_error(
     estimate: list[NDArray[np.float64]], truth: list[NDArray[np.float64]], with_scale: bool = True
 ) -> float:
-    """RMSE of camera centres after alignment, in the units of `truth`; both lists hold T_camera_world (4, 4)."""
+    """Return the RMSE of the camera centres after alignment, in the units of `truth`.
+
+    Args:
+        estimate: T_camera_world (4, 4) of every frame.
+        truth: Ground-truth T_camera_world (4, 4) of every frame.
+        with_scale: Whether to align by a similarity; by a rigid motion otherwise.
+    """
     source = np.array([inverse_se3(T)[:3, 3] for T in estimate])
     target = np.array([inverse_se3(T)[:3, 3] for T in truth])
     s, R, t = umeyama(source, target, with_scale)
@@ -164,7 +211,10 @@ def absolute_trajectory_error(
 def trajectory_errors(
     tracked: list[NDArray[np.float64]], refined: list[NDArray[np.float64]], truth: list[NDArray[np.float64]]
 ) -> dict[str, float | None]:
-    """ATE of the refined poses (aligned by a similarity, and rigidly) and of the tracked ones; None without truth."""
+    """Return the ATE of the refined poses (aligned by a similarity, and rigidly) and of the tracked poses.
+
+    All three are None without ground truth.
+    """
     cases = {"ate_rmse": (refined, True), "ate_rmse_rigid": (refined, False), "ate_rmse_tracked": (tracked, True)}
     return {
         name: round(absolute_trajectory_error(poses, truth, with_scale), 6) if len(truth) else None

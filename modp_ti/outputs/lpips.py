@@ -1,4 +1,4 @@
-"""LPIPS, the learned distance of two pictures (AlexNet, version 0.1) [Zhang 2018], from weights that the user has."""
+"""LPIPS (AlexNet, version 0.1) [Zhang 2018], with weights that the user provides."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from pipelines.torch_checkpoint import read_checkpoint, require_entries
 
 __all__ = ["MIN_SIDE", "Lpips", "open_lpips"]
 
-# The files as torchvision and the `lpips` package name them.
+# File names as used by torchvision and the `lpips` package.
 ALEXNET = "alexnet-owt-7be5be79.pth"
 LINEAR = "alex.pth"
 
-# Convolutions of AlexNet's `features` by index: shape of the kernel, stride, padding; a pool comes before `POOLED`.
+# AlexNet's convolutions by their index in `features`: kernel shape, stride, padding. A max pool precedes those in
+# `POOLED`.
 CONVOLUTIONS = {
     0: ((64, 3, 11, 11), 4, 2),
     3: ((192, 64, 5, 5), 1, 2),
@@ -29,18 +30,27 @@ CONVOLUTIONS = {
     10: ((256, 256, 3, 3), 1, 1),
 }
 POOLED = (3, 6)
-# The least side whose last pool still has a full window.
+# Smallest image side for which the last pool still has a full window [px].
 MIN_SIDE = 31
 
 
 class Lpips:
-    """Distance of two pictures: the features of AlexNet's five layers, compared pixel by pixel.
+    """The LPIPS distance of two images.
 
-    sum over layers of the mean over pixels of w . (a / |a| - b / |b|)^2, with a and b the channels of a pixel.
+    It compares the features of AlexNet's five layers: the sum over layers of the mean over pixels of w . (a / |a| - b /
+    |b|)^2, where a and b are the channels of a pixel.
     """
 
     def __init__(self, alexnet: Path, linear: Path) -> None:
-        """Read the weights of AlexNet (torchvision) and of the five linear layers. ValueError names a wrong entry."""
+        """Load the weights.
+
+        Args:
+            alexnet: AlexNet's weights in torchvision's format.
+            linear: Weights w of the five linear layers.
+
+        Raises:
+            ValueError: If an entry of a file is missing or has the wrong shape.
+        """
         entries = read_checkpoint(alexnet)
         features = {name: entry for name, entry in entries.items() if not name.startswith("classifier.")}
         shapes: dict[str, tuple[int, ...]] = {}
@@ -58,7 +68,7 @@ class Lpips:
 
     @torch.inference_mode()
     def __call__(self, a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-        """LPIPS of two pictures (H, W, 3), RGB in [0, 1], with sides of at least MIN_SIDE pixels."""
+        """Return the LPIPS of two images (H, W, 3), RGB in [0, 1], with sides of at least MIN_SIDE pixels."""
         both = torch.from_numpy(np.stack([a, b]).astype(np.float32)).permute(0, 3, 1, 2)
         x = (2.0 * both - 1.0 - self._shift) / self._scale
         total = 0.0
@@ -73,11 +83,18 @@ class Lpips:
 
 
 def open_lpips(folder: Path | None, side: int) -> tuple[Lpips | None, str | None]:
-    """LPIPS and None, or None and the reason, in one line, why there is none. Nothing is downloaded.
+    """Load LPIPS if its weights are on this machine. Nothing is downloaded.
 
-    folder: where the two files are; None looks where torchvision keeps its downloads and where the `lpips` package
-    is installed. side: the smaller one of the pictures [pixels]. Raises InputError where a folder is given and a file
-    in it is missing or is not what it should be.
+    Args:
+        folder: Folder with the two weight files. None looks in torchvision's download folder and in the installed
+            `lpips` package.
+        side: Shorter side of the images [px].
+
+    Returns:
+        The network and None, or None and a one-line reason why it is not available.
+
+    Raises:
+        InputError: If `folder` is given and a file in it is missing or invalid.
     """
     if side < MIN_SIDE:
         return None, f"LPIPS is not computed: it needs sides of at least {MIN_SIDE} pixels, here one has {side}"
@@ -100,6 +117,6 @@ def _first(places: Iterable[Path], name: str) -> Path | None:
 
 
 def _package() -> list[Path]:
-    """Where the `lpips` package, which brings the linear layers, keeps them; it is not imported."""
+    """Return the weight folder of the `lpips` package, which ships the linear layers, without importing it."""
     spec = importlib.util.find_spec("lpips")
     return [Path(p) / "weights" / "v0.1" for p in (spec.submodule_search_locations or [])] if spec else []

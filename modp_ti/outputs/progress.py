@@ -1,4 +1,4 @@
-"""The live line of a run: frames, keyframes, Gaussians, PSNR, frames per second."""
+"""The progress line of a run: frames, keyframes, Gaussians, PSNR, frames per second."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["ProgressLine"]
 
 T = TypeVar("T")
 
-# Seconds between the lines of a log.
+# Time between two progress lines in a log [s].
 LOG_EVERY = 30.0
 
 
 class ProgressLine:
-    """Shows what a run is at, on one line of `console`; where that is no terminal, in a line now and then."""
+    """Shows the progress of a run in one line of a terminal, or in a line every 30 seconds otherwise."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
@@ -33,16 +33,16 @@ class ProgressLine:
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
-        """Show that something of unknown length is going on."""
+        """Show a status message while work of unknown length is in progress."""
         with self.console.status(what):
             yield
 
     def note(self, text: str) -> None:
-        """Say something that a person should know."""
+        """Print a note for the user."""
         self.console.print(text, highlight=False, soft_wrap=True)
 
     def prepare(self, what: str, done: int, total: int) -> None:
-        """Show a tracker's preparation; the Progress callback of trackers."""
+        """Show the progress of a tracker's preparation. Trackers take this method as their `Progress` callback."""
         if self._progress is None:
             self._begin(what, total)
         self._update(description=what, completed=done, total=total)
@@ -50,7 +50,7 @@ class ProgressLine:
             self.stop()
 
     def through(self, what: str, items: Iterable[T], total: int) -> Iterator[T]:
-        """The items, showing how many are done."""
+        """Yield the items, showing how many are done."""
         self._begin(what, total)
         try:
             for item in items:
@@ -63,7 +63,7 @@ class ProgressLine:
         self._begin(what, frames, done)
 
     def frame(self, report: FrameReport | None) -> None:
-        """Show a frame that is done; None for one that is held out."""
+        """Count a finished frame; `report` is None if it is held out."""
         if report is not None:
             psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
             gaussians = f"  {report.gaussians:,} Gaussians" if report.gaussians else ""
@@ -82,24 +82,24 @@ class ProgressLine:
         self._begin("optimising", steps)
 
     def optimised(self, step: int, gaussians: int, psnr: float) -> None:
-        """Show a step of offline optimisation that is done."""
+        """Show a finished step of the offline optimisation."""
         self._update(completed=step, state=f"{gaussians:,} Gaussians  {psnr:.2f} dB")
 
     def start_evaluating(self, renders: int) -> None:
         self._begin("evaluating the saved map", renders)
 
     def evaluated(self) -> None:
-        """Show that one more frame has been compared with a map."""
+        """Count a frame that was compared with a map."""
         self._update(advance=1)
 
     def stop(self) -> None:
-        """End the line, leaving its last state on the screen."""
+        """End the line and leave its last state on the screen."""
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
 
     def summary(self, metrics: dict) -> None:
-        """Say in one line what the run came to."""
+        """Print the run's result in one line."""
         scores = metrics["refined"] or metrics["online"] or metrics["offline"]
         which = "held_out" if scores["held_out"]["count"] else "all"
         lpips = scores[which]["lpips"]

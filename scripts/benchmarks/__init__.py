@@ -1,1 +1,1 @@
-"""What scripts/benchmark.py measures: one file a kind of measurement, each run in a process of its own."""
+"""Measurements of scripts/benchmark.py, one file per kind. Each measurement runs in its own process."""

@@ -1,4 +1,4 @@
-"""How the time of a step grows with pixels and Gaussians, and that of a keyframe with the keyframes before it."""
+"""Measures how a step's time grows with pixels and Gaussians, and a keyframe's with the number of earlier keyframes."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from pipelines.settings import DensifySettings, KeyframeSettings, LevelSettings,
 
 __all__ = ["PIXELS", "measure_frames", "measure_growth"]
 
-# width, height, Gaussians in view, Gaussians behind the camera: the first of each group stands for one.
+# (width, height, Gaussians in view, Gaussians behind the camera). Each group varies one quantity.
 PIXELS = [(320, 240, 100_000, 0), (640, 480, 100_000, 0), (1280, 960, 100_000, 0)]
 VISIBLE = [(640, 480, 25_000, 0), (640, 480, 100_000, 0), (640, 480, 400_000, 0)]
 HIDDEN = [(640, 480, 50_000, 0), (640, 480, 50_000, 200_000), (640, 480, 50_000, 800_000)]
 KEYFRAMES = (10, 100, 1000)
-TIMED = 5  # keyframes that are timed at each of these
+TIMED = 5  # number of keyframes that are timed at each of these
 
 
 def measure_growth(device: str, threads: int, repeats: int) -> dict[str, list[dict[str, float]]]:
-    """Milliseconds of a step by `pixels`, `visible` and `hidden`: what varies, and its time."""
+    """Return rows with the varied quantities and the time of a step [ms], for `pixels`, `visible` and `hidden`."""
     initialise(device, threads)
     gaussians = GaussianField()
     widest = max(PIXELS)
@@ -52,7 +52,7 @@ def measure_growth(device: str, threads: int, repeats: int) -> dict[str, list[di
 
 
 def measure_frames(device: str, threads: int) -> list[dict[str, float]]:
-    """Milliseconds of a frame that becomes a keyframe, with 5 steps, by the keyframes before it, in the same map."""
+    """Return the time of a keyframe with 5 steps [ms] by the number of earlier keyframes, in the same map."""
     initialise(device, threads)
     width, height = 320, 240
     settings = MappingSettings(
@@ -75,9 +75,9 @@ def measure_frames(device: str, threads: int) -> list[dict[str, float]]:
         pixels = camera.project(xyz + T[:3, 3])
         seen = camera.contains(pixels)
         points = SparsePoints(xyz[seen], pixels[seen], np.flatnonzero(seen))
-        # Shifted: a picture that repeats the one before has no business in a map.
+        # Shifted, because the mapper rejects repeated images.
         made = TrackedFrame(2 * number, 0.0, str(number), np.roll(image, number, axis=1), camera, T, points)
-        _ = made.pyramid  # as the thread that reads ahead makes it
+        _ = made.pyramid  # as prefetching does
         return made
 
     rows = []

@@ -1,6 +1,6 @@
-"""The same scene through gsplat, where it and a GPU are there: what its users get from `gsplat.rasterization`.
+"""Measures the same scene with `gsplat.rasterization`, if gsplat and a GPU are available.
 
-Written against gsplat 1.5's documentation. It was not run here, as there was no GPU to run it on.
+Written against gsplat 1.5's documentation. It has not been run, as no GPU was available.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ __all__ = ["measure_gsplat", "why_no_gsplat"]
 
 
 def why_no_gsplat() -> str | None:
-    """Why gsplat cannot be measured here; None where it can."""
+    """Return why gsplat cannot be measured here, or None if it can."""
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed"
     return None if torch.cuda.is_available() else "gsplat needs a CUDA device, and PyTorch finds none"
 
 
 def measure_gsplat(size: Size, repeats: int) -> dict[str, float]:
-    """Milliseconds of the render of one view `forward`, and `forward and backward` to all parameters of the Gaussians.
+    """Return the time of rendering one view [ms], `forward`, and `forward and backward` to all Gaussian parameters.
 
-    Activations are inside, as they are in this project's projection; opacities are compensated as here.
+    Activations are included, as in this project's projection. Opacities are compensated as here.
     """
     import gsplat
 

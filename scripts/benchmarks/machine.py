@@ -1,9 +1,9 @@
-"""What the machine can do: float32 arithmetic and memory bandwidth, against which the kernels are held.
+"""Measures the machine's float32 throughput and memory bandwidth, to which the kernels are compared.
 
-Arithmetic: the product of two 2048 x 2048 matrices in float32 by PyTorch's BLAS, 2 * 2048^3 operations; a good BLAS
-comes within some ten percent of what the multipliers can do. Bandwidth: a = b + s c over arrays of 32 million float32,
-far beyond the caches, twelve bytes an element: two read, one written; that a CPU first fetches what it will overwrite
-is not counted. The best of several runs, as both are limits.
+Throughput: the product of two 2048 x 2048 float32 matrices by PyTorch's BLAS, 2 * 2048^3 operations. A good BLAS comes
+within about ten percent of the peak. Bandwidth: a = b + s c over arrays of 32 million float32, far larger than the
+caches, with twelve bytes per element (two reads, one write). A CPU also fetches the lines that it overwrites, which is
+not counted. The best of several runs is used, as both are upper limits.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ RUNS = 5
 
 
 def measure_machine(device: str, threads: int) -> dict[str, float]:
-    """gflops and gigabytes_per_second of float32 on `threads` threads, or on the GPU where it is taken."""
+    """Return gflops and gigabytes_per_second of float32, on `threads` CPU threads or on the GPU if it is used."""
     where = "cuda" if initialise(device, threads) == "cuda" else "cpu"
     torch.set_num_threads(threads)
     a, b = (torch.rand(MATRIX, MATRIX, device=where) for _ in range(2))
@@ -37,7 +37,7 @@ def measure_machine(device: str, threads: int) -> dict[str, float]:
 
 
 def _best(call: Callable[[], object], where: str) -> float:
-    """Seconds of the fastest of some calls."""
+    """Return the time of the fastest of several calls [s]."""
     wait = torch.cuda.synchronize if where == "cuda" else lambda: None
     times = []
     for _ in range(RUNS + 1):

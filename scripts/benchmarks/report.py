@@ -1,4 +1,4 @@
-"""The figures of a benchmark as Markdown."""
+"""Formats the figures of a benchmark as Markdown."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["report"]
 
 
 def report(figures: Mapping[str, Any]) -> str:
-    """The tables of everything in `figures` (see `collect` of benchmark.py)."""
+    """Return the tables of all figures (see `collect` in benchmark.py)."""
     parts = [f"# Benchmark: {figures['device']}, {figures['cores']} cores", *_machine(figures["machine"])]
     for row, other in zip(figures["steps"], figures["gsplat"], strict=True):
         parts += _step(row, figures["machine"]) + _gsplat(row, other)

@@ -1,4 +1,4 @@
-"""The scene of the benchmarks: Gaussians spread over depths of 2 to 6 units, as dense in the image as a map gets."""
+"""The benchmark scene: Gaussians at depths of 2 to 6 units, with the image density of a real map."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ __all__ = ["Size", "add_gaussians", "arrays", "camera_of", "noise_frame"]
 
 @dataclass(frozen=True)
 class Size:
-    """How large a measurement is: pixels, and Gaussians in view."""
+    """Size of a measurement.
+
+    Attributes:
+        width: Image width [px].
+        height: Image height [px].
+        gaussians: Number of Gaussians in view.
+    """
 
     width: int
     height: int
@@ -27,19 +33,19 @@ class Size:
 
 
 def camera_of(width: int, height: int) -> PinholeCamera:
-    """A camera of some 61 degrees across."""
+    """Return a camera with a horizontal field of view of about 61 degrees."""
     return PinholeCamera(0.85 * width, 0.85 * width, width / 2, height / 2, width, height)
 
 
 def arrays(size: Size, hidden: bool = False, seed: int = 0) -> dict[str, NDArray[np.float64]]:
-    """The Gaussians by name as `GaussianField.append` takes them; all behind the camera where `hidden`."""
+    """Return random Gaussians by name, as `GaussianField.append` takes them; behind the camera if `hidden`."""
     rng = np.random.default_rng(seed)
     camera, n = camera_of(size.width, size.height), size.gaussians
     depth = rng.uniform(2.0, 6.0, n)
     position = camera.unproject(rng.uniform((0, 0), (size.width, size.height), (n, 2)), depth)
     if hidden:
         position[:, 2] *= -1.0
-    # Half the distance to the next one: about a Gaussian for every ten pixels at 480x270 and 12,500.
+    # Half the distance to the nearest neighbour: about one Gaussian per ten pixels at 480x270 and 12,500 Gaussians.
     sigma = 0.5 * np.sqrt(size.width * size.height / n) * depth / camera.focal
     return {
         "position": position,
@@ -51,11 +57,11 @@ def arrays(size: Size, hidden: bool = False, seed: int = 0) -> dict[str, NDArray
 
 
 def add_gaussians(gaussians: GaussianField, size: Size, hidden: bool = False) -> None:
-    """Append the Gaussians of the size."""
+    """Append random Gaussians of this size."""
     gaussians.append(**arrays(size, hidden))
 
 
 def noise_frame(width: int, height: int) -> TrackedFrame:
-    """A frame of noise from the origin."""
+    """Return a noise image seen from the origin."""
     image = np.random.default_rng(1).random((height, width, 3), dtype=np.float32)
     return TrackedFrame(0, 0.0, "noise", image, camera_of(width, height), np.eye(4))

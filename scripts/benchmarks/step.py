@@ -1,4 +1,4 @@
-"""One optimisation step on one view: every stage, the pixel-Gaussian pairs, the memory."""
+"""Measures one optimisation step on one view: the time of every stage, the pixel-Gaussian pairs and the memory."""
 
 from __future__ import annotations
 
@@ -21,24 +21,32 @@ __all__ = ["ADAM_BYTES", "BACKWARD_FLOPS", "FORWARD_FLOPS", "LOSS_FLOPS", "STAGE
 STAGES = (
     "projection", "binning", "compositing", "loss", "compositing backward", "projection backward", "penalty", "Adam",
 )  # fmt: skip
-# Additions, multiplications and divisions, a fused multiply-add counted as two; comparisons, selections and conversions
-# not counted. For a pixel-Gaussian pair in the inner loops of pipelines/render/cpu/compositing.py, 14 of them the
-# exponential:
+# Additions, multiplications and divisions; a fused multiply-add counts as two. Comparisons, selections and conversions
+# are not counted. Per pixel-Gaussian pair in the inner loops of pipelines/render/cpu/compositing.py, including 14 for
+# the exponential:
 FORWARD_FLOPS = 34
 BACKWARD_FLOPS = 54
-# and for a pixel of a channel in pipelines/optimise/losses.py: five windows of 11 + 11 taps (the products with them),
-# SSIM and its derivatives, three windows of 11 + 11 taps, the gradient.
+# Per pixel and channel in pipelines/optimise/losses.py: five windows of 11 + 11 taps (including the products), SSIM and
+# its derivatives, three windows of 11 + 11 taps, the gradient.
 LOSS_FLOPS = 110 + 110 + 45 + 132 + 10
-# Of a Gaussian that Adam touches: 14 float32 with gradient and two moments, and two counters, each read and written.
+# Bytes per Gaussian that Adam updates: 14 float32 with gradient and two moments, and two counters, each read and
+# written.
 ADAM_BYTES = (14 * 4 + 2) * 4 * 2
 
 
 def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool = False) -> dict[str, float]:
-    """Milliseconds of each of STAGES and of a whole `step`, counts of pairs, `peak_memory_mb`, and `cores_had`.
+    """Measure the stages and the whole step on one view.
 
-    The last is how many cores worked on the steps: far fewer than threads where others use the machine.
+    Args:
+        device: "cpu" or "cuda".
+        threads: Number of CPU threads.
+        size: Size of the scene.
+        repeats: Number of timed calls.
+        twin: Also time the plain pixel-outer compositing that the tests compare with (CPU only).
 
-    twin: also those of the plain pixel-outer compositing that the tests compare with (CPU).
+    Returns:
+        Time of each of STAGES and of a whole `step` [ms], counts of pairs, `peak_memory_mb` and `cores_had`. The last
+            is the number of cores that worked on the steps, far fewer than `threads` if the machine is busy.
     """
     on_cpu = initialise(device, threads) == "cpu"
     settings = MappingSettings()
@@ -48,7 +56,7 @@ def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool
     optimiser = MapOptimiser(gaussians, renderer, settings)
     store = KeyframeStore()
     view = store.append(noise_frame(size.width, size.height))
-    # All the work of a step, and the same scene after it.
+    # Zero learning rates: all the work of a step without a change of the scene.
     still = LearningRates(0.0, 0.0, 0.0, 0.0, 0.0)
     weights = settings.optimise
 
@@ -64,13 +72,13 @@ def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool
         lambda: optimiser.aspect.backward(weights.aspect_weight, store.scene_depth), lambda: optimiser.adam.step(still),
     )  # fmt: skip
     figures = stage_milliseconds(list(zip(STAGES, calls, strict=True)), repeats)
-    figures["visible"] = renderer.projected.seen[None]  # `count` is a bound, on a GPU
+    figures["visible"] = renderer.projected.seen[None]  # on a GPU, `count` is only an upper bound
     figures["pairs of whole tiles"] = renderer.pairs.count * TILE_PIXELS
     if on_cpu:
         rows = renderer.pairs.rows_to_numpy()
         figures["pairs visited"] = int(((rows >> 16) - (rows & 0xFFFF)).sum()) * TILE_WIDTH
     else:
-        # A thread a pixel: whole tiles are visited.
+        # One thread per pixel visits whole tiles.
         figures["pairs visited"] = figures["pairs of whole tiles"]
     if on_cpu and twin:
         plain = ReferenceCompositing(renderer.view, renderer.projected, renderer.pairs, renderer.images)

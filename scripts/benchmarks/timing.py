@@ -1,4 +1,4 @@
-"""Timing calls on whichever device Taichi runs, and the memory that a process has taken."""
+"""Timing of calls on Taichi's current device, and the peak memory of a process."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["milliseconds", "peak_memory_mb", "stage_milliseconds"]
 
 
 def stage_milliseconds(stages: Sequence[tuple[str, Callable[[], object]]], repeats: int) -> dict[str, float]:
-    """Median of each stage, of `repeats` passes through all of them in their order after one that does not count.
+    """Return the median time of each stage [ms] over `repeats` passes through all stages, after one warm-up pass.
 
-    The device is waited for after every stage, so that their sum exceeds a pass that is left to itself on a GPU.
+    The device is synchronised after every stage. On a GPU, the sum therefore exceeds the time of an undisturbed pass.
     """
     times: dict[str, list[float]] = {name: [] for name, _ in stages}
     for number in range(repeats + 1):
@@ -30,10 +30,10 @@ def stage_milliseconds(stages: Sequence[tuple[str, Callable[[], object]]], repea
 
 
 def milliseconds(call: Callable[[], object], repeats: int) -> float:
-    """Median of `repeats` calls after one that does not count."""
+    """Return the median time of `repeats` calls [ms], after one warm-up call."""
     return stage_milliseconds([("call", call)], repeats)["call"]
 
 
 def peak_memory_mb() -> float:
-    """The most memory of the host that this process has held, as of now."""
+    """Return the peak host memory of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

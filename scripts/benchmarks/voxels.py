@@ -1,4 +1,4 @@
-"""The occupancy voxels on 300,000 points in random order on the walls of a room 80 coarsest cells wide."""
+"""Measures the occupancy voxels with 300,000 random points on the walls of a room 80 coarsest cells wide."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEVELS = (3, 7)
 
 
 def measure_voxels(device: str, threads: int, level: int) -> dict[str, float]:
-    """Milliseconds per 100,000 points at a level of the voxels, and megabytes that 300,000 points take."""
+    """Return milliseconds per 100,000 points at a level of the voxels, and the megabytes for 300,000 points."""
     initialise(device, threads)
     rng = np.random.default_rng(0)
     points = rng.uniform(-ROOM / 2, ROOM / 2, (BATCHES, POINTS, 3))
@@ -51,7 +51,7 @@ def measure_voxels(device: str, threads: int, level: int) -> dict[str, float]:
 
 
 def _resident_mb() -> float:
-    """Memory of this process that is in use now (Linux; elsewhere not a number)."""
+    """Return the current resident memory of this process [MB], NaN on systems other than Linux."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,4 +1,4 @@
-"""Whole runs of scenes, online, as a user starts them."""
+"""Measures whole online runs of scenes, started as a user starts them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,16 @@ __all__ = ["measure_runs", "planned_runs"]
 
 
 def planned_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str], folder: Path) -> list[Job]:
-    """A run of every scene file, without refinement, into folders by the scenes' names in `folder`.
+    """Return a job for every scene file, without refinement, with output folders named after the scenes.
 
-    settings: overrides by key. Raises InputError for scenes that cannot be run.
+    Args:
+        scenes: Scene files.
+        device: "cpu" or "cuda".
+        settings: Overrides by key.
+        folder: Parent of the output folders.
+
+    Raises:
+        InputError: If a scene cannot be run.
     """
     overrides = {"refine.steps": "0", "device": device, **settings}
     jobs = [
@@ -27,7 +34,7 @@ def planned_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str]
 
 
 def measure_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Figures of metrics.json of the planned runs, by the scene's name. Raises InputError where one fails."""
+    """Run the scenes and return their figures of metrics.json by the scene's name. Raises InputError if a run fails."""
     with tempfile.TemporaryDirectory() as folder:
         jobs = planned_runs(scenes, device, settings, Path(folder))
         results = execute(jobs)

@@ -1,1 +1,1 @@
-"""Trouble made on purpose: malformed files, killed runs, disturbed streams."""
+"""Fault injection: malformed files, killed runs, disturbed streams."""

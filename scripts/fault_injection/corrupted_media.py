@@ -1,4 +1,4 @@
-"""What is corrupted in pictures, videos, finished runs and camera paths."""
+"""Corruptions of images, videos, finished runs and camera paths."""
 
 from __future__ import annotations
 

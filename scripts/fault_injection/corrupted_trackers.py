@@ -1,4 +1,4 @@
-"""What is corrupted in scene files and in the files of trackers."""
+"""Corruptions of scene files and trackers' files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a file is corrupted: in any way, in its text, in the layout of its format. The same every time."""
+"""Deterministic corruptions of files: of any file, of text, and of specific formats."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ __all__ = [
 Corruption = Callable[[Path], None]
 
 
-# ---- what can happen to any file --------------------------------------------------------------------------------
+# ---- any file ----------------------------------------------------------------------------------------------------
 
 
 def changed(content: Callable[[bytes], bytes]) -> Corruption:
-    """Its bytes become what `content` makes of them."""
+    """Replace the file's bytes by the result of `content`."""
 
     def corrupt(file: Path) -> None:
         file.write_bytes(content(file.read_bytes()))
@@ -100,11 +100,11 @@ TEXT: dict[str, Corruption] = {
 }
 
 
-# ---- what can happen to text --------------------------------------------------------------------------------------
+# ---- text --------------------------------------------------------------------------------------------------------
 
 
 def replaced(old: str, new: str) -> Corruption:
-    """The first `old` in its text becomes `new`."""
+    """Replace the first `old` in the text by `new`."""
 
     def corrupt(file: Path) -> None:
         text = file.read_text()
@@ -115,7 +115,7 @@ def replaced(old: str, new: str) -> Corruption:
 
 
 def with_line(number: int, new: str) -> Corruption:
-    """One of its lines becomes another; its place counted from 0."""
+    """Replace a line, counted from 0."""
 
     def corrupt(file: Path) -> None:
         lines = file.read_text().splitlines()
@@ -126,12 +126,12 @@ def with_line(number: int, new: str) -> Corruption:
 
 
 def whole(content: str | bytes) -> Corruption:
-    """All of it becomes this."""
+    """Replace the whole content."""
     return changed(lambda data: content if isinstance(content, bytes) else content.encode())
 
 
 def in_json(change: Callable[[dict], object]) -> Corruption:
-    """Its JSON is changed in place by `change`."""
+    """Modify the JSON in place with `change`."""
 
     def corrupt(file: Path) -> None:
         data = json.loads(file.read_text())
@@ -146,7 +146,13 @@ NUMBERS = {"NaN": "nan", "infinity": "inf", "a huge number": "1e300", "5000 digi
 
 
 def rows_of(line: str, place: int, at: int) -> dict[str, Corruption]:
-    """A table of numbers with one of a row replaced. line: the row; at: its line."""
+    """Return corruptions that replace one number of a table's row, or change its number of columns.
+
+    Args:
+        line: The row.
+        place: Index of the number in the row.
+        at: Line number of the row.
+    """
     words = line.split()
     cases = {
         f"{what} in a row": with_line(at, " ".join([*words[:place], new, *words[place + 1 :]]))
@@ -158,11 +164,11 @@ def rows_of(line: str, place: int, at: int) -> dict[str, Corruption]:
     }
 
 
-# ---- what can happen to binary files ------------------------------------------------------------------------------
+# ---- binary files ------------------------------------------------------------------------------------------------
 
 
 def patched(at: int, form: str, *values: float) -> Corruption:
-    """Numbers over what stands at an offset; from the end where that is negative."""
+    """Overwrite numbers at an offset, which counts from the end if negative."""
 
     def change(data: bytes) -> bytes:
         start = at if at >= 0 else len(data) + at
@@ -173,17 +179,17 @@ def patched(at: int, form: str, *values: float) -> Corruption:
 
 
 def appended(more: bytes) -> Corruption:
-    """More bytes follow it."""
+    """Append bytes."""
     return changed(lambda data: data + more)
 
 
 def ply_file(header: str, body: bytes = b"") -> Corruption:
-    """It becomes a PLY file of this header and body."""
+    """Replace the content by a PLY file with this header and body."""
     return whole(f"ply\n{header}\nend_header\n".encode() + body)
 
 
 def png_file(width: int, height: int, content: bytes = b"\0" * 64) -> bytes:
-    """A PNG whose checksums are right, whatever it says of its size."""
+    """Return a PNG with correct checksums and the given size in its header."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -193,7 +199,7 @@ def png_file(width: int, height: int, content: bytes = b"\0" * 64) -> bytes:
 
 
 def jpeg_of_size(width: int, height: int) -> Corruption:
-    """The size in a JPEG's header becomes another."""
+    """Change the size in a JPEG's header."""
 
     def change(data: bytes) -> bytes:
         at = data.index(b"\xff\xc0") + 5
@@ -203,26 +209,26 @@ def jpeg_of_size(width: int, height: int) -> Corruption:
 
 
 def npy_file(header: str, body: bytes = b"\0" * 96) -> Corruption:
-    """It becomes an `.npy` file of this header and body."""
+    """Replace the content by an `.npy` file with this header and body."""
     text = header.encode().ljust(117) + b"\n"
     return whole(b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text + body)
 
 
 def pickled_npy(file: Path) -> None:
-    """It becomes an `.npy` file that holds a pickle."""
+    """Replace the content by an `.npy` file that holds a pickle."""
     with file.open("wb") as stream:
         np.save(stream, np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
 
 
 def archive_npy(file: Path) -> None:
-    """It becomes an archive of arrays."""
+    """Replace the content by an archive of arrays."""
     with io.BytesIO() as stream:
         np.savez(stream, a=np.zeros((3, 3)))
         file.write_bytes(stream.getvalue())
 
 
 def in_stella(change: Callable[[dict], object]) -> Corruption:
-    """Its MessagePack is changed in place by `change`."""
+    """Modify the MessagePack content in place with `change`."""
 
     def corrupt(file: Path) -> None:
         data = msgpack.unpackb(file.read_bytes())
@@ -233,7 +239,7 @@ def in_stella(change: Callable[[dict], object]) -> Corruption:
 
 
 def in_gz(change: Callable[[str], str | bytes]) -> Corruption:
-    """Its text, unpacked, becomes what `change` makes of it, packed again."""
+    """Replace the decompressed text by the result of `change`, and compress it again."""
 
     def corrupt(file: Path) -> None:
         text = change(gzip.decompress(file.read_bytes()).decode())
@@ -243,18 +249,18 @@ def in_gz(change: Callable[[str], str | bytes]) -> Corruption:
 
 
 def bomb(text: str) -> str:
-    """A table of a million rows like its first."""
+    """Return a table with a million copies of the first row."""
     header, row = text.splitlines()[:2]
     return header + "\n" + (row + "\n") * 1_000_000
 
 
 def setting(path: str, value: object) -> Callable[[dict], None]:
-    """Sets what stands at `a/b/0` of nested data."""
+    """Return a function that sets the value at the path `a/b/0` of nested data."""
     return _placed([int(part) if part.isdecimal() else part for part in path.split("/")], value)
 
 
 def key_of(path: str, value: object) -> Callable[[dict], None]:
-    """The same where every key is text."""
+    """As `setting`, but every part of the path is a text key."""
     return _placed(path.split("/"), value)
 
 
@@ -269,11 +275,11 @@ def _placed(path: Sequence[str | int], value: object) -> Callable[[dict], None]:
     return change
 
 
-# ---- what is particular to each format --------------------------------------------------------------------------
+# ---- specific formats --------------------------------------------------------------------------------------------
 
 
 def laughs(levels: int) -> str:
-    """YAML of a line a level that stands for nine times the one before."""
+    """Return YAML in which every level expands to nine times the one before ("billion laughs")."""
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, levels)]
     return "\n".join(lines)

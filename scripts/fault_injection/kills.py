@@ -1,4 +1,4 @@
-"""`kill -9` at random moments of a small run, which is resumed each time: the map must be the one of a run in peace."""
+"""Kills a small run at random moments and resumes it. The map must be identical to that of an undisturbed run."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from fault_injection.runs import contents, finished, require_success, run_until
 
 __all__ = ["KILLS_SCENE", "Kills", "kill_and_resume", "kills_table"]
 
-# The demo room, so small that starting the process takes longest. Exposure is estimated and the tracker corrects its
-# poses, so that everything that there is to be kept is at stake.
+# The demo room, so small that starting the process takes the most time. Exposure estimation and pose corrections are
+# enabled so that the snapshots contain all kinds of state.
 KILLS_SCENE = """\
 source:  {scale: 0.25, holdout: 4, step: 3}
 tracker: {kind: synthetic, drift: 0.05, correction: true, exposure_change: 0.5}
@@ -29,10 +29,14 @@ snapshot_every: 2
 
 @dataclass
 class Kills:
-    """moments: seconds after the start of its process at which each kill came. stages: how far the run was.
+    """Result of the kills.
 
-    runs: runs that came to their end, in spite of the kills on the way; identical: those whose files are the same as
-    those of the run in peace. leftovers: half-written files that were found.
+    Attributes:
+        moments: Time of each kill since the start of its process [s].
+        stages: Number of kills by stage of the run.
+        runs: Number of runs that finished despite the kills.
+        identical: Number of these whose files equal those of the undisturbed run.
+        leftovers: Number of partial files found.
     """
 
     moments: list[float]
@@ -43,9 +47,19 @@ class Kills:
 
 
 def kill_and_resume(folder: Path, kills: int, seed: int, say: Callable[[str], None], scene: str = KILLS_SCENE) -> Kills:
-    """Kill a run so many times; each is started again with `--resume` where it left a snapshot, else from its scene.
+    """Kill runs at random moments. Each continues with `--resume` if it left a snapshot, otherwise from its scene.
 
-    A run that comes to its end is compared, and another one begun. Raises InputError where a run fails by itself.
+    When a run finishes, it is compared with the undisturbed run, and another one is started.
+
+    Args:
+        folder: Folder of the runs.
+        kills: Number of kills.
+        seed: Seed of the random moments.
+        say: Called with progress lines.
+        scene: Content of the scene file.
+
+    Raises:
+        InputError: If a run fails by itself.
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -60,7 +74,8 @@ def kill_and_resume(folder: Path, kills: int, seed: int, say: Callable[[str], No
     output = folder / "killed"
     under_way = False
     while len(result.moments) < kills or under_way:
-        # One in four while it starts, which takes longest; the others once it maps, however busy the machine is.
+        # A quarter of the kills hit the start, which takes longest. The others count from the first snapshot, so that
+        # they hit the mapping even on a busy machine.
         mapping = chance.random() > 0.25
         moment = chance.uniform(0.0, peace.seconds - first if mapping else first)
         snapshot = output / "snapshot.npz"
@@ -83,7 +98,7 @@ def kill_and_resume(folder: Path, kills: int, seed: int, say: Callable[[str], No
 
 
 def kills_table(result: Kills) -> str:
-    """The result as Markdown."""
+    """Return the result as a Markdown table."""
     stages = ", ".join(f"{count} {stage}" for stage, count in result.stages.items())
     lines = [
         "| kill -9 at random moments | |",

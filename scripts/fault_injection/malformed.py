@@ -1,6 +1,8 @@
-"""Malformed inputs through the command line, in this process: one line, exit code 2, nothing written, memory bounded.
+"""Runs the command line on malformed inputs, in this process, and checks the result.
 
-`python scripts/fault_injection/malformed.py [READER ...]` prints a table by reader, and what went wrong.
+Expected are a one-line message, exit code 2, no output files and bounded memory.
+
+`python scripts/fault_injection/malformed.py [READER ...]` prints a table by reader, and the failures.
 """
 
 from __future__ import annotations
@@ -26,16 +28,23 @@ from fault_injection.samples import SAMPLES, write_sample  # noqa: E402
 __all__ = ["BASE", "Outcome", "malformed_inputs", "markdown", "run_case"]
 
 BASE = 16 << 20
-"""Bytes that a command may take however small its input is; beyond, twice the input's size."""
-# Of what native libraries take, which the operating system counts in its own units, this much more.
+"""Bytes that a command may allocate in addition to twice the size of its input."""
+# Additional allowance for native libraries, measured as resident memory by the OS.
 NATIVE_BASE = 96 << 20
-# After which a command hangs: seconds of the clock, and of the processor.
+# Limits of wall time and CPU time after which a command counts as hanging [s].
 SECONDS, PROCESSOR_SECONDS = 900, 30
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a malformed input came to. fault: what should not have been, empty where all is well. line: the message."""
+    """Result of a malformed input.
+
+    Attributes:
+        case: The input.
+        fault: What was wrong with the command's reaction, empty if nothing.
+        line: The message.
+        allocated: Bytes that Python allocated at most.
+    """
 
     case: Case
     fault: str
@@ -44,7 +53,7 @@ class Outcome:
 
 
 def malformed_inputs(readers: Iterable[str] = (), cases: Sequence[Case] = CASES) -> Iterator[Outcome]:
-    """Run the cases, or those of some readers, one after the other."""
+    """Run all cases, or those of some readers, one after the other."""
     wanted = set(readers)
     cases = [case for case in cases if not wanted or case.reader in wanted]
     with tempfile.TemporaryDirectory(prefix="modp-ti-malformed-") as folder:
@@ -61,7 +70,7 @@ def malformed_inputs(readers: Iterable[str] = (), cases: Sequence[Case] = CASES)
 
 
 def run_case(case: Case, sample: Path, folder: Path) -> Outcome:
-    """Make the malformed input in `folder`, of the valid one in `sample`, and give it to the command."""
+    """Create the malformed input in `folder` from the valid one in `sample`, and run the command on it."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(sample, folder, symlinks=True)
     case.corrupt(folder / case.file)
@@ -91,7 +100,7 @@ def run_case(case: Case, sample: Path, folder: Path) -> Outcome:
 
 
 def markdown(outcomes: list[Outcome]) -> str:
-    """A table by reader."""
+    """Return a table by reader."""
     rows = ["| reader | malformed inputs | one line, exit code 2, nothing left | most allocated |", "|---|---|---|---|"]
     for reader in dict.fromkeys(outcome.case.reader for outcome in outcomes):
         of = [outcome for outcome in outcomes if outcome.case.reader == reader]
@@ -103,7 +112,10 @@ def markdown(outcomes: list[Outcome]) -> str:
 
 
 def _accepted(folder: Path, arguments: tuple[str, ...]) -> str:
-    """Why a command refuses a valid sample; this also imports what it needs, before memory is measured."""
+    """Return the message if a command refuses a valid sample.
+
+    This also imports the command's modules before memory is measured.
+    """
     kept = _listing(folder)
     code, text = _command(folder, arguments, impatient=False)
     for name in _listing(folder) - kept:
@@ -112,7 +124,7 @@ def _accepted(folder: Path, arguments: tuple[str, ...]) -> str:
 
 
 def _command(folder: Path, arguments: tuple[str, ...], impatient: bool = True) -> tuple[int, str]:
-    """Exit code and all output, of native libraries too, of `modp-ti` in the folder."""
+    """Run `modp-ti` in the folder and return its exit code and all output, including that of native libraries."""
     from modp_ti.commands.app import app
 
     here = Path.cwd()
@@ -152,7 +164,7 @@ def _everything_to(descriptor: int) -> Iterator[None]:
 
 @contextmanager
 def _impatient() -> Iterator[None]:
-    """Raises where the command hangs."""
+    """Raise an error if the command hangs."""
 
     def late(*_: object) -> None:
         raise TimeoutError(f"hangs: {PROCESSOR_SECONDS} s of the processor, or {SECONDS} s, have passed")
@@ -186,7 +198,7 @@ def _listing(folder: Path) -> set[str]:
 
 
 def _reset_resident() -> int:
-    """Bytes of memory in use; the system's record of the most of it begins anew."""
+    """Reset the OS's record of the peak resident memory, and return the current one in bytes."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -201,7 +213,7 @@ def _peak_resident() -> int:
 def _status(key: str) -> int:
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:  # not Linux: Python's own count stands alone
+    except OSError:  # not Linux: only Python's own count is used
         return 0
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith(key))
 

@@ -1,4 +1,4 @@
-"""The malformed inputs: of each reader's files, what is corrupted and how."""
+"""The malformed inputs: which file of each reader is corrupted, and how."""
 
 from __future__ import annotations
 
@@ -28,7 +28,15 @@ __all__ = ["CASES", "Case"]
 
 @dataclass(frozen=True)
 class Case:
-    """corrupt: called with the path of `file`, relative to the sample's folder. arguments: of `modp-ti`."""
+    """A malformed input.
+
+    Attributes:
+        reader: Name of the reader.
+        file: The corrupted file, relative to the sample's folder.
+        name: Name of the corruption.
+        corrupt: Called with the file's path.
+        arguments: Arguments of `modp-ti`.
+    """
 
     reader: str
     file: str
@@ -64,13 +72,14 @@ def _cases() -> list[Case]:
     add("orbslam3", "CameraTrajectory.txt", anything() | TEXT | ORBSLAM3)
     add("tum_rgbd", "rgb.txt", anything("cut in half") | TEXT | TUM_RGBD)
     add("replica", "traj.txt", anything() | TEXT | REPLICA)
-    unseen = ("missing", "a folder", "a link to itself", "a pipe", "a device")  # what is as if it were not there
+    # Corruptions that have the same effect as a missing file.
+    unseen = ("missing", "a folder", "a link to itself", "a pipe", "a device")
     add("sevenscenes", "seq/frame-000001.pose.txt", anything(*unseen) | TEXT | SEVENSCENES)
     add("modp", "trajectory.json", anything() | TEXT | MODP["trajectory.json"])
     for file in ("point_cloud/point_cloud_1.txt", "point_cloud/point_cloud_2.npy"):
         add("modp", file, anything("missing", "empty") | MODP[file])
     for file, corruptions in ARIA.items():
-        # A row that ends in the middle of its last number is a row.
+        # A row cut in the middle of its last number is still a valid row.
         cut = ("cut in half",) if file.endswith("observations.csv") else ()
         add("aria", file, anything(*cut, *(unseen if file.startswith("semidense") else ())) | corruptions)
     add("stella_vslam", "map.msg", anything("noise before it") | STELLA)

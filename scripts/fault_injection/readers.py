@@ -1,7 +1,7 @@
-"""Every reader as a function of bytes: what the fuzzer calls, and what the corpus is replayed through.
+"""Every reader as a function of bytes, for the fuzzer and for replaying the corpus.
 
-A reader with several files takes its first byte as the file's number. Anything but an InputError (or its like: what
-`pipelines` and the tracker server raise) that comes out of one is a fault of ours.
+For a reader with several files, the first byte selects the file. The only expected exceptions are InputError and its
+equivalents in `pipelines` and the tracker server.
 """
 
 from __future__ import annotations
@@ -23,7 +23,14 @@ __all__ = ["READERS", "Reader", "import_readers", "seeds"]
 
 @dataclass(frozen=True)
 class Reader:
-    """files: of the sample, by their numbers; read: called in the sample's folder with the one that was written."""
+    """A reader under test.
+
+    Attributes:
+        name: The reader's name.
+        sample: Name of its sample input.
+        files: The sample's files, by number.
+        read: Called with the path of the file that was written, inside the sample's folder.
+    """
 
     name: str
     sample: str
@@ -31,7 +38,7 @@ class Reader:
     read: Callable[[Path], object]
 
     def __call__(self, folder: Path, data: bytes) -> bool:
-        """Read `data` in the place of one of the files; whether it was taken."""
+        """Read `data` in place of one of the files, and return whether it was accepted."""
         if len(self.files) > 1:
             number, data = (data[0] if data else 0) % len(self.files), data[1:]
         else:
@@ -49,7 +56,7 @@ class Reader:
 
 
 def _open(file: Path) -> None:
-    """The tracker of the scene beside the file, opened and asked for what it holds."""
+    """Open the tracker of the scene that the file belongs to."""
     from modp_ti.config.scene_file import load_scene
     from modp_ti.inputs.trackers import open_tracker
 
@@ -167,7 +174,7 @@ def _weights(file: Path) -> None:
 
 
 class _Wire(socket.socket):
-    """A socket that has received what is in a file, and whose sender has gone."""
+    """A socket that has received a file's content and whose sender has disconnected."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
@@ -183,7 +190,7 @@ class _Wire(socket.socket):
 
 
 def _tracker_server(file: Path) -> None:
-    """A whole conversation, up to what is handed to the mapper."""
+    """Run a whole conversation, up to what is passed to the mapper."""
     from modp_ti.inputs.tracker_server import messages
     from modp_ti.inputs.tracker_server.connection import Connection, SenderGoneError
     from modp_ti.inputs.tracker_server.ordering import Ordering
@@ -252,7 +259,7 @@ READERS: dict[str, Reader] = {
 
 
 def import_readers() -> None:
-    """Import every module that the readers use, once and for all processes that are forked off."""
+    """Import every module that the readers use, once for all forked processes."""
     kinds = ("aria", "colmap", "modp", "replica", "stella_vslam", "transforms", "tum")
     for name in (
         *(
@@ -277,7 +284,7 @@ def import_readers() -> None:
 
 
 def seeds(reader: Reader, folder: Path) -> list[bytes]:
-    """Write the reader's sample into a new folder; its files as the fuzzer gives them."""
+    """Write the reader's sample to a new folder, and return its files in the fuzzer's form."""
     write_sample(reader.sample, folder)
     contents = [(folder / name).read_bytes() for name in reader.files]
     return contents if len(contents) == 1 else [bytes([n]) + content for n, content in enumerate(contents)]

@@ -1,4 +1,4 @@
-"""Runs of `modp-ti` in processes of their own that may be killed, and what they left."""
+"""Runs `modp-ti` in separate processes that may be killed, and reads their output."""
 
 from __future__ import annotations
 
@@ -15,13 +15,21 @@ from modp_ti.files.errors import InputError
 
 __all__ = ["COMPARED", "Ended", "contents", "finished", "metrics", "require_success", "run_until"]
 
-# What must be the same after an interrupted run.
+# Files that an interrupted and resumed run must reproduce exactly.
 COMPARED = ("splats.ply", "trajectory.txt")
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended. killed: by us. seconds: since its start. first_snapshot: when it had one, or None."""
+    """How a run ended.
+
+    Attributes:
+        code: Exit code.
+        killed: Whether this program killed it.
+        seconds: Time since its start [s].
+        first_snapshot: When its first snapshot appeared [s], or None.
+        said: Its standard error.
+    """
 
     code: int
     killed: bool
@@ -31,9 +39,13 @@ class Ended:
 
 
 def run_until(arguments: list[str], snapshot: Path, kill_after: float | None = None, mapping: bool = False) -> Ended:
-    """`modp-ti run` with these arguments; `kill -9` after so many seconds, if it is there still.
+    """Run `modp-ti run`, and kill it with SIGKILL if it is still running after `kill_after`.
 
-    mapping: they count from when it has written a snapshot, however long it took to start.
+    Args:
+        arguments: Arguments of the command.
+        snapshot: The run's snapshot file.
+        kill_after: Time until the kill [s], None to let it finish.
+        mapping: Count this time from the first snapshot instead of from the start.
     """
     before = _stamp(snapshot)
     started, first = time.monotonic(), None
@@ -67,23 +79,23 @@ def _stamp(file: Path) -> int:
 
 
 def finished(arguments: list[str], output: Path) -> Ended:
-    """The same, to its end. Raises InputError with what it said where that is not a good one."""
+    """Run `modp-ti run` to its end. Raises InputError with its messages if it fails."""
     ended = run_until(arguments, output / "snapshot.npz")
     require_success(ended, output)
     return ended
 
 
 def require_success(ended: Ended, output: Path) -> None:
-    """Raises InputError for a run that ended badly by itself."""
+    """Raise InputError if a run failed."""
     if ended.code:
         raise InputError(f"the run into {output} ended with {ended.code}: {ended.said.strip()[-500:]}")
 
 
 def contents(output: Path) -> dict[str, bytes]:
-    """The files that are compared."""
+    """Return the content of the files to compare."""
     return {name: (output / name).read_bytes() for name in COMPARED}
 
 
 def metrics(output: Path) -> dict[str, Any]:
-    """metrics.json of a finished run."""
+    """Read metrics.json of a finished run."""
     return json.loads((output / "metrics.json").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Small valid inputs of every reader, written here byte by byte: what is malformed is made of them."""
+"""Small valid inputs of every reader, from which the malformed inputs are made."""
 
 from __future__ import annotations
 
@@ -40,7 +40,12 @@ __all__ = ["SAMPLES", "Sample", "write_sample"]
 
 @dataclass(frozen=True)
 class Sample:
-    """A reader's input. files: those that it is about, relative to the folder; arguments: of `modp-ti`, run in it."""
+    """The input of a reader.
+
+    Attributes:
+        files: The files under test, relative to the folder.
+        arguments: Arguments of `modp-ti`, which runs in the folder.
+    """
 
     reader: str
     files: tuple[str, ...]
@@ -254,7 +259,7 @@ def _write_mask(folder: Path) -> None:
 
 
 def _write_video(folder: Path) -> None:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once, by whoever comes first
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once, at the first use in the process
     writer = cv2.VideoWriter(str(folder / "room.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (WIDTH, HEIGHT))
     for i in range(FRAMES):
         writer.write(picture(i))
@@ -265,7 +270,7 @@ def _write_video(folder: Path) -> None:
 
 
 def splats() -> bytes:
-    """A map of 40 Gaussians in the 3DGS layout."""
+    """Return a map of 40 Gaussians as a 3DGS PLY."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     table = np.zeros((40, len(names)), "<f4")
@@ -277,7 +282,7 @@ def splats() -> bytes:
 
 
 def _write_run(folder: Path) -> None:
-    """The output folder of a finished run, `out`."""
+    """Write the output folder of a finished run, `out`."""
     _write_colmap_binary(folder)
     _colmap_binary(folder, inside="out/colmap")
     write_bytes(folder, "out/splats.ply", splats())
@@ -308,7 +313,7 @@ def _message(kind: int, payload: bytes = b"") -> bytes:
 
 
 def wire() -> bytes:
-    """What a tracker sends through the tracker server: three frames, a late pose and a correction."""
+    """Return a tracker's messages to the tracker server: three frames, a late pose and a correction."""
     lens = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, *[0.0] * 8]
     data = _message(1, struct.pack("<IIII12d", WIDTH, HEIGHT, 1, 0, *lens) + b"a tracker")
     poses = []
@@ -392,7 +397,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
 
 
 def write_sample(reader: str, folder: Path) -> Sample:
-    """Write a reader's input into a new folder."""
+    """Write a reader's input to a new folder."""
     sample, write = SAMPLES[reader]
     folder.mkdir(parents=True)
     write(folder)

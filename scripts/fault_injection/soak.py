@@ -1,4 +1,4 @@
-"""A soak: the demo room again and again, as one long recording, and what memory the process holds meanwhile."""
+"""Soak test: maps the demo room repeatedly as one long recording and measures the memory of the process."""
 
 from __future__ import annotations
 
@@ -20,10 +20,15 @@ WIDTH, HEIGHT = 80, 60
 
 @dataclass(frozen=True)
 class Soak:
-    """frames: that were mapped. megabytes: resident memory after each tenth of them, the keyframes' own part apart.
+    """Result of a soak test.
 
-    kept: what a keyframe and the record of a frame must hold, in megabytes, after each tenth: it grows with the
-    recording, as it has to, and is reckoned with and not measured.
+    Attributes:
+        frames: Number of mapped frames.
+        keyframes: Number of keyframes at the end.
+        gaussians: Number of Gaussians after each tenth of the frames.
+        megabytes: Resident memory after each tenth of the frames [MB].
+        kept: Memory that keyframes and frame records need after each tenth [MB]. It has to grow with the recording, and
+            is computed rather than measured.
     """
 
     frames: int
@@ -34,18 +39,24 @@ class Soak:
 
     @property
     def growth(self) -> float:
-        """Percent by which memory has grown after the first tenth."""
+        """Growth of the memory after the first tenth [%]."""
         return 100.0 * (self.megabytes[-1] / self.megabytes[0] - 1.0)
 
     @property
     def growth_of_the_rest(self) -> float:
-        """The same without what must be kept."""
+        """Growth of the memory without `kept` [%]."""
         first, last = (self.megabytes[i] - self.kept[i] for i in (0, -1))
         return 100.0 * (last / first - 1.0)
 
 
 def soak(frames: int, memory: float | None, say: Callable[[str], None]) -> Soak:
-    """Map so many frames, the demo's, there and back again without end, in so much memory [GB] (`mapping.memory`)."""
+    """Map the demo's frames back and forth until there are `frames` of them.
+
+    Args:
+        frames: Number of frames.
+        memory: Memory limit of the map [GB] (`mapping.memory`), None for no limit.
+        say: Called with progress lines.
+    """
     initialise("cpu")
     tracker = list(SyntheticTracker(width=WIDTH, height=HEIGHT))
     settings = MappingSettings(optimise=OptimiseSettings(steps=1, last_steps=1), memory=memory)
@@ -71,18 +82,18 @@ def _there_and_back(frames: list[TrackedFrame], count: int) -> Iterator[TrackedF
 
 
 def _must_be_kept(mapper: Mapper) -> int:
-    """Bytes of keyframes' images and points, and of what every frame saw."""
+    """Return the bytes of the keyframes' images and points, and of all frames' observations."""
     return mapper.pipeline.keyframes.nbytes + mapper.frames.points.nbytes
 
 
 def _resident() -> float:
-    """Megabytes of this process."""
+    """Return the resident memory of this process [MB]."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def soak_table(result: Soak) -> str:
-    """The result as Markdown."""
+    """Return the result as a Markdown table."""
     return "\n".join(
         [
             "| soak | after a tenth | at the end |",

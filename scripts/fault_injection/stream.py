@@ -1,4 +1,4 @@
-"""A recording with faulty frames in its midst, beside the same one in order: how much the map suffers."""
+"""Maps a recording with faulty frames and the intact one, to measure the loss of quality."""
 
 from __future__ import annotations
 
@@ -40,7 +40,14 @@ export: {{report: false}}
 
 @dataclass(frozen=True)
 class Stream:
-    """frames: of the recording. faulty: frames by fault. clean, faults: metrics.json of the two runs."""
+    """Result of both runs.
+
+    Attributes:
+        frames: Number of frames of the recording.
+        faulty: Indices of the faulty frames by fault.
+        clean: metrics.json of the run on the intact recording.
+        disturbed: metrics.json of the run on the corrupted one.
+    """
 
     frames: int
     faulty: dict[str, list[int]]
@@ -49,17 +56,17 @@ class Stream:
 
     @property
     def loss(self) -> float:
-        """Held-out PSNR [dB] that the faults cost."""
+        """Held-out PSNR that the faults cost [dB]."""
         return held_out(self.clean) - held_out(self.disturbed)
 
 
 def held_out(figures: dict) -> float:
-    """PSNR [dB] of the held-out frames."""
+    """Return the PSNR of the held-out frames [dB]."""
     return figures["refined"]["held_out"]["psnr"]
 
 
 def write_recording(folder: Path, frames: int, scale: float, steps: int, refine: int) -> None:
-    """The demo room as a folder of images with a trajectory in TUM's format, and the points that its tracker has."""
+    """Write the demo room as an image folder with a TUM trajectory and the tracker's points."""
     initialise("cpu")
     tracker = SyntheticTracker(width=round(320 * scale), height=round(240 * scale), frames=frames)
     (folder / "images").mkdir(parents=True)
@@ -80,11 +87,11 @@ def write_recording(folder: Path, frames: int, scale: float, steps: int, refine:
 
 
 def disturb(folder: Path, share: float, seed: int) -> dict[str, list[int]]:
-    """Corruption so many frames of a recording, none of them held out; the frames by what befell them."""
+    """Corrupt a fraction `share` of a recording's frames, none of them held out, and return their indices by fault."""
     chance = random.Random(seed)
     images = sorted((folder / "images").iterdir())
     times, poses = read_trajectory(folder / "poses.txt")
-    # Not the first ones: a recording that begins with rubbish is another matter.
+    # The first frames stay intact, since a corrupted start is a different case.
     places = [i for i in range(HOLDOUT, len(images)) if i % HOLDOUT]
     chosen = sorted(chance.sample(places, round(share * len(images))))
     kinds = [FAULTS[i % len(FAULTS)] for i in range(len(chosen))]
@@ -95,7 +102,7 @@ def disturb(folder: Path, share: float, seed: int) -> dict[str, list[int]]:
     faulty = {kind: [i for i, of in zip(chosen, kinds, strict=True) if of == kind] for kind in FAULTS}
     lines = (folder / "poses.txt").read_text(encoding="utf-8").splitlines()
     for i in faulty["pose of NaN"]:
-        lines[i + 1] = " ".join([lines[i + 1].split()[0], *["nan"] * 7])  # + 1: the heading
+        lines[i + 1] = " ".join([lines[i + 1].split()[0], *["nan"] * 7])  # + 1 for the header line
     (folder / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return faulty
 
@@ -131,7 +138,7 @@ def map_both(
     steps: int = 8,
     refine: int = 100,
 ) -> Stream:
-    """Map the recording in order, and with a tenth of its frames corrupted."""
+    """Map the intact recording, and one with a tenth of its frames corrupted."""
     shutil.rmtree(folder, ignore_errors=True)
     clean, corrupted = folder / "clean", folder / "corrupted"
     write_recording(clean, frames, scale, steps, refine)
@@ -148,7 +155,7 @@ def map_both(
 
 
 def stream_table(result: Stream) -> str:
-    """The result as Markdown."""
+    """Return the result as a Markdown table."""
     corrupted = ", ".join(f"{len(places)} {kind}" for kind, places in result.faulty.items())
     left_out = ", ".join(f"{count} {why}" for why, count in result.disturbed["frames_left_out"].items())
     return "\n".join(

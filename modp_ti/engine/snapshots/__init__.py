@@ -1,4 +1,4 @@
-"""Snapshots of a run: what is kept while it goes on, so that it can go on after it was stopped."""
+"""Snapshots: the state of a run, saved while it goes on, so that an interrupted run can be resumed."""
 
 from __future__ import annotations
 

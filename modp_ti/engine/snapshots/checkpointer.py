@@ -1,4 +1,4 @@
-"""`Checkpointer`: takes the snapshots of a run while it goes on."""
+"""`Checkpointer`: writes the snapshots of a run."""
 
 from __future__ import annotations
 
@@ -18,11 +18,23 @@ __all__ = ["Checkpointer"]
 
 
 class Checkpointer:
-    """Writes `snapshot.npz` into the output folder: when it is due, and when it is asked to.
+    """Writes `snapshot.npz` to the output folder, at the configured interval and on request.
 
-    possible: whether the run can be resumed at all. digest: of what the tracker has delivered. online: the map before
-    refinement, once there is one. refined: steps of refinement that are done. resumed: how often the run was. written,
-    failed: how many snapshots. say: called with one line where one cannot be written.
+    Args:
+        config: The scene's settings.
+        mapper: The mapper whose state is saved.
+        record: Notes for the report, saved with it.
+        clock: The run's clock.
+        say: Called with one line the first time that a snapshot cannot be written.
+
+    Attributes:
+        possible: Whether this run can be resumed at all.
+        digest: Digest of what the tracker has delivered so far.
+        online: The map before refinement, None until refinement begins.
+        refined: Number of finished refinement steps.
+        resumed: How often the run was resumed.
+        written: Number of snapshots that were written.
+        failed: Number of snapshots that could not be written.
     """
 
     def __init__(
@@ -42,23 +54,34 @@ class Checkpointer:
         self._last: Position | None = None
 
     def after_frame(self) -> None:
-        """A frame has been mapped: keep it all where so many have been since the last time."""
+        """Write a snapshot if `snapshot_every` frames have been mapped since the last one that was due."""
         if self._every and len(self._mapper.frames) % self._every == 0:
             self.keep()
 
     def after_mapping(self) -> None:
-        """All frames are mapped: refinement begins."""
+        """Write a snapshot before refinement begins, if snapshots are enabled."""
         if self._every:
             self.keep()
 
     def after_step(self, step: int, steps: int) -> None:
-        """A step of refinement is done. As many as so many keyframes take make a snapshot due, and so does the last."""
+        """Record a finished refinement step, and write a snapshot if one is due.
+
+        A snapshot is due after as many steps as `snapshot_every` keyframes take, and after the last step.
+
+        Args:
+            step: Number of the step, from 1.
+            steps: Total number of steps.
+        """
         self.refined = step
         if self._every and (step == steps or step % (self._every * self.config.mapping.optimise.steps) == 0):
             self.keep()
 
     def keep(self) -> bool:
-        """Write a snapshot of the run as it stands; whether there is one. The last one stays where this fails."""
+        """Write a snapshot of the current state. If that fails, the previous snapshot is kept.
+
+        Returns:
+            Whether a snapshot of the current state exists.
+        """
         if not self.possible:
             return False
         position = Position(self.digest.events, self.digest.value, self._mapper.finished, self.refined)
@@ -78,18 +101,22 @@ class Checkpointer:
         return True
 
     def way_on(self) -> str:
-        """What to add to a message about outputs that could not be written: how not to lose the work; "" for no way."""
+        """Return the part of an error message that says how to resume, or "" if the run cannot be resumed."""
         if not self.possible or not self.path.is_file():
             return ""
         return f"; `modp-ti run --resume {self.path.parent}` goes on from its snapshot, once that is mended"
 
     def remove(self) -> None:
-        """The run is finished and needs it no longer, nor what a kill may have left half written."""
+        """Delete the snapshot of a finished run, and the partial file that a killed process may have left."""
         for name in (FILE, FILE + ".partial"):
             self.path.with_name(name).unlink(missing_ok=True)
 
     def go_on_from(self, snapshot: Snapshot) -> None:
-        """Take over what the snapshot knows of the run, the map apart. Raises InputError where it is not whole."""
+        """Restore what a snapshot holds besides the map.
+
+        Raises:
+            InputError: If the snapshot is incomplete.
+        """
         with snapshot.fitting():
             self.online = snapshot.online()
             self.refined = snapshot.position.refined

@@ -1,4 +1,4 @@
-"""A checksum of what a tracker has delivered, by which a resumed run knows that it is given the same again."""
+"""A checksum of the tracker's output. A resumed run uses it to verify that it receives the same input again."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ __all__ = ["StreamDigest"]
 
 
 class StreamDigest:
-    """value: CRC-32 of all frames and corrections so far, in their order; events: how many."""
+    """Checksum of frames and corrections.
+
+    Attributes:
+        value: CRC-32 of all frames and corrections so far, in order.
+        events: Their number.
+    """
 
     def __init__(self) -> None:
         self.value = 0
         self.events = 0
 
     def add(self, event: TrackedFrame | PoseCorrection) -> None:
-        """Take in the next one. Of a held-out frame the image does not count, for it does not touch the map."""
+        """Add a frame or correction. The image of a held-out frame is left out, as it does not affect the map."""
         self.events += 1
         if isinstance(event, PoseCorrection):
             self._take(event.index, event.T_camera_world, event.ids, event.xyz)

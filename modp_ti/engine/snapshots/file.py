@@ -1,7 +1,7 @@
-"""The file of a snapshot: NumPy's .npz of plain arrays, one of which is JSON. Nothing in it is ever run.
+"""The snapshot file: an uncompressed .npz of plain arrays, one of which holds JSON. It contains no executable code.
 
-The archive is read by its own rules and not by `numpy.load`: every array must be stored as it is, and as long as its
-header says, before anything of its size is made.
+The reader does not use `numpy.load`, because the file may be damaged or hostile. Before it allocates an array, it
+checks that the entry is stored uncompressed and has the length that its header states.
 """
 
 from __future__ import annotations
@@ -24,16 +24,22 @@ from modp_ti.files.errors import InputError
 __all__ = ["FILE", "VERSION", "read_arrays", "write_arrays"]
 
 FILE = "snapshot.npz"
-# Of what stands in the arrays and in the JSON. A file of another version is refused: it holds the state of other code.
+# Version of the arrays and the JSON. Other versions are refused, as they hold the state of different code.
 VERSION = 1
 ABOUT = "about"
 KINDS = "biuf"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) -> None:
-    """Write arrays of numbers by name, and what JSON can hold; the file before stays until this one is on the disk.
+    """Write named arrays of numbers and a JSON object. The previous file is replaced only once the new one is on disk.
 
-    Raises OSError where it cannot be written.
+    Args:
+        path: The file.
+        arrays: Arrays by name.
+        about: Content of the JSON object.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     text = json.dumps({"version": VERSION, **about}).encode("utf-8")
     with replacing(path) as file:
@@ -41,9 +47,16 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, 
 
 
 def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """The arrays and the JSON of a file that `write_arrays` wrote.
+    """Read a file that `write_arrays` wrote.
 
-    Raises InputError (one line) for a file that is missing, damaged, none of ours or of another version.
+    Args:
+        path: The file.
+
+    Returns:
+        The arrays by name, and the JSON object.
+
+    Raises:
+        InputError: If the file is missing, damaged, not a snapshot, or of another version. The message has one line.
     """
     try:
         size = os.path.getsize(path)
@@ -78,7 +91,7 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int) -> NDArray:
-    data = archive.read(info)  # at most as long as the file; its checksum is looked at
+    data = archive.read(info)  # at most the file's size; zipfile verifies the CRC
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):

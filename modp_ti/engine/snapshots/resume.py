@@ -1,4 +1,4 @@
-"""Going on from a snapshot: its settings, and the frames that it was made of, read again."""
+"""Resuming a run: load the settings of its snapshot, and read again the frames that it was made from."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from modp_ti.files.errors import InputError
 
 __all__ = ["load_resumed", "replay"]
 
-# Settings that may be others than they were: the map is the same.
+# Settings that may change on resuming, since the map does not depend on them.
 FREE = (
     "output",
     "threads",
@@ -33,10 +33,18 @@ FREE = (
 
 
 def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> tuple[SceneConfig, Snapshot]:
-    """The snapshot in the output folder, and the settings to go on with.
+    """Read the snapshot in an output folder and the settings to continue with.
 
-    Those are the snapshot's own, or of a scene file where one is named, with the overrides. Raises InputError where
-    there is no snapshot, it cannot be used, or a setting that the map depends on is another one.
+    Args:
+        output: The output folder of the interrupted run.
+        scene: Scene file to take the settings from, None for those of the snapshot.
+        overrides: `KEY=VALUE` settings that override them.
+
+    Returns:
+        The settings and the snapshot.
+
+    Raises:
+        InputError: If there is no usable snapshot, or a setting that the map depends on has changed.
     """
     file = output / FILE
     if not file.is_file():
@@ -64,7 +72,7 @@ def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> 
 
 
 def _leaves(data: dict[str, Any], start: str = "") -> dict[str, Any]:
-    """Values by dotted keys."""
+    """Flatten nested settings to dotted keys."""
     leaves: dict[str, Any] = {}
     for key, value in data.items():
         leaves |= _leaves(value, f"{start}{key}.") if isinstance(value, dict) else {f"{start}{key}": value}
@@ -74,10 +82,16 @@ def _leaves(data: dict[str, Any], start: str = "") -> dict[str, Any]:
 def replay(
     snapshot: Snapshot, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest
 ) -> None:
-    """Take from the tracker what the snapshot was made of, and give the mapper back its state.
+    """Read the snapshot's frames from the tracker again, and restore the mapper's state.
 
-    digest: fresh; it then stands where the snapshot was taken. Raises InputError where the tracker now delivers
-    something else, and for a snapshot whose parts do not fit.
+    Args:
+        snapshot: The snapshot.
+        mapper: A new mapper with the snapshot's settings.
+        arriving: The tracker's frames and corrections from the start. Those of the snapshot are consumed.
+        digest: A new digest. It ends up at the snapshot's position.
+
+    Raises:
+        InputError: If the tracker now delivers different data, or the parts of the snapshot do not fit together.
     """
     position = snapshot.position
 

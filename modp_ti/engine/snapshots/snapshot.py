@@ -1,4 +1,4 @@
-"""`Snapshot`: everything that a stopped run needs to go on, as arrays and numbers, and the run's parts from it."""
+"""`Snapshot`: the complete state of a run as arrays and numbers, with conversions to and from the run's objects."""
 
 from __future__ import annotations
 
@@ -26,9 +26,13 @@ UNKNOWN = np.full((3, 4), np.nan)
 
 @dataclass(frozen=True)
 class Position:
-    """Where in the run it was taken. events: frames and corrections that the tracker had delivered; digest: of them.
+    """The point in a run at which a snapshot was taken.
 
-    finished: whether the map had had what follows its last frame. refined: steps of refinement.
+    Attributes:
+        events: Number of frames and corrections that the tracker had delivered.
+        digest: Their `StreamDigest`.
+        finished: Whether `Mapper.finish` had run.
+        refined: Number of finished refinement steps.
     """
 
     events: int
@@ -39,9 +43,14 @@ class Position:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """settings: the run's, resolved, as JSON. groups: arrays by names `group.name`. numbers: what JSON can hold.
+    """The saved state of a run.
 
-    path: where it lies, for messages.
+    Attributes:
+        path: Where the file is, for messages.
+        settings: The run's resolved settings, as JSON.
+        position: The point in the run at which it was taken.
+        arrays: Arrays with names of the form `group.name`.
+        numbers: Everything else, as JSON.
     """
 
     path: Path
@@ -55,13 +64,21 @@ class Snapshot:
         return MapState(self.arrays, self.numbers["map"])
 
     def write(self) -> None:
-        """Write it in place of the one before. Raises OSError where it cannot be written."""
+        """Write the file, replacing the previous snapshot.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
         about = {"settings": self.settings, "position": asdict(self.position), "numbers": self.numbers}
         write_arrays(self.path, self.arrays, about)
 
     @classmethod
     def read(cls, path: Path) -> Snapshot:
-        """The snapshot of that file. Raises InputError (one line) where it cannot be used."""
+        """Read a snapshot.
+
+        Raises:
+            InputError: If the file cannot be used. The message has one line.
+        """
         arrays, about = read_arrays(path)
         try:
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
@@ -71,14 +88,19 @@ class Snapshot:
 
     @contextmanager
     def fitting(self) -> Iterator[None]:
-        """While its parts are put to use: what does not fit together is refused in one line, as InputError."""
+        """Convert errors inside this context to a one-line InputError saying that the parts do not fit together."""
         try:
             yield
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
             raise _unfit(self.path, error) from None
 
     def frames(self) -> DeliveredFrames:
-        """What had been kept of the frames. Raises KeyError or ValueError where it is not whole."""
+        """Return the metadata of the frames.
+
+        Raises:
+            KeyError: If it is incomplete.
+            ValueError: If it is inconsistent.
+        """
         state = MapState(self.arrays, self.numbers["frames"])
         rows, points = state.group("frames"), state.group("points")
         frames = DeliveredFrames(
@@ -96,7 +118,7 @@ class Snapshot:
         return frames
 
     def online(self) -> MapVersion | None:
-        """The map as it was before refinement; None where that had not begun."""
+        """Return the map before refinement, or None if refinement had not begun."""
         state = MapState(self.arrays, self.numbers["online"] or {})
         gaussians, poses = state.group("online"), state.group("online_poses")
         if not gaussians:
@@ -105,7 +127,7 @@ class Snapshot:
         return MapVersion(gaussians, list(poses["T"]), exposures, int(state.numbers["view_renders"]))
 
     def record(self, record: RunRecord) -> None:
-        """Put what had been noted so far into a fresh record."""
+        """Copy the saved notes into a new record."""
         state = MapState(self.arrays, {})
         rows = state.group("record")
         columns = [rows[name].tolist() for name in ("index", "held_out", "is_keyframe", "done", "gaussians")]
@@ -123,7 +145,7 @@ def _unfit(path: Path, error: Exception) -> InputError:
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:
-    """What `Snapshot.frames` gives back."""
+    """Inverse of `Snapshot.frames`."""
     cameras = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in frames.camera]
     rows = {
         "index": np.array(frames.index, dtype=np.int64),
@@ -137,7 +159,7 @@ def frames_state(frames: DeliveredFrames) -> MapState:
 
 
 def version_state(version: MapVersion | None) -> MapState:
-    """What `Snapshot.online` gives back."""
+    """Inverse of `Snapshot.online`."""
     if version is None:
         return MapState({}, {})
     poses = {
@@ -148,7 +170,7 @@ def version_state(version: MapVersion | None) -> MapState:
 
 
 def record_state(record: RunRecord) -> MapState:
-    """What `Snapshot.record` gives back."""
+    """Inverse of `Snapshot.record`."""
     notes = record.frames
     rows = {
         "index": np.array([note.index for note in notes], dtype=np.int64),

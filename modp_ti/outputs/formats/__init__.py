@@ -1,1 +1,1 @@
-"""What a run leaves: one file per output format."""
+"""Readers and writers of the output files, one module per format."""

@@ -1,4 +1,4 @@
-"""A run as a COLMAP model: its cameras, the refined poses of all frames and the tracked points with what saw them."""
+"""Writes a run as a COLMAP model: cameras, refined poses of all frames, and tracked points with their observations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ __all__ = ["image_names", "write_colmap", "write_image"]
 
 
 def image_names(names: Sequence[str], written: bool) -> list[str]:
-    """What the model calls the frames of these names: the same, or as PNG files where their images are `written`."""
+    """Return the image names of the model.
+
+    Args:
+        names: Names of the frames.
+        written: Whether the images are written as well. The names then end in `.png`.
+    """
     if not written:
         return list(names)
     renamed = [str(PurePosixPath(name).with_suffix(".png")) for name in names]
@@ -33,11 +38,17 @@ def write_colmap(
     poses: Sequence[NDArray[np.float64]],
     points: TrackedPoints,
 ) -> None:
-    """Write `cameras`, `images` and `points3D` (.bin) of frames with their T_camera_world (4, 4) into a new folder.
+    """Write a COLMAP model (`cameras.bin`, `images.bin`, `points3D.bin`) to a new folder.
 
-    Cameras are those of the mapped images, PINHOLE. Images are numbered from 1 in their order, points from 1 in the
-    order in which frames saw them first. Points are where the tracker has them; their errors are those under the given
-    poses.
+    Images are numbered from 1 in their order, and points from 1 in the order of their first observation. Point
+    positions are those of the tracker. The stored errors are reprojection errors under `poses`.
+
+    Args:
+        folder: The folder to create.
+        names: Names of the images.
+        cameras: PINHOLE camera of each undistorted image.
+        poses: T_camera_world (4, 4) of each image.
+        points: Tracked points with the pixels of each frame.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -73,9 +84,9 @@ def write_colmap(
 
 
 def write_image(folder: Path, name: str, frame: TrackedFrame) -> None:
-    """Write the frame's undistorted image as `images/name` (PNG), and its mask, where it has one, as `masks/name.png`.
+    """Write a frame's undistorted image as `images/NAME` (PNG), and its mask, if any, as `masks/NAME.png`.
 
-    Masks are COLMAP's: black where a pixel is ignored.
+    Masks follow COLMAP's convention: ignored pixels are black.
     """
     target = folder / "images" / name
     target.parent.mkdir(parents=True, exist_ok=True)

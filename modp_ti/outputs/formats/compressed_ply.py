@@ -1,12 +1,13 @@
-"""Compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, in chunks of 256 with their own ranges.
+"""Compressed PLY of PlayCanvas and SuperSplat: 16 bytes per Gaussian, in chunks of 256 with their own value ranges.
 
-    chunk   18 x float32: least and largest position, then log scale, then colour of its Gaussians
+    chunk   18 x float32: minimum and maximum of position, then log scale, then colour of its Gaussians
     vertex  uint32 packed_position, packed_rotation, packed_scale, packed_color
-    sh      uchar f_rest_0 ...: one step of 8 / 256 from -4, all of red first; only where there are any
+    sh      uchar f_rest_0 ...: steps of 8 / 256 from -4, all of red first; only if the map has them
 
-Positions and log scales: x, y, z in 11, 10, 11 bits between the chunk's least and largest. Colour: red, green, blue
-(0.5 + 0.2820948 f_dc) between them and opacity in 8 bits each. Rotation: the largest of w, x, y, z by its number in two
-bits, then the others in their order in 10 bits each, from -sqrt(1/2) to sqrt(1/2). First named, highest bits.
+Positions and log scales store x, y, z in 11, 10, 11 bits between the chunk's minimum and maximum. The colour word
+stores red, green, blue (0.5 + 0.2820948 f_dc) between their bounds and the opacity, in 8 bits each. The rotation word
+stores the index of the largest of w, x, y, z in two bits, then the other three in order in 10 bits each, from
+-sqrt(1/2) to sqrt(1/2). The first value of a word is in the highest bits.
 """
 
 from __future__ import annotations
@@ -31,12 +32,17 @@ RANGES = [
     for bound in ("min", "max")
     for name in names
 ]
-# Log scales beyond are no sizes of anything.
+# Log scales are clipped to this magnitude; larger ones are not meaningful.
 LARGEST_LOG_SCALE = 20.0
 
 
 def write_compressed_ply(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
-    """Write Gaussians as `GaussianField.to_numpy` gives them, in another order: neighbours in space share a chunk."""
+    """Write Gaussians, reordered so that neighbours in space share a chunk.
+
+    Args:
+        path: The file.
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+    """
     order = _morton_order(state["position"])
     state = {name: values[order] for name, values in state.items()}
     first = np.arange(0, len(order), CHUNK)
@@ -68,7 +74,7 @@ def write_compressed_ply(path: str | os.PathLike[str], state: Mapping[str, NDArr
 
 
 def _packed(parts: NDArray[np.float64] | list[NDArray[np.float64]], bits: tuple[int, ...]) -> NDArray[np.uint32]:
-    """Numbers in [0, 1], each in so many bits of one word, the first in the highest."""
+    """Pack numbers in [0, 1] into one word with the given bits each, the first in the highest bits."""
     word = np.zeros(len(parts[0]), np.uint32)
     for part, count in zip(parts, bits, strict=True):
         word = word << np.uint32(count) | to_bits(part, count)
@@ -76,7 +82,7 @@ def _packed(parts: NDArray[np.float64] | list[NDArray[np.float64]], bits: tuple[
 
 
 def _morton_order(position: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Order (N,) along a curve that keeps neighbours together: by the interleaved bits of ten a coordinate."""
+    """Return the order (N,) along a Morton curve with 10 bits per coordinate."""
     if len(position) == 0:
         return np.zeros(0, np.int64)
     low, high = position.min(axis=0), position.max(axis=0)

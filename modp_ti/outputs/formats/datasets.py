@@ -1,4 +1,4 @@
-"""A finished run as a data set to train on elsewhere: images with a COLMAP model, or with a transforms.json."""
+"""Writes a finished run as a data set for training elsewhere: images with a COLMAP model or a transforms.json."""
 
 from __future__ import annotations
 
@@ -18,13 +18,17 @@ from modp_ti.files.errors import InputError
 
 __all__ = ["dataset_folder", "rename_images", "write_transforms"]
 
-# From OpenCV's axes of a camera to OpenGL's.
+# Converts OpenCV camera axes to OpenGL camera axes.
 OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @contextmanager
 def dataset_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `folder` at the end. Raises InputError where that holds something."""
+    """Yield a temporary folder that becomes `folder` on exit.
+
+    Raises:
+        InputError: If `folder` exists and is not empty.
+    """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; name a new folder (--output), or remove it")
     partial = folder.with_name(folder.name + ".partial")
@@ -40,7 +44,13 @@ def dataset_folder(folder: Path) -> Iterator[Path]:
 
 
 def rename_images(model: Path, target: Path, names: Sequence[str]) -> None:
-    """Write the COLMAP model of a run into the new folder `target`, its images called `names`, in their order."""
+    """Copy a COLMAP model with new image names.
+
+    Args:
+        model: Folder of the model.
+        target: Folder to create.
+        names: New names of the images, in their order.
+    """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     reconstruction = pycolmap.Reconstruction(str(model))
@@ -58,10 +68,18 @@ def write_transforms(
     held_out: Sequence[int],
     points: str,
 ) -> None:
-    """Write `transforms.json` beside `images/` (and `masks/`) of frames with T_camera_world (4, 4).
+    """Write nerfstudio's `transforms.json` for the images in `images/` and the masks in `masks/`.
 
-    Its matrices are camera to world with OpenGL's axes of the camera (x right, y up, z back); the world is that of the
-    poses. held_out: positions of the frames that nerfstudio is to test on. points: name of a PLY file to begin with.
+    Its matrices are camera to world with OpenGL camera axes (x right, y up, z back). The world frame is that of
+    `poses`.
+
+    Args:
+        folder: The data set's folder.
+        names: Names of the images.
+        cameras: Camera of each image.
+        poses: T_camera_world (4, 4) of each image.
+        held_out: Positions of the images for testing.
+        points: Name of a PLY file with initial points.
     """
     one = len(set(cameras)) == 1
     data: dict[str, object] = {"camera_model": "OPENCV", **(_intrinsics(cameras[0]) if one else {})}
@@ -77,8 +95,8 @@ def write_transforms(
     if held_out:
         tested = {files[index] for index in held_out}
         data["train_filenames"] = [file for file in files if file not in tested]
-        # The same frames twice: nerfstudio looks at `val` while it trains and at `test` when it evaluates, and where
-        # one split is listed it refuses a set without the others.
+        # Validation and test share the held-out frames. nerfstudio uses `val` during training and `test` for
+        # evaluation, and requires all splits if one is listed.
         data["val_filenames"] = data["test_filenames"] = [file for file in files if file in tested]
     data["frames"] = frames
     (folder / "transforms.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

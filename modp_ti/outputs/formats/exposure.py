@@ -23,9 +23,14 @@ def write_exposures(
     exposures: Sequence[NDArray[np.float64]],
     keyframes: set[int],
 ) -> None:
-    """Write (A, b) (3, 4) of every frame: it shows A colour + b where the map holds `colour`.
+    """Write the exposure (A, b) of every frame, which maps the map's `colour` to A colour + b.
 
-    keyframes: indices of the frames whose exposure was estimated; those of the others lie between.
+    Args:
+        path: The file.
+        indices: Indices of the frames.
+        timestamps: Their time stamps [s].
+        exposures: (3, 4) matrix (A, b) of each frame.
+        keyframes: Indices of the frames whose exposure was estimated. The others are interpolated.
     """
     frames = [
         {
@@ -41,7 +46,11 @@ def write_exposures(
 
 
 def read_exposures(path: Path) -> dict[int, NDArray[np.float64]]:
-    """(A, b) (3, 4) by index of the frame; none where there is no file. Raises InputError for a damaged one."""
+    """Read exposures (A, b) (3, 4) by frame index. The result is empty if the file does not exist.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
     if not path.is_file():
         return {}
     try:

@@ -1,4 +1,4 @@
-"""`frames.json`: what later commands must know of a run and no other of its files says."""
+"""`frames.json`: facts about a run that later commands need and no other file contains."""
 
 from __future__ import annotations
 
@@ -17,9 +17,13 @@ __all__ = ["FramesRecord", "read_frames", "write_frames"]
 
 @dataclass(frozen=True)
 class FramesRecord:
-    """near: depth below which nothing was drawn. scene_depth: median depth of what the keyframes see [scene units].
+    """Content of `frames.json`.
 
-    keyframes, held_out: which frames are, as rising indices into the lines of trajectory.txt.
+    Attributes:
+        near: Depth below which nothing is drawn [scene units].
+        scene_depth: Median depth of the keyframes' views [scene units].
+        keyframes: Ascending positions of the keyframes in trajectory.txt.
+        held_out: Ascending positions of the held-out frames in trajectory.txt.
     """
 
     near: float
@@ -31,7 +35,7 @@ class FramesRecord:
 def write_frames(
     path: Path, near: float, scene_depth: float, keyframes: Collection[int], held_out: Collection[int]
 ) -> None:
-    """Write the record; numbers have the digits that give them back exactly."""
+    """Write the record. Numbers are written with enough digits to be read back exactly."""
     lists = {"keyframes": sorted(keyframes), "held_out": sorted(held_out)}
     lines = [f'"{name}": {json.dumps(value)}' for name, value in lists.items()]
     text = ",\n ".join([f'"near": {float(near)!r}', f'"scene_depth": {float(scene_depth)!r}', *lines])
@@ -39,7 +43,11 @@ def write_frames(
 
 
 def read_frames(path: Path, count: int) -> FramesRecord:
-    """The record of a run of `count` frames. Raises InputError for a file that is none."""
+    """Read the record of a run of `count` frames.
+
+    Raises:
+        InputError: If the file is damaged or does not fit `count`.
+    """
     try:
         data = read_json(path, "of a finished run")
         record = FramesRecord(

@@ -1,12 +1,12 @@
-"""Binary glTF 2.0 (`.glb`) of one mesh with vertex colours.
+"""Writes a mesh with vertex colours as binary glTF 2.0 (`.glb`).
 
-Open3D's own writer puts the numbers as text into the JSON part, which most readers refuse.
+Open3D's own writer puts the buffers as text into the JSON part, which most readers refuse.
 
     12 bytes    "glTF", version 2, length of the file
-    JSON chunk  what the buffer holds, padded with spaces to four bytes
-    BIN chunk   indices uint32 | positions 3 x float32 | colours 4 x uint16, linear as glTF has them
+    JSON chunk  layout of the buffer, padded with spaces to four bytes
+    BIN chunk   indices uint32 | positions 3 x float32 | colours 4 x uint16, linear as glTF requires
 
-Little-endian. The material is unlit: the colours are those of the photographs, light and shadow are in them already.
+All numbers are little-endian. The material is unlit, because the colours from photographs already contain the shading.
 """
 
 from __future__ import annotations
@@ -29,7 +29,14 @@ TRIANGLES, VERTICES, INDICES = 4, 34962, 34963
 def write_glb(
     path: str | os.PathLike[str], vertices: NDArray, triangles: NDArray, colours: NDArray[np.floating]
 ) -> None:
-    """Write vertices (V, 3) with y up, triangles (T, 3) and the vertices' colours (V, 3), sRGB in [0, 1]."""
+    """Write a mesh.
+
+    Args:
+        path: The file.
+        vertices: (V, 3) positions with y up.
+        triangles: (T, 3) vertex indices.
+        colours: (V, 3) sRGB colours in [0, 1].
+    """
     positions = np.ascontiguousarray(vertices, "<f4")
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     rgba = np.ones((len(positions), 4))
@@ -71,6 +78,6 @@ def write_glb(
     }
     head = json.dumps(document, separators=(",", ":")).encode("ascii")
     head += b" " * (-len(head) % 4)
-    body = b"".join(parts)  # every part is a multiple of four bytes
+    body = b"".join(parts)  # the length of every part is a multiple of four bytes
     chunks = struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(body), b"BIN\0") + body
     replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)

@@ -1,4 +1,4 @@
-"""A map as a folder: what every map leaves, and how a folder's files are put in place together."""
+"""Writes the files of a map to a folder, so that they appear together."""
 
 from __future__ import annotations
 
@@ -26,10 +26,12 @@ LAST = "metrics.json"
 
 @contextmanager
 def appearing(output: Path) -> Iterator[Path]:
-    """An empty folder to write into; what it holds goes into `output`, over what is there, once all went well.
+    """Yield an empty temporary folder whose content moves to `output` on exit, replacing files of the same name.
 
-    `metrics.json`, where there is one, goes last: a folder that has it has all the rest. Raises InputError where it
-    cannot be written.
+    `metrics.json` moves last, so that a folder that contains it is complete.
+
+    Raises:
+        InputError: If the files cannot be written.
     """
     folder = output.with_name(output.name + ".partial")
     shutil.rmtree(folder, ignore_errors=True)
@@ -60,7 +62,13 @@ def write_map(
 ) -> None:
     """Write `splats.ply`, `trajectory.txt`, `frames.json`, `colmap/` and, with estimated exposures, `exposure.json`.
 
-    names: of the frames in the COLMAP model. near: depth below which nothing is drawn.
+    Args:
+        folder: An existing folder.
+        version: The map.
+        frames: Metadata and points of all frames.
+        names: Image names for the COLMAP model.
+        keyframes: The map's keyframes.
+        near: Depth below which nothing is drawn [scene units].
     """
     indices = {keyframe.index for keyframe in keyframes}
     write_splats(folder / "splats.ply", version.gaussians)

@@ -1,10 +1,10 @@
-"""Depth of rendered views, corrected by matching the images of neighbouring frames.
+"""Multi-view stereo that corrects the depth of rendered views.
 
-A map is optimised for colour: where there is little texture, its Gaussians stay at the depth that they were given,
-whole regions of them some percent off, and all views agree on it. The images hold the parallax all the same; so do,
-less sharp, the map's own pictures. Around the depth that the map shows, inverse depths are swept [Collins 1996]:
-every neighbour's image is carried over and compared (ZNCC); sums of matching cost along rows and columns decide
-[Hirschmueller 2008], and the map where the images say nothing.
+A map is optimised for colour. In regions with little texture, Gaussians stay at their initial depth, which may be some
+percent off, and all views agree on the wrong depth. The images still contain the parallax, and so do, less sharply,
+pictures rendered from the map. Inverse depths around the map's are swept [Collins 1996]: each neighbour's image is
+warped to the view and compared by ZNCC. Matching costs are aggregated along rows and columns [Hirschmueller 2008].
+Where the images are ambiguous, the map's depth is kept.
 """
 
 from __future__ import annotations
@@ -21,31 +21,33 @@ from fields.geometry.se3 import inverse_se3
 
 __all__ = ["DepthView", "agreed_depth", "choose_neighbours", "matched_depth"]
 
-# Neighbours a view is compared with: as many before and after it, half of them at each of these parallaxes (the
-# baseline over the median depth), as near as there are.
+# Number of neighbours of a view, and the preferred parallaxes (baseline over median depth). Each parallax gets a third
+# of the neighbours, if possible as many before the view as after it.
 PARALLAXES = (0.25, 0.12, 0.06)
 NEIGHBOURS = 12
-# No neighbour looks more than this away (cosine of the angle), or from within or beyond these parallaxes.
+# Limits for neighbours: cosine of the angle between the optical axes, and parallax.
 LEAST_COSINE = 0.7
 LEAST_PARALLAX, LARGEST_PARALLAX = 0.015, 0.4
-# Steps of inverse depth to either side, of a pixel in the most distant neighbour: a wide sweep, then those around it.
+# Number of sweep steps to either side, one pixel in the most distant neighbour each: a wide sweep, then two narrow
+# ones.
 SWEEPS = (16, 6, 3)
-# Side of the compared windows [px], and what is added to their variance: contrast of less says nothing. (Large windows
-# make things wider: beside its edge, a thing's outline is seen in the window of what is behind it. Of the demo room's
-# mesh, 88 percent of the vertices were true with windows of 3 and 83 with windows of 5. Where fewer than half of the
-# neighbours are there, as in a short run, small ones are too noisy.)
+# Side of the matching windows [px], and a constant added to their variance, which suppresses weaker contrast. Large
+# windows enlarge objects, because an object's outline falls into the windows of the background next to it: on the demo
+# room's mesh, 88 percent of the vertices were correct with windows of 3, and 83 with windows of 5. With fewer than half
+# of the neighbours, as in a short run, small windows are too noisy.
 WINDOW, WINDOW_OF_FEW = 3, 7
 LEAST_VARIANCE = 1e-5
-# Costs are 1 - ZNCC. Of a change by one step between neighbouring pixels, of a larger one where their grey is the same
-# and falls off with this difference, and of the ends of the sweep beside its middle, where the map is. (The last only
-# decides where nothing else does: with 0.05, whole regions stayed where the map has them.)
+# Costs are 1 - ZNCC. Penalties: a change by one step between adjacent pixels; a larger change, which decreases with
+# their grey difference on the scale GREY_EDGE; and the distance from the map's depth, relative to the sweep's range.
+# The last one only breaks ties: with 0.05, whole regions stayed at the map's depth.
 SMALL_JUMP, LARGE_JUMP, GREY_EDGE = 0.1, 0.8, 0.05
 MAP_WEIGHT = 0.002
-# Kept is a depth that as many neighbours find at the same place to this share of it.
+# A depth is kept if this many neighbours find the same place within this relative tolerance.
 AGREEING = 1
 AGREEMENT = 0.02
-# A view of which a smaller share agrees with its neighbours keeps all: of a short run, a poor mesh is better than none.
-# (Of nine frames of 80x60 it was 16 to 26 percent, hardly more than by chance; of two rooms' frames 64 and more.)
+# A view keeps all its depths if a smaller fraction agrees with its neighbours: for a short run, a poor mesh is better
+# than none. The fraction was 16 to 26 percent for nine frames of 80x60, hardly more than chance, and 64 percent and
+# more for the frames of two rooms.
 LEAST_AGREED = 0.5
 
 Image = NDArray[np.float32]
@@ -53,7 +55,14 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DepthView:
-    """A camera at T_camera_world (4, 4), its grey image (H, W) in [0, 1], and z (H, W), 0 where unknown."""
+    """A view to be matched.
+
+    Attributes:
+        camera: The view's camera.
+        T_camera_world: (4, 4) pose.
+        grey: (H, W) grey image in [0, 1].
+        depth: (H, W) z, 0 where unknown.
+    """
 
     camera: PinholeCamera
     T_camera_world: NDArray[np.float64]
@@ -62,7 +71,7 @@ class DepthView:
 
 
 def choose_neighbours(views: Sequence[DepthView], index: int) -> list[int]:
-    """Which views one is compared with; fewer than NEIGHBOURS where there are no more."""
+    """Return the indices of the views to match a view with, at most NEIGHBOURS."""
     view = views[index]
     median = float(np.median(view.depth[view.depth > 0])) if (view.depth > 0).any() else 1.0
     rated = []
@@ -82,17 +91,20 @@ def choose_neighbours(views: Sequence[DepthView], index: int) -> list[int]:
 
 
 def matched_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[int]) -> Image:
-    """Depth (H, W) of a view, corrected by its neighbours; its own where it has none."""
+    """Return the depth (H, W) of a view, corrected by matching its neighbours.
+
+    Without neighbours or known depth, the view's own depth is returned.
+    """
     view = views[index]
     known = view.depth > 0
     if not neighbours or not known.any():
         return view.depth
     inverse = 1.0 / np.where(known, view.depth, np.median(view.depth[known]))
     warps = [_warp(view, views[other]) for other in neighbours]
-    # By such a step, what is seen from the most distant neighbour moves by a pixel or so.
+    # One step of inverse depth moves a pixel by about one pixel in the most distant neighbour.
     step = np.float32(1.0 / max(float(np.linalg.norm(b[:2])) for _, b in warps))
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # thousands of small pictures: waiting for other threads takes longer than the work
+    cv2.setNumThreads(1)  # for thousands of small pictures, waiting for other threads takes longer than the work
     try:
         inverse = _swept(view, [views[other] for other in neighbours], warps, inverse, step)
     finally:
@@ -101,9 +113,9 @@ def matched_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[i
 
 
 def agreed_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[int]) -> Image:
-    """Depth (H, W) of a view where AGREEING neighbours show the same place, 0 elsewhere.
+    """Return the depth (H, W) of a view where AGREEING neighbours have the same surface, 0 elsewhere.
 
-    All of it where hardly any of the view is agreed on (LEAST_AGREED).
+    If less than LEAST_AGREED of the view agrees, all of its depth is returned.
     """
     view = views[index]
     row, column = np.nonzero(view.depth > 0)
@@ -127,7 +139,7 @@ def agreed_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[in
 
 
 def _warp(view: DepthView, other: DepthView) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A (3, 3) and b (3,): pixel (x, y) at inverse depth w is seen at A (x, y, 1) + w b, homogeneous, in `other`."""
+    """Return A (3, 3), b (3,): pixel (x, y) at inverse depth w is at A (x, y, 1) + w b (homogeneous) in `other`."""
     T = other.T_camera_world @ inverse_se3(view.T_camera_world)
     K = other.camera.matrix()
     A = K @ T[:3, :3] @ np.linalg.inv(view.camera.matrix())
@@ -141,9 +153,9 @@ def _swept(
     inverse: NDArray[np.floating],
     step: np.float32,
 ) -> Image:
-    """Inverse depth (H, W) near `inverse` at which the others' pictures fit, found in steps."""
+    """Sweep around `inverse` and return the inverse depth (H, W) with the least smoothed matching cost."""
     for reach in SWEEPS:
-        # Smooth, so that a window is carried over as one piece of a surface, but for edges.
+        # Smoothing except at edges, so that a window is warped as one piece of surface.
         inverse = cv2.medianBlur(inverse.astype(np.float32), 3)
         inverse = cv2.bilateralFilter(inverse, -1, 0.03 * float(np.median(inverse)), 6)
         offsets = np.arange(-reach, reach + 1, dtype=np.float32)
@@ -160,9 +172,9 @@ def _matching_cost(
     inverse: Image,
     offsets: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """1 - ZNCC (H, W, D) at inverse depths inverse (H, W) + offsets (D,), as the mean of the views that see it.
+    """Return 1 - ZNCC (H, W, D) at inverse depths inverse (H, W) + offsets (D,), averaged over the views.
 
-    1 where none does.
+    Only views that see the pixel count. The cost is 1 if there are none.
     """
     height, width = view.grey.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
@@ -179,7 +191,7 @@ def _matching_cost(
             )
             there, spread = _moments(carried, window)
             together = cv2.blur(view.grey * carried, (window, window)) - mean * there
-            seen = there >= 0.0  # no part of the window is outside
+            seen = there >= 0.0  # the whole window is inside
             score = together / np.sqrt((variance + LEAST_VARIANCE) * (spread + LEAST_VARIANCE))
             total[d] += np.where(seen, 1.0 - score, 0.0)
             count[d] += seen
@@ -188,13 +200,13 @@ def _matching_cost(
 
 
 def _moments(grey: Image, window: int) -> tuple[Image, Image]:
-    """Mean and variance (H, W) of the window around every pixel."""
+    """Return mean and variance (H, W) of the window around each pixel."""
     mean = cv2.blur(grey, (window, window))
     return mean, np.maximum(cv2.blur(grey * grey, (window, window)) - mean * mean, 0.0)
 
 
 def _smoothed(cost: NDArray[np.float32], grey: Image) -> NDArray[np.float32]:
-    """The costs (H, W, D) of the best ways to every pixel along its row and its column, from both sides, added up."""
+    """Sum the costs (H, W, D) of the best paths to each pixel along its row and column, from both sides."""
     total = np.zeros_like(cost)
     for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
         source, picture, target = (a.swapaxes(0, axis)[::step] for a in (cost, grey, total))
@@ -212,7 +224,7 @@ def _smoothed(cost: NDArray[np.float32], grey: Image) -> NDArray[np.float32]:
 
 
 def _least(cost: NDArray[np.float32]) -> Image:
-    """Place (H, W) of the least of the costs (H, W, D), between steps by a parabola."""
+    """Return the index (H, W) of the least cost (H, W, D), with a parabola fit between steps."""
     best = np.clip(cost.argmin(axis=2), 1, cost.shape[2] - 2)[..., None]
     left, middle, right = (np.take_along_axis(cost, best + k, axis=2)[..., 0] for k in (-1, 0, 1))
     curvature = np.maximum(left + right - 2.0 * middle, 1e-6)

@@ -1,6 +1,6 @@
-"""`mesh.ply`: the map's surface, by fusing depth seen from many places into a truncated signed distance field.
+"""Extracts the map's surface as a mesh by fusing depth views into a truncated signed distance field.
 
-[Curless and Levoy 1996], in Open3D's voxel block grid: only blocks of voxels near a surface exist.
+The method is that of [Curless and Levoy 1996], in Open3D's sparse voxel block grid.
 """
 
 from __future__ import annotations
@@ -30,25 +30,32 @@ __all__ = [
 ]
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
-# The distance is kept up to this many voxels before and behind the surface. (More makes corners round, and the two
-# sides of thin things one: of the demo room's mesh, five instead of three took four percent of the true vertices.)
+# Truncation distance in voxels before and behind the surface. Larger values round off corners and merge the two sides
+# of thin objects: with five instead of three, the demo room's mesh lost four percent of its correct vertices.
 TRUNCATION = 3.0
-# A voxel counts where as many views have seen it.
+# Minimum number of views that must have seen a voxel.
 LEAST_VIEWS = 2.0
-# Depth is taken where as much of the light is stopped, and where it varies by no more than this share to one of the
-# neighbours across and one of those down: at the edge of a thing, compositing makes pixels whose expected depth lies
-# between the thing and what is behind it. (Maps are optimised for colour; their depth where they are more opaque than
-# 0.5 was measured to be no worse than where they are more opaque than 0.9.)
+# A pixel's depth is used if its opacity reaches LEAST_OPACITY and if it differs by at most the fraction LARGEST_STEP
+# from a horizontal and from a vertical neighbour. At silhouettes, compositing yields expected depths between the object
+# and its background. Maps are optimised for colour; their depth at opacities above 0.5 was measured to be no worse than
+# above 0.9.
 LEAST_OPACITY = 0.5
 LARGEST_STEP = 0.05
-# A part on its own is kept where it has this share of the whole surface.
+# Connected parts with a smaller share of the total surface area are removed.
 LEAST_PART = 0.002
 BLOCK = 8
 
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """What a camera at T_camera_world (4, 4) sees: z (H, W), 0 where unknown, and colours (H, W, 3) in [0, 1]."""
+    """Depth and colour seen by a camera.
+
+    Attributes:
+        camera: The camera.
+        T_camera_world: (4, 4) pose.
+        depth: (H, W) z, 0 where unknown.
+        colour: (H, W, 3) in [0, 1].
+    """
 
     camera: PinholeCamera
     T_camera_world: NDArray[np.float64]
@@ -57,7 +64,7 @@ class SurfaceView:
 
 
 def without_edges(z: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (H, W), 0 where unknown, without the pixels at the edges of things."""
+    """Return the depth (H, W) with pixels at depth edges set to 0, which means unknown."""
     padded = np.pad(z, 1, mode="edge")
     across = np.minimum(np.abs(z - padded[1:-1, :-2]), np.abs(z - padded[1:-1, 2:]))
     down = np.minimum(np.abs(z - padded[:-2, 1:-1]), np.abs(z - padded[2:, 1:-1]))
@@ -65,9 +72,18 @@ def without_edges(z: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def fused(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object:
-    """The signed distance (an Open3D VoxelBlockGrid) in voxels of edge `voxel` of what is nearer than `farthest`.
+    """Fuse views into a signed distance field.
 
-    Both in scene units. Raises InputError where the views show no surface.
+    Args:
+        views: Depth and colour of each view.
+        voxel: Edge of the voxels [scene units].
+        farthest: Depth beyond which pixels are ignored [scene units].
+
+    Returns:
+        An Open3D VoxelBlockGrid.
+
+    Raises:
+        InputError: If the views show no surface.
     """
     o3d = open3d()
     core = o3d.core
@@ -93,18 +109,25 @@ def fused(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object
 
 
 def extracted(grid: object) -> object:
-    """The surface (an Open3D TriangleMesh) with colours. Raises InputError where nowhere enough views agree on one."""
+    """Extract the surface with colours from a VoxelBlockGrid.
+
+    Returns:
+        An Open3D TriangleMesh.
+
+    Raises:
+        InputError: If too few views agree on a surface.
+    """
     o3d = open3d()
     mesh = grid.extract_triangle_mesh(LEAST_VIEWS).to_legacy()
     if len(mesh.triangles) == 0:
         raise InputError(f"no {LEAST_VIEWS:.0f} frames agree on a surface; try larger voxels (--voxel)")
-    # Means of colours, off by rounding: writers complain of those beyond 1.
+    # Rounding can move averaged colours beyond 1, which writers reject.
     mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0.0, 1.0))
     return mesh
 
 
 def without_floating_parts(mesh: object) -> object:
-    """The mesh (an Open3D TriangleMesh) without the parts on their own that are a small share of its area."""
+    """Remove connected parts with less than LEAST_PART of the surface area from an Open3D TriangleMesh."""
     of_triangle, _, areas = mesh.cluster_connected_triangles()
     areas = np.asarray(areas)
     mesh.remove_triangles_by_mask((areas < LEAST_PART * areas.sum())[np.asarray(of_triangle)])
@@ -112,9 +135,13 @@ def without_floating_parts(mesh: object) -> object:
 
 
 def write_mesh(path: Path, mesh: object) -> None:
-    """Write a mesh with its vertex colours as PLY, GLB or OBJ, by the ending. The file appears whole or not at all.
+    """Write a mesh with vertex colours as PLY, GLB or OBJ, by the suffix. The file appears whole or not at all.
 
-    The axes are those of the poses, but in GLB, where y is up, they are turned by half a turn around x.
+    The axes are those of the poses. Only GLB, where y points up, is rotated by 180 degrees around x.
+
+    Args:
+        path: The file.
+        mesh: An Open3D TriangleMesh.
     """
     if path.suffix.lower() == ".glb":
         vertices = np.asarray(mesh.vertices) * [1.0, -1.0, -1.0]
@@ -128,7 +155,11 @@ def write_mesh(path: Path, mesh: object) -> None:
 
 
 def read_mesh(path: Path) -> object:
-    """An Open3D TriangleMesh from a file. Raises InputError where there is none."""
+    """Read an Open3D TriangleMesh.
+
+    Raises:
+        InputError: If the file is missing or holds no triangles.
+    """
     o3d = open3d()
     if not path.is_file():
         raise InputError(f"{path}: no such file; modp-ti export OUT --format mesh makes a mesh")

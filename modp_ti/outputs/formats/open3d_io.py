@@ -1,4 +1,4 @@
-"""Open3D, imported where it is used, and files that it writes put in place whole."""
+"""Imports Open3D on demand, and moves the files that it writes into place once they are complete."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ __all__ = ["open3d", "written_aside"]
 
 
 def open3d() -> ModuleType:
-    """The module. Raises InputError where its import fails, most often for a missing system library."""
+    """Import and return Open3D.
+
+    Raises:
+        InputError: If the import fails, most often because of a missing system library.
+    """
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -26,7 +30,7 @@ def open3d() -> ModuleType:
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """A path of the same ending beside `path`, which what is written there replaces at the end."""
+    """Yield a temporary path with the same suffix, whose file replaces `path` on exit."""
     partial = path.with_name(f"{path.stem}.partial{path.suffix}")
     try:
         yield partial

@@ -1,4 +1,4 @@
-"""`points.ply`: the map as coloured points, for any program that shows point clouds."""
+"""`points.ply`: the map as a coloured point cloud."""
 
 from __future__ import annotations
 
@@ -15,12 +15,20 @@ from modp_ti.outputs.formats.quantised import opacities
 
 __all__ = ["write_points"]
 
-# What lets more through than it stops is haze, not surface.
+# Gaussians below this opacity are haze rather than surface.
 LEAST_OPACITY = 0.5
 
 
 def write_points(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> int:
-    """Write the centres of the opaque Gaussians with their constant colours as binary PLY; how many there are."""
+    """Write the centres of the opaque Gaussians with their constant colours as binary PLY.
+
+    Args:
+        path: The file.
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+
+    Returns:
+        Number of points.
+    """
     o3d = open3d()
     solid = opacities(state) >= LEAST_OPACITY
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(state["position"][solid].astype(np.float64)))

@@ -1,4 +1,4 @@
-"""What the compressed forms of splats have in common: opacities, unit quaternions, and numbers in a few bits."""
+"""Helpers of the compressed splat formats: opacities, unit quaternions and quantisation."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ __all__ = ["opacities", "smallest_three", "to_bits", "unit_quaternions"]
 
 
 def opacities(state: Mapping[str, NDArray]) -> NDArray[np.float64]:
-    """Opacity in (0, 1) of every Gaussian (N,)."""
+    """Return the opacity (N,) of every Gaussian, in (0, 1)."""
     return 1.0 / (1.0 + np.exp(-state["opacity_logit"].astype(np.float64)))
 
 
 def unit_quaternions(state: Mapping[str, NDArray]) -> NDArray[np.float64]:
-    """Rotations (N, 4) as w, x, y, z of length 1."""
+    """Return the rotations (N, 4) as unit quaternions w, x, y, z."""
     q = state["quaternion"].astype(np.float64)
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
 def smallest_three(q: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Place of the largest component (N,) of unit quaternions (N, 4), and the others (N, 3) in their order.
+    """Split unit quaternions (N, 4) into the index of the largest component (N,) and the other three (N, 3), in order.
 
-    Of q and -q, the same rotation, it takes the one whose largest component is positive, so that it need not be kept.
+    The sign is chosen such that the largest component is positive and need not be stored.
     """
     largest = np.abs(q).argmax(axis=1)
     rows = np.arange(len(q))
@@ -34,6 +34,6 @@ def smallest_three(q: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[n
 
 
 def to_bits(values: NDArray, bits: int) -> NDArray[np.uint32]:
-    """Values in [0, 1], clipped to it, as the nearest of 2^bits - 1 steps."""
+    """Quantise values in [0, 1], after clipping, to the nearest of the levels 0 to 2^bits - 1."""
     most = (1 << bits) - 1
     return np.round(np.clip(values, 0.0, 1.0) * most).astype(np.uint32)

@@ -1,4 +1,4 @@
-"""Scores of every frame as comma-separated values, one line a frame and version of the map."""
+"""`scores.csv`: scores of every frame, one line per frame and version of the map."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ COLUMNS = [field.name for field in dataclasses.fields(FrameScore)]
 
 
 def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> None:
-    """Write index, name, held_out (0 or 1), stage, psnr [dB], ssim, lpips (empty where not computed), with a header.
+    """Write the scores with a header line.
 
-    Numbers have the digits that give them back exactly.
+    The columns are index, name, held_out (0 or 1), stage, psnr [dB], ssim and lpips (empty if not computed). Numbers
+    are written with enough digits to be read back exactly.
     """
     with replacing(path, "w") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -31,7 +32,11 @@ def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> 
 
 
 def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
-    """The scores of a file that `write_scores` wrote. Raises InputError, with the line, for anything else."""
+    """Read a file that `write_scores` wrote.
+
+    Raises:
+        InputError: If the file is not valid. The message names the line.
+    """
     file = Path(path)
     try:
         rows = list(csv.reader(text_lines(file, "utf-8")))

@@ -1,4 +1,4 @@
-"""`splats.ply`: the Gaussians in the layout of 3DGS, as every splat viewer reads it."""
+"""`splats.ply`: Gaussians in the PLY layout of 3DGS, which splat viewers read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from modp_ti.files.ply import parse_ply_header
 
 __all__ = ["read_splats", "write_splats"]
 
-# The pixel footprint that the map was optimised with; a renderer must use the same to show the same picture.
+# The filter that the map was optimised with. Other renderers must use the same to reproduce the images.
 COMMENT = "rendered with 0.3 px^2 blur and mip-splatting opacity compensation (antialiased)"
 
 
@@ -28,10 +28,17 @@ def _names(sh_count: int) -> list[str]:
 
 
 def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> None:
-    """Write Gaussians as `GaussianField.to_numpy` gives them. The file appears whole or not at all.
+    """Write Gaussians as a 3DGS PLY file. The file appears whole or not at all.
 
-    Opacity as its logit, scale as its logarithm, quaternion with w first, `f_rest` with all of red first; all values as
-    they are, so that the file read back renders bit for bit alike.
+    Opacities are logits, scales are logarithms, quaternions have w first, and `f_rest` holds all of red first. All
+    values are written unchanged, so that the file renders identically when read back.
+
+    Args:
+        path: The file.
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     n, sh_count, _ = state["sh"].shape
     table = np.concatenate(
@@ -54,9 +61,16 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
 
 
 def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
-    """Gaussians of a 3DGS PLY file, as `GaussianField.load` takes them. Properties may come in any order.
+    """Read the Gaussians of a 3DGS PLY file. Its properties may come in any order.
 
-    Raises InputError (one line) for a file that is none, is cut short or lacks a property.
+    Args:
+        path: The file.
+
+    Returns:
+        Gaussians by name, as `GaussianField.load` takes them.
+
+    Raises:
+        InputError: If the file is not a 3DGS PLY file, is truncated or lacks a property. The message has one line.
     """
     file = Path(path)
     try:

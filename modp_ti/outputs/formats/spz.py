@@ -1,11 +1,12 @@
-"""`.spz`: the compressed splats of Niantic (nianticlabs/spz), version 3: a gzip stream of a header and six arrays.
+"""`.spz`: compressed splats of Niantic (nianticlabs/spz), version 3: a gzip stream of a header and six arrays.
 
     header    uint32 magic, version, count; uint8 SH degree, fractional bits of positions, flags, 0
     position  3 x int24, fixed point      opacity  uint8       colour    3 x uint8, 0.15 f_dc + 0.5
     scale     3 x uint8, 16 (log + 10)    rotation uint32      harmonics uint8, 128 f_rest + 128, colours innermost
 
-All little-endian. Rotation: the largest of x, y, z, w by its number in two bits, then the others in their order, a sign
-and nine bits each, from 0 to sqrt(1/2). Axes are right, up, back; those of 3DGS files right, down, front.
+All numbers are little-endian. The rotation word stores the index of the largest of x, y, z, w in two bits, then the
+other three in order, each as a sign and nine bits from 0 to sqrt(1/2). The axes are right, up, back; those of 3DGS
+files are right, down, front.
 """
 
 from __future__ import annotations
@@ -25,17 +26,22 @@ from modp_ti.outputs.formats.quantised import opacities, smallest_three, to_bits
 __all__ = ["write_spz"]
 
 MAGIC, VERSION, ANTIALIASED = 0x5053474E, 3, 1
-# Positions are kept to this share of the size (largest axis) that all but one in twenty Gaussians exceed: finer ones
-# are noise that does not compress.
+# Resolution of positions, as a fraction of the size (largest axis) that 95 percent of the Gaussians exceed. A finer one
+# would store noise that does not compress.
 FINEST = 1 / 32
-# Half a turn around x changes the sign of the harmonics that are odd in (y, z): degree 1, 2, 3.
+# A rotation by 180 degrees around x flips the sign of the harmonics that are odd in (y, z): degree 1, 2, 3.
 TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float64)
 
 
 def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
-    """Write Gaussians as `GaussianField.to_numpy` gives them. The file says that they are trained with anti-aliasing.
+    """Write Gaussians, marked as trained with anti-aliasing.
 
-    Raises InputError for a map that is too large for positions of 24 bits.
+    Args:
+        path: The file.
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+
+    Raises:
+        InputError: If the map's extent exceeds 24-bit positions.
     """
     turn = np.array([1.0, -1.0, -1.0])
     position = state["position"].astype(np.float64) * turn
@@ -53,7 +59,7 @@ def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> Non
     rest = state["sh"][:, 1:].astype(np.float64) * TURNED[: state["sh"].shape[1] - 1, None]
     arrays = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3],
-        # Neither 0 nor 255, whose logits are infinite.
+        # 0 and 255 are excluded, as their logits are infinite.
         np.clip(to_bits(opacities(state), 8), 1, 254).astype(np.uint8),
         to_bits(0.15 * state["sh"][:, 0].astype(np.float64) + 0.5, 8).astype(np.uint8),
         np.clip(np.round(16.0 * (state["log_scale"].astype(np.float64) + 10.0)), 0, 255).astype(np.uint8),
@@ -66,7 +72,7 @@ def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> Non
 
 
 def _rotations(q: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """Unit quaternions x, y, z, w (N, 4) in 32 bits each."""
+    """Pack unit quaternions x, y, z, w (N, 4) into 32 bits each."""
     largest, others = smallest_three(q)
     packed = largest.astype("<u4")
     for value in others.T:

@@ -1,4 +1,4 @@
-"""Trajectories in the TUM format: `time tx ty tz qx qy qz qw` a line, camera to world, `#` comments."""
+"""Trajectories in TUM format: lines of `time tx ty tz qx qy qz qw`, camera to world, with `#` comments."""
 
 from __future__ import annotations
 
@@ -21,10 +21,17 @@ __all__ = ["read_trajectory", "write_trajectory"]
 def write_trajectory(
     path: str | os.PathLike[str], timestamps: Iterable[float], poses: Iterable[NDArray[np.float64]]
 ) -> None:
-    """Writes one line a frame: timestamps in seconds, poses as `T_camera_world` (4, 4).
+    """Write one line per frame. The file appears whole or not at all.
 
-    Every number has the digits that give it back exactly. The file appears whole or not at all. Raises
-    ValueError for a pose that is not finite or for more of one than of the other.
+    Numbers are written with enough digits to be read back exactly.
+
+    Args:
+        path: The file.
+        timestamps: Time stamps [s].
+        poses: T_camera_world (4, 4) of each frame.
+
+    Raises:
+        ValueError: If a pose contains NaN or Inf, or the numbers of time stamps and poses differ.
     """
     lines = ["# time tx ty tz qx qy qz qw   (seconds, camera to world)"]
     for time, T_camera_world in zip(timestamps, poses, strict=True):
@@ -33,14 +40,21 @@ def write_trajectory(
         rotation = np.asarray(T_camera_world, dtype=np.float64)[:3, :3].T
         centre = -rotation @ T_camera_world[:3, 3]
         numbers = [float(time), *centre.tolist(), *_quaternion(rotation).tolist()]
-        lines.append(" ".join(repr(number + 0.0) for number in numbers))  # + 0.0: no minus before a zero
+        lines.append(" ".join(repr(number + 0.0) for number in numbers))  # + 0.0 turns -0.0 into 0.0
     replace_text(path, "\n".join(lines) + "\n")
 
 
 def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Timestamps (N,) in seconds and `T_camera_world` (N, 4, 4) of a TUM trajectory, in the file's order.
+    """Read a TUM trajectory.
 
-    Raises InputError, with the line, for anything else.
+    Args:
+        path: The file.
+
+    Returns:
+        Time stamps (N,) [s] and T_camera_world (N, 4, 4), in the file's order.
+
+    Raises:
+        InputError: If the file is not a TUM trajectory. The message names the line.
     """
     file = Path(path)
     rows = array("d")
@@ -71,7 +85,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], 
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(x, y, z, w) with w >= 0: the eigenvector of Bar-Itzhack's matrix, good for every rotation."""
+    """Return (x, y, z, w) with w >= 0 as an eigenvector of Bar-Itzhack's matrix, which is stable for all rotations."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     K = np.array(
         [
@@ -86,7 +100,7 @@ def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rotation(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrix of (x, y, z, w), normalised first."""
+    """Return the rotation matrix of a quaternion (x, y, z, w) of any length."""
     x, y, z, w = q / np.linalg.norm(q)
     return np.array(
         [

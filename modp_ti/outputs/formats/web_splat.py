@@ -1,9 +1,9 @@
-"""`.splat`: 32 bytes a Gaussian, as the first viewers on the web read it (antimatter15/splat) and most still do.
+"""`.splat`: 32 bytes per Gaussian, the format of the first web viewers (antimatter15/splat), which most still read.
 
     position 3 x float32 | scale 3 x float32, linear | colour and opacity 4 x uint8 | quaternion w x y z 4 x uint8
 
-A component c of the unit quaternion is round(128 c) + 128. There is no header. The most important Gaussians come first,
-since viewers show what has been loaded so far. Colour does not depend on the direction.
+A component c of the unit quaternion is stored as round(128 c) + 128. There is no header. The most important Gaussians
+come first, because viewers show what they have loaded so far. Colours do not depend on the view direction.
 """
 
 from __future__ import annotations
@@ -24,7 +24,12 @@ RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4
 
 
 def write_web_splat(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
-    """Write Gaussians as `GaussianField.to_numpy` gives them. Of their colours the constant part is kept, clipped."""
+    """Write Gaussians with the constant part of their colours, clipped to [0, 1].
+
+    Args:
+        path: The file.
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+    """
     opacity = opacities(state)
     importance = opacity * np.exp(state["log_scale"].astype(np.float64).sum(axis=1))
     order = np.argsort(-importance, kind="stable")

@@ -1,1 +1,1 @@
-"""A finished map seen again: read from its folder, loaded into the renderer, flown through, filmed."""
+"""Playback of finished maps: read a run's folder, render it along camera paths, write videos and exports."""

@@ -1,4 +1,4 @@
-"""Ways of a camera through a finished map, each as T_camera_world (M, 4, 4)."""
+"""Camera paths through a finished map, each as T_camera_world (M, 4, 4)."""
 
 from __future__ import annotations
 
@@ -7,40 +7,51 @@ from numpy.typing import NDArray
 
 __all__ = ["looking_at", "orbit", "smoothed"]
 
-# How much the focus is held to the points at the scene's depth before the keyframes: decides where axes are parallel.
+# Weight that pulls the focus to the points at the scene's depth on the optical axes. It determines the focus if the
+# axes are parallel.
 HELD = 0.1
-# The orbit is closed where no gap between the directions that the keyframes were taken from is larger; else it swings
-# over those directions, to and fro, but for this share at either end, where few saw what there is, and no less than
-# SWING to either side.
+# The orbit is a full circle if the largest gap between the keyframes' directions is below LARGEST_GAP. Otherwise it
+# swings back and forth over these directions, without the fraction ENDS at both ends, where few keyframes saw the
+# scene, but by at least SWING to either side.
 LARGEST_GAP = np.radians(120.0)
 ENDS = 0.1
 SWING = np.radians(10.0)
 
 
 def smoothed(poses: NDArray[np.float64], count: int, deviation: float) -> NDArray[np.float64]:
-    """`count` poses along recorded ones (N, 4, 4), each the mean of those around it.
+    """Return `count` poses (count, 4, 4) along a recorded path, each a Gaussian-weighted mean of the poses around it.
 
-    deviation: of the Gaussian that weighs them, in frames. Ends are drawn inwards by about as much.
+    The ends of the path are pulled inwards by about `deviation`.
+
+    Args:
+        poses: (N, 4, 4) recorded T_camera_world.
+        count: Number of poses to return.
+        deviation: Standard deviation of the weights [frames].
     """
     n = len(poses)
     at = np.linspace(0.0, n - 1.0, count)
-    # Relative to the nearest, so that a narrow Gaussian between two frames does not underflow.
+    # Relative to the nearest frame, so that a narrow Gaussian between two frames does not underflow.
     square = (at[:, None] - np.arange(n)) ** 2
     weights = np.exp(-0.5 * (square - square.min(axis=1, keepdims=True)) / max(deviation, 1e-3) ** 2)
     weights /= weights.sum(axis=1, keepdims=True)
     rotations = poses[:, :3, :3].transpose(0, 2, 1)  # camera to world
     centres = _centres(poses)
-    # The chordal mean of rotations: the nearest rotation to their weighted sum.
+    # Chordal mean: the rotation nearest to the weighted sum of the rotation matrices.
     U, _, Vt = np.linalg.svd((weights @ rotations.reshape(n, 9)).reshape(count, 3, 3))
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
     return _poses(U @ Vt, weights @ centres)
 
 
 def orbit(poses: NDArray[np.float64], depth: float, count: int) -> NDArray[np.float64]:
-    """A turn of `count` poses around what the keyframes at `poses` (N, 4, 4) look at, at their distance and height.
+    """Return poses (count, 4, 4) around the point that the keyframes look at, at their median distance and height.
 
-    It looks inwards where they do (around an object), outwards where they do (from within a room). Where they were not
-    taken from all around, it swings over the directions that they were taken from. depth: of the scene.
+    The camera looks inwards if the keyframes do (around an object), and outwards otherwise (inside a room). If the
+    keyframes do not surround the focus, the path swings over the directions that they cover.
+
+    Args:
+        poses: (N, 4, 4) T_camera_world of the keyframes.
+        depth: The scene's depth [scene units].
+        count: Number of poses.
     """
     centres, forward = _centres(poses), poses[:, 2, :3]
     up = -poses[:, 1, :3].mean(axis=0)
@@ -61,7 +72,7 @@ def orbit(poses: NDArray[np.float64], depth: float, count: int) -> NDArray[np.fl
 
 
 def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T_camera_world (4, 4) of an upright camera at `eye` that looks at `target`."""
+    """Return T_camera_world (4, 4) of an upright camera at `eye` that looks at `target`."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = _unit_across(np.cross(z, up), z)
     T = np.eye(4)
@@ -71,7 +82,7 @@ def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArra
 
 
 def _focus(centres: NDArray[np.float64], forward: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
-    """The point (3,) nearest to all optical axes, held towards the points on them at `depth`."""
+    """Return the point (3,) nearest to all optical axes, regularised towards the points on them at `depth`."""
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     A = across.sum(axis=0) + HELD * len(centres) * np.eye(3)
     b = (across @ centres[:, :, None]).sum(axis=0)[:, 0] + HELD * (centres + depth * forward).sum(axis=0)
@@ -79,20 +90,20 @@ def _focus(centres: NDArray[np.float64], forward: NDArray[np.float64], depth: fl
 
 
 def _angles(taken_from: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Angles (count,) of the orbit's poses. taken_from: the keyframes' (N,), in [-pi, pi]."""
+    """Return the angles (count,) of the orbit's poses, given the keyframes' angles (N,) in [-pi, pi]."""
     ordered = np.sort(taken_from)
     gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))
     widest = int(np.argmax(gaps))
     turn = 2 * np.pi * np.arange(count) / count
     if gaps[widest] < LARGEST_GAP:
         return turn
-    ordered[: widest + 1] += 2 * np.pi  # behind the gap it goes on
+    ordered[: widest + 1] += 2 * np.pi  # continue after the gap
     first, last = np.quantile(ordered, [ENDS, 1 - ENDS])
     return (first + last) / 2 + max((last - first) / 2, SWING) * np.sin(turn)
 
 
 def _unit_across(v: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vector (3,) along the part of `v` across the unit vector `axis`; any across it where there is none."""
+    """Return the unit vector (3,) along the part of `v` orthogonal to `axis`; any orthogonal one if it is 0."""
     v = v - (v @ axis) * axis
     if np.linalg.norm(v) < 1e-9:
         v = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -100,12 +111,12 @@ def _unit_across(v: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[n
 
 
 def _centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera centres (N, 3)."""
+    """Return the camera centres (N, 3)."""
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
 def _poses(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T_camera_world (M, 4, 4) of camera-to-world rotations (M, 3, 3) and centres (M, 3)."""
+    """Return T_camera_world (M, 4, 4) from camera-to-world rotations (M, 3, 3) and centres (M, 3)."""
     result = np.tile(np.eye(4), (len(centres), 1, 1))
     result[:, :3, :3] = rotations.transpose(0, 2, 1)
     result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], centres)

@@ -1,4 +1,4 @@
-"""What `modp-ti export` does: each format from a finished run to a file or a folder."""
+"""Implements `modp-ti export`: writes a finished run in a given format."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from modp_ti.outputs.progress import ProgressLine
 
 __all__ = ["DEFAULT_NAMES", "export_map"]
 
-# What a format is called in OUT unless the user names a place.
+# Default output name of each format, in the run's folder.
 DEFAULT_NAMES = {
     "points": "points.ply",
     "mesh": "mesh.ply",
@@ -35,23 +35,39 @@ DEFAULT_NAMES = {
     "video": "recorded.mp4",
 }
 SPLATS = {"spz": write_spz, "compressed-ply": write_compressed_ply}
-# Edge of the mesh's voxels in scene depths, and how far its surface reaches.
+# Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL = 1 / 160
 FARTHEST = 4.0
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """voxel: edge of the mesh's voxels [scene units], None for VOXEL of the scene's depth. device: for rendering."""
+    """Options of an export.
+
+    Attributes:
+        voxel: Edge of the mesh's voxels [scene units], None for VOXEL times the scene's depth.
+        device: Device for rendering.
+    """
 
     voxel: float | None = None
     device: str = "auto"
 
 
 def export_map(run: FinishedRun, format: str, output: Path | None, options: ExportOptions, line: ProgressLine) -> Path:
-    """Write the run in a format of DEFAULT_NAMES; where it lies. Raises InputError where that cannot be done.
+    """Write a run in one of the formats of DEFAULT_NAMES.
 
-    output: file or new folder; None for the format's name in the run's own folder.
+    Args:
+        run: The finished run.
+        format: Name of the format.
+        output: File or new folder, None for the default name in the run's folder.
+        options: Options of the export.
+        line: Shows the progress.
+
+    Returns:
+        The path that was written.
+
+    Raises:
+        InputError: If the export is not possible.
     """
     target = _target(run, format, output)
     try:
@@ -76,7 +92,7 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
 
 
 def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
-    """Where the format goes. Raises InputError, before anything is computed, where it cannot."""
+    """Return the output path. Raises InputError if it is not usable, before anything is computed."""
     target = run.folder / DEFAULT_NAMES[format] if output is None else output.expanduser()
     if not target.absolute().parent.is_dir():
         raise InputError(f"{target.absolute().parent}: no such folder; make it first")

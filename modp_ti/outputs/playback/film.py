@@ -1,4 +1,4 @@
-"""Views of a map on disk: a folder of pictures or of depth, or a video."""
+"""Writes rendered views as a folder of pictures or depth images, or as a video."""
 
 from __future__ import annotations
 
@@ -16,15 +16,19 @@ from pipelines.render.renderer import RenderedView
 
 __all__ = ["VIDEO_SUFFIXES", "depth_colours", "is_video", "require_writable", "write_pictures", "write_video"]
 
-# Codec by the file's ending. MPEG-4 part 2 is quick and every player has it, browsers have VP9; the wheels of OpenCV
-# have no H.264.
+# Codec by suffix. MPEG-4 part 2 encodes quickly and plays everywhere except in browsers, which have VP9. OpenCV's
+# wheels have no H.264.
 VIDEO_SUFFIXES = {".mp4": "mp4v", ".webm": "VP90"}
-# The colours of depth go from this many times nearer than the scene's depth to as many times farther.
+# The depth colours range from the scene's depth divided by this factor to the depth times this factor.
 DEPTH_RANGE = 4.0
 
 
 def is_video(path: Path) -> bool:
-    """Whether the name asks for a video. Raises InputError for the ending of any other kind of file."""
+    """Return whether the name asks for a video.
+
+    Raises:
+        InputError: If the suffix is that of another kind of file.
+    """
     suffix = path.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
         return True
@@ -34,7 +38,11 @@ def is_video(path: Path) -> bool:
 
 
 def require_writable(path: Path) -> None:
-    """Raise InputError where the video, or the folder of pictures, cannot be put there."""
+    """Check that a video or a folder of pictures can be created at `path`.
+
+    Raises:
+        InputError: If not.
+    """
     if is_video(path):
         if path.is_dir():
             raise InputError(f"{path}: is a folder, not a video file; name another")
@@ -47,9 +55,15 @@ def require_writable(path: Path) -> None:
 
 
 def write_pictures(folder: Path, views: Iterable[RenderedView], depth: bool) -> None:
-    """One file a view, 000000 and on: PNG, or with `depth` TIFF of float32 z in scene units, 0 where nothing is.
+    """Write one file per view, from 000000. The folder appears whole or not at all.
 
-    The folder appears whole or not at all.
+    Args:
+        folder: The folder, which must be new or empty.
+        views: The views.
+        depth: Write TIFF files with float32 z [scene units], 0 where nothing is, instead of PNG files.
+
+    Raises:
+        InputError: If the files cannot be written.
     """
     import cv2
 
@@ -72,7 +86,16 @@ def write_pictures(folder: Path, views: Iterable[RenderedView], depth: bool) -> 
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
-    """A video of pictures (H, W, 3) uint8 RGB of one even size. The file appears whole or not at all."""
+    """Write a video. The file appears whole or not at all.
+
+    Args:
+        path: The file, with a suffix of VIDEO_SUFFIXES.
+        pictures: (H, W, 3) uint8 RGB, all of one even size.
+        frames_per_second: Frame rate.
+
+    Raises:
+        InputError: If the video cannot be written.
+    """
     import cv2
 
     partial = path.with_name(f"{path.stem}.partial{path.suffix.lower()}")
@@ -96,7 +119,10 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
 
 
 def depth_colours(view: RenderedView, scene_depth: float) -> NDArray[np.uint8]:
-    """Depth as colours (H, W, 3): red is near, blue far, on a logarithmic scale around `scene_depth`; black nothing."""
+    """Map depth to colours (H, W, 3): red is near, blue is far, black is empty.
+
+    The scale is logarithmic around `scene_depth`.
+    """
     import cv2
 
     z = view.expected_depth()

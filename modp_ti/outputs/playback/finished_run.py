@@ -1,4 +1,4 @@
-"""`FinishedRun`: the output folder of a run, as the commands that come after it read it."""
+"""`FinishedRun`: reads the output folder of a run for the commands that follow it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,15 @@ NEEDED = ("config.yaml", "splats.ply", "trajectory.txt", "colmap", "frames.json"
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A map, and the frames that it was made of: by position names, times [s], T_camera_world (4, 4) and cameras.
+    """A map and its frames.
 
-    names: as the COLMAP model has them. record: near, scene depth, keyframes, held-out frames.
+    Attributes:
+        folder: The run's output folder.
+        names: Image names in the COLMAP model.
+        timestamps: (N,) time stamps [s].
+        poses: (N, 4, 4) refined T_camera_world.
+        cameras: Camera of each frame.
+        record: Near plane, scene depth, keyframes and held-out frames.
     """
 
     folder: Path
@@ -42,7 +48,11 @@ class FinishedRun:
 
     @cached_property
     def gaussians(self) -> dict[str, NDArray[np.float32]]:
-        """The map, as `GaussianField.load` takes it. Raises InputError for a damaged file or an empty map."""
+        """Gaussians as `GaussianField.load` takes them.
+
+        Raises:
+            InputError: If the file is damaged or the map is empty.
+        """
         state = read_splats(self.folder / "splats.ply")
         if len(state["position"]) == 0:
             raise InputError(f"{self.folder / 'splats.ply'}: the map holds no Gaussian")
@@ -55,14 +65,18 @@ class FinishedRun:
         return [index for index in range(len(self)) if index not in held_out]
 
     def spread(self, most: int) -> list[int]:
-        """Positions of the frames that were not held out: all, or of more than `most` as many at equal steps."""
+        """Return the positions of at most `most` evenly spaced frames that were not held out."""
         mapped = self.mapped
         count = min(len(mapped), most)
         return [mapped[i * len(mapped) // count] for i in range(count)]
 
 
 def open_run(folder: Path) -> FinishedRun:
-    """Read what a finished run left. Raises InputError where it is none, or not finished, or damaged."""
+    """Read the output folder of a finished run.
+
+    Raises:
+        InputError: If the folder holds no finished run, or a damaged one.
+    """
     folder = folder.expanduser()
     if not folder.is_dir():
         what = "not a folder" if folder.exists() else "no such folder; a run makes it at its end"
@@ -85,7 +99,7 @@ def open_run(folder: Path) -> FinishedRun:
 
 
 def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
-    """Names and cameras of the images in their order."""
+    """Return the names and cameras of the images, in order."""
     model = read_colmap_model(folder)
     images = [model.images[number] for number in sorted(model.images)]
     of_id = {}
@@ -97,7 +111,7 @@ def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
             raise InputError(f"{what} is none of a run: {error}") from None
         of_id[number], _ = require_plausible(pinhole, NO_DISTORTION, what)
     for image in images:
-        # They name files to be read, and written in an export: none may lie elsewhere.
+        # The names are used as paths for reading and for exports, so they must stay inside the image folder.
         parts = PurePosixPath(image.name).parts
         if not parts or parts[0] == "/" or ".." in parts or "\0" in image.name:
             raise InputError(f"{folder}: image {image.name!r} is no name below the folder of images")

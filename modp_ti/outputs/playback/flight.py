@@ -1,4 +1,4 @@
-"""What is filmed of a finished map: the way of the camera, its lens, and how many pictures a second."""
+"""Films a finished map: plans the camera path, the lens and the frame rate, and renders them."""
 
 from __future__ import annotations
 
@@ -23,16 +23,20 @@ from pipelines.render.renderer import RenderedView
 __all__ = ["PATHS", "Flight", "film", "plan_flight"]
 
 PATHS = ("recorded", "smoothed", "orbit")
-# Pictures along paths that have none of their own.
+# Number of pictures and frame rate of paths that do not define their own.
 DEFAULT_FRAMES = 240
 DEFAULT_FPS = 30.0
 
 
 @dataclass(frozen=True)
 class Flight:
-    """Poses T_camera_world (M, 4, 4), the camera at each, and pictures a second.
+    """A planned film.
 
-    exposures: (A, b) (3, 4) at each, which makes A colour + b of the map's colours; None for the map's own.
+    Attributes:
+        poses: (M, 4, 4) T_camera_world.
+        cameras: Camera at each pose.
+        frames_per_second: Frame rate.
+        exposures: (3, 4) matrix (A, b) at each pose, which maps colours to A colour + b. None for the map's colours.
     """
 
     poses: NDArray[np.float64]
@@ -41,7 +45,7 @@ class Flight:
     exposures: list[NDArray[np.float64]] | None = None
 
     def even(self) -> Flight:
-        """With pictures of even width and height, as videos have them: the last row and column left out."""
+        """Return the flight with even picture sizes, as videos require. An odd last row or column is cropped."""
         cameras = [
             PinholeCamera(c.fx, c.fy, c.cx, c.cy, max(c.width // 2 * 2, 2), max(c.height // 2 * 2, 2))
             for c in self.cameras
@@ -59,12 +63,21 @@ def plan_flight(
     deviation: float = 5.0,
     exposure: bool = False,
 ) -> Flight:
-    """The flight along `path`: one of PATHS, or a trajectory file (TUM).
+    """Plan a flight along a path.
 
-    size: (width, height); None for the recorded one. fov: horizontal, in degrees; None for the recorded one. frames:
-    pictures, of a smoothed path or an orbit. deviation: of the smoothing, in frames. exposure: each picture as its
-    frame was exposed, of the recorded path. Raises InputError for a path or file that is none, for frames where the
-    path has its own, and for exposures where none were estimated.
+    Args:
+        run: The finished run.
+        path: One of PATHS, or a trajectory file in TUM format.
+        size: (width, height) [px], None for the recorded size.
+        fov: Horizontal field of view [degrees], None for the recorded one.
+        frames: Number of pictures of a smoothed path or an orbit, None for the default.
+        fps: Frame rate, None for that of the path's time stamps.
+        deviation: Standard deviation of the smoothing [frames].
+        exposure: Apply each frame's exposure. Only for the recorded path.
+
+    Raises:
+        InputError: If the path is unknown, its file is invalid, `frames` is given for a path with its own poses, or the
+            exposures are not available.
     """
     exposures = _exposures(run, path) if exposure else None
     times = None
@@ -89,9 +102,18 @@ def plan_flight(
 
 
 def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: str, line: ProgressLine) -> None:
-    """Render the flight into a video or a folder of pictures, whichever `output` names.
+    """Render a flight to a video or a folder of pictures, depending on the name of `output`.
 
-    depth: instead of colours. Raises InputError where the output cannot be written, before anything is rendered.
+    Args:
+        run: The finished run.
+        flight: The planned flight.
+        output: A video file or a folder.
+        depth: Render depth instead of colour.
+        device: "cpu", "cuda" or "auto".
+        line: Shows the progress.
+
+    Raises:
+        InputError: If the output cannot be written. This is checked before rendering.
     """
     require_writable(output)
     flight = flight.even() if is_video(output) else flight
@@ -117,7 +139,7 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
 
 
 def _exposures(run: FinishedRun, path: str) -> list[NDArray[np.float64]]:
-    """The exposure of every recorded frame. Raises InputError where they are not known, or belong to another path."""
+    """Return the exposure of every recorded frame. Raises InputError if unavailable or if the path is another one."""
     if path != "recorded":
         raise InputError(f"--exposure is of the recorded frames: --path {path} has none of its own")
     known = read_exposures(run.folder / "exposure.json")
@@ -129,7 +151,7 @@ def _exposures(run: FinishedRun, path: str) -> list[NDArray[np.float64]]:
 
 
 def _lens(camera: PinholeCamera, size: tuple[int, int] | None, fov: float | None) -> PinholeCamera:
-    """The camera with another size and field of view. Its width shows what it showed, unless `fov` is given."""
+    """Return the camera with another size and field of view. Without `fov`, the horizontal field of view is kept."""
     width, height = size or (camera.width, camera.height)
     if fov is not None:
         focal = 0.5 * width / np.tan(np.radians(fov) / 2)
@@ -140,7 +162,7 @@ def _lens(camera: PinholeCamera, size: tuple[int, int] | None, fov: float | None
 
 
 def _rate(times: NDArray[np.float64] | None) -> float:
-    """Pictures a second of a path with these times [s], as a video player takes it."""
+    """Return the frame rate of a path with these time stamps [s], limited to 1 to 60 Hz."""
     steps = np.diff(times) if times is not None else np.zeros(0)
     steps = steps[steps > 0]
     return float(np.clip(1.0 / np.median(steps), 1.0, 60.0)) if len(steps) else DEFAULT_FPS

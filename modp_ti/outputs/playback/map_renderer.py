@@ -1,4 +1,4 @@
-"""`MapRenderer`: a saved map in the renderer."""
+"""`MapRenderer`: loads a saved map into the renderer."""
 
 from __future__ import annotations
 
@@ -15,14 +15,25 @@ from pipelines.render.renderer import RenderedView, Renderer
 
 __all__ = ["MAX_SIDE", "MapRenderer", "start_device"]
 
-# Pixels on a side: the buffers of a larger picture come near the gigabyte beyond which Taichi is not safe.
+# Largest side of a picture [px]. The buffers of larger ones approach the gigabyte beyond which Taichi is not safe.
 MAX_SIDE = 2048
-# Where storage is sparse, every map gets the pool of a run, so that it finds that run's kernels in the cache.
+# Minimum capacity on backends with sparse storage. It equals that of a run, so that the run's cached kernels are
+# reused.
 POOL = 1_500_000
 
 
 def start_device(device: str) -> str:
-    """Start Taichi on "cpu", "cuda" or "auto"; the backend taken. Raises InputError where it does not start."""
+    """Start Taichi.
+
+    Args:
+        device: "cpu", "cuda" or "auto".
+
+    Returns:
+        The backend in use.
+
+    Raises:
+        InputError: If Taichi does not start.
+    """
     try:
         return initialise(device)
     except RuntimeError as error:
@@ -30,9 +41,16 @@ def start_device(device: str) -> str:
 
 
 class MapRenderer:
-    """Renders Gaussians, by name as `GaussianField.to_numpy`, in pictures of up to width x height. Taichi runs already.
+    """Renders a saved map. Taichi must have been started.
 
-    near: depth [scene units] below which nothing is drawn. Raises InputError for a size beyond `MAX_SIDE`.
+    Args:
+        gaussians: Arrays by name, as from `GaussianField.to_numpy`.
+        width: Largest picture width [px].
+        height: Largest picture height [px].
+        near: Depth below which nothing is drawn [scene units].
+
+    Raises:
+        InputError: If the size exceeds `MAX_SIDE`, or the Gaussians are invalid.
     """
 
     def __init__(self, gaussians: Mapping[str, NDArray], width: int, height: int, near: float) -> None:
@@ -50,14 +68,14 @@ class MapRenderer:
         self.near = near
 
     def view(self, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> RenderedView:
-        """The map through `camera` from T_camera_world (4, 4), before black."""
+        """Render the map from T_camera_world (4, 4) on a black background."""
         return self.renderer.render(camera, T_camera_world, self.near)
 
     def picture(self, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Its colours (H, W, 3) as 8 bits."""
+        """Render the map's colours (H, W, 3) as 8-bit values."""
         return eight_bits(self.view(camera, T_camera_world).colour)
 
 
 def eight_bits(colour: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Colours in [0, 1], clipped to it first, as 8 bits."""
+    """Convert colours to 8 bits, after clipping to [0, 1]."""
     return np.round(np.clip(colour, 0.0, 1.0) * 255.0).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The images that a finished run mapped: those that it kept, or once more from the scene's source."""
+"""Provides the images of a finished run, either those that it kept or read again from the scene's source."""
 
 from __future__ import annotations
 
@@ -22,15 +22,23 @@ __all__ = ["dataset_names", "grey_images", "write_images"]
 
 
 def dataset_names(run: FinishedRun) -> list[str]:
-    """What the run's images are called in a data set, as PNG files, by position."""
+    """Return the PNG names of the run's images in a data set, by position."""
     return run.names if _kept(run).is_dir() else image_names(run.names, written=True)
 
 
 def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
-    """Write all images, undistorted as they were mapped, into `images` of the folder, and masks into `masks`.
+    """Write all undistorted images to `images`, and the masks to `masks`, in a folder.
 
-    A run that did not keep its images (`export.images`) has them read again from the source of its scene; the tracker
-    `klt` tracks again for that. Raises InputError where the source is gone, was live, or now gives other frames.
+    If the run did not keep its images (`export.images`), they are read again from the scene's source, for which the
+    tracker `klt` has to track again.
+
+    Args:
+        run: The finished run.
+        folder: The folder to write to.
+        line: Shows the progress.
+
+    Raises:
+        InputError: If the source is gone, was live, or now delivers other frames.
     """
     names = dataset_names(run)
     if _kept(run).is_dir():
@@ -64,7 +72,16 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
 
 
 def grey_images(run: FinishedRun, positions: Sequence[int], line: ProgressLine) -> list[NDArray[np.uint8]]:
-    """The images (H, W) of some frames, in grey, from where `write_images` has them; it raises the same."""
+    """Return the grey images (H, W) of some frames.
+
+    Args:
+        run: The finished run.
+        positions: Positions of the frames.
+        line: Shows the progress.
+
+    Raises:
+        InputError: As `write_images`.
+    """
     names = dataset_names(run)
     with TemporaryDirectory() as folder:
         place = _kept(run)

@@ -1,4 +1,4 @@
-"""`with_plain_colours`: a map whose colours lie in [0, 1] and do not depend on the direction, looking as it did."""
+"""`with_plain_colours`: converts a map to view-independent colours in [0, 1] with the same appearance."""
 
 from dataclasses import asdict, replace
 
@@ -15,22 +15,29 @@ from pipelines.optimise.gpu_losses import photometric_loss
 
 __all__ = ["with_plain_colours"]
 
-# Views of the map that its plain form is optimised to show; of more frames, as many at equal steps.
+# Maximum number of views to fit, evenly spaced over the frames.
 VIEWS = 60
 STEPS = 900
-# Adam's rates at the start, positions' in scene depths, and the factor at the end.
+# Initial learning rates of Adam, the position's relative to the scene's depth, and the decay factor at the end.
 RATES = LearningRates(position=1e-4, log_scale=0.01, quaternion=0.002, opacity_logit=0.1, colour=0.04)
 DECAY = 0.05
 SSIM_WEIGHT = 0.2
-# Of the constant harmonic, where colours end.
+# Value of the constant harmonic at which the colour reaches 1.
 LARGEST = 0.5 / SH_C0
 
 
 def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArray[np.float32]]:
-    """The run's Gaussians (as `GaussianField.load` takes them), optimised under that constraint to render alike.
+    """Optimise a copy of the run's Gaussians to render alike with view-independent colours in [0, 1].
 
-    Where a Gaussian brighter than 1 lets light through, clipping makes it too dark. So all of it is fitted to the map's
-    own pictures at the frames that were mapped. Taichi runs already.
+    Clipping alone would make a Gaussian brighter than 1 too dark if it is translucent. Therefore all parameters are
+    fitted to the map's own renders from the mapped frames. Taichi must have been started.
+
+    Args:
+        run: The finished run.
+        line: Shows the progress.
+
+    Returns:
+        Gaussians by name, as `GaussianField.load` takes them.
     """
     chosen = run.spread(VIEWS)
     cameras = [run.cameras[index] for index in chosen]
@@ -67,7 +74,7 @@ class PlainColours:
         self.gaussians = gaussians
 
     def impose(self) -> None:
-        """Clip the constant harmonic to [0, 1] as a colour, and take away the others."""
+        """Clip the constant harmonic to colours in [0, 1], and set the others to 0."""
         if len(self.gaussians):
             self._impose(len(self.gaussians))
 

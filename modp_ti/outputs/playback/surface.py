@@ -1,4 +1,4 @@
-"""`surface_views`: the depth of a finished map's surface from where its frames were taken, for a mesh."""
+"""`surface_views`: depth views of a finished map's surface from its frames, for a mesh."""
 
 from __future__ import annotations
 
@@ -20,16 +20,21 @@ from modp_ti.outputs.progress import ProgressLine
 
 __all__ = ["surface_views"]
 
-# Frames whose views are fused; of more, as many at equal steps.
+# Maximum number of views that are fused, evenly spaced over the frames.
 SURFACE_VIEWS = 300
-# Pixels of the longer side that depth is looked at with: a pixel is then finer than the mesh's voxels.
+# Longer side of the depth views [px]. A pixel is then finer than the mesh's voxels.
 LONGEST_SIDE = 480
 
 
 def surface_views(run: FinishedRun, device: str, line: ProgressLine) -> Iterator[SurfaceView]:
-    """What frames that were mapped see of the map, its depth corrected by matching their images.
+    """Yield the map's depth and colour from the mapped frames, with the depth corrected by matching their images.
 
-    Where the images are not to be had any more, the map's own pictures are matched, which are less sharp.
+    If the images are no longer available, renders of the map are matched instead, which are less sharp.
+
+    Args:
+        run: The finished run.
+        device: "cpu", "cuda" or "auto".
+        line: Shows the progress.
     """
     chosen = run.spread(SURFACE_VIEWS)
     cameras = [_within(run.cameras[index], LONGEST_SIDE) for index in chosen]
@@ -68,6 +73,6 @@ def _images(run: FinishedRun, chosen: Sequence[int], line: ProgressLine) -> list
 
 
 def _within(camera: PinholeCamera, longest: int) -> PinholeCamera:
-    """The camera of the same view with at most so many pixels on a side."""
+    """Return the camera for the same view with at most `longest` pixels on a side."""
     s = min(1.0, longest / max(camera.width, camera.height))
     return camera.resized(max(round(s * camera.width), 1), max(round(s * camera.height), 1))

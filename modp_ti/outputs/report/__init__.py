@@ -1,1 +1,1 @@
-"""`report.html`: what a run did, as one page that can be read and printed without network."""
+"""`report.html`: a self-contained page about a run, for reading offline and printing."""

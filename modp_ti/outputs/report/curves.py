@@ -1,4 +1,4 @@
-"""What the curves of a report show, as numbers."""
+"""Computes the numbers behind the report's curves."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from modp_ti.outputs.report.record import FrameNote
 
 __all__ = ["binned", "frame_rate", "shifts_and_turns"]
 
-# Points of a curve: more would not be seen.
+# Maximum number of points of a curve. More would not be visible.
 MOST_POINTS = 400
 
 
 def frame_rate(frames: Sequence[FrameNote], window: int) -> NDArray[np.float64]:
-    """Frames per second (N,) over the `window` frames that end at each; NaN where there are not yet as many.
+    """Return frames per second (N,) over the `window` frames that end at each frame.
 
-    Of fewer frames than that the last one has the rate over all.
+    The first `window - 1` values are NaN. If there are fewer frames than `window`, the last value is the rate over all
+    of them.
     """
     done = np.array([0.0, *(note.done for note in frames)])
     window = min(window, len(frames))
@@ -30,7 +31,7 @@ def frame_rate(frames: Sequence[FrameNote], window: int) -> NDArray[np.float64]:
 def binned(
     x: NDArray[np.float64], y: NDArray[np.float64], points: int = MOST_POINTS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means of neighbouring values, at most `points` of them; of all that are finite."""
+    """Average neighbouring finite values into at most `points` bins, and return the means of x and y."""
     finite = np.isfinite(y)
     x, y = x[finite], y[finite]
     parts = max(1, min(points, len(x)))
@@ -43,7 +44,12 @@ def binned(
 def shifts_and_turns(
     before: Sequence[NDArray[np.float64]], after: Sequence[NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How far each camera moved [scene units] and turned [degrees]; both lists hold T_camera_world (4, 4)."""
+    """Return how far each camera moved [scene units] and turned [degrees].
+
+    Args:
+        before: T_camera_world (4, 4) of every frame.
+        after: The same frames' poses after the change.
+    """
     a, b = np.asarray(before), np.asarray(after)
     R_a, R_b = a[:, :3, :3], b[:, :3, :3]
     centre_a = -np.einsum("nji,nj->ni", R_a, a[:, :3, 3])

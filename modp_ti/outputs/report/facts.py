@@ -1,4 +1,4 @@
-"""What the tables of a report say: settings that were changed, the machine and its programs, and the run's figures."""
+"""The content of the report's tables: changed settings, the machine and its libraries, and the run's figures."""
 
 from __future__ import annotations
 
@@ -59,7 +59,13 @@ OTHERS = {
 
 @dataclass(frozen=True)
 class Change:
-    """A setting that is not its default, both as YAML text; default: None for one that has none."""
+    """A setting that differs from its default.
+
+    Attributes:
+        key: Dotted key.
+        value: Value as YAML text.
+        default: Default as YAML text, None if there is no default.
+    """
 
     key: str
     value: str
@@ -68,7 +74,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Figure:
-    """A number with what it is of."""
+    """A formatted number and its label."""
 
     label: str
     value: str
@@ -76,7 +82,14 @@ class Figure:
 
 @dataclass(frozen=True)
 class Stage:
-    """Seconds that a stage took. share: of the whole, in percent."""
+    """Time of a stage of the run.
+
+    Attributes:
+        name: Key in metrics.json.
+        meaning: Description for readers.
+        seconds: Time [s].
+        share: Share of the total time [%].
+    """
 
     name: str
     meaning: str
@@ -85,12 +98,12 @@ class Stage:
 
 
 def without_credentials(text: str) -> str:
-    """The text without user names and passwords in the addresses of streams: reports are passed on."""
+    """Remove user names and passwords from URLs in the text, since reports are shared."""
     return re.sub(r"(?<=://)[^/@\s\"']+@", "", text)
 
 
 def changed_settings(config: SceneConfig) -> list[Change]:
-    """Settings that are not their defaults, in the order of the reference."""
+    """Return the settings that differ from their defaults, in the order of the settings reference."""
     changes = []
     for entry, value in documented_values(config):
         text = "" if value is None else as_yaml(value)
@@ -100,12 +113,16 @@ def changed_settings(config: SceneConfig) -> list[Change]:
 
 
 def machine(device: str) -> list[Figure]:
-    """Programs and hardware. device: what the run says of the backend that it took."""
+    """Return versions and hardware.
+
+    Args:
+        device: Description of the backend that the run used.
+    """
     packages = []
     for name, package in PACKAGES.items():
         try:
             packages.append(f"{name} {version(package)}")
-        except PackageNotFoundError:  # brought by another distribution
+        except PackageNotFoundError:  # installed by another distribution package
             continue
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return [
@@ -127,12 +144,12 @@ def _processor() -> str:
 
 
 def last_stage(metrics: Mapping[str, Any]) -> str:
-    """The version of the map that the run left: "refined", "online" or "offline"."""
+    """Return the name of the run's final map version: "refined", "online" or "offline"."""
     return next(stage for stage in ("refined", "online", "offline") if metrics[stage] is not None)
 
 
 def headline(metrics: Mapping[str, Any]) -> list[Figure]:
-    """The figures that one looks for first."""
+    """Return the main figures."""
     scores = metrics[last_stage(metrics)]
     which = "held_out" if scores["held_out"]["count"] else "all"
     of = "held-out" if which == "held_out" else "all frames"
@@ -150,7 +167,7 @@ def headline(metrics: Mapping[str, Any]) -> list[Figure]:
 
 
 def other_figures(metrics: Mapping[str, Any]) -> list[Figure]:
-    """Figures of metrics.json that have no table of their own, those that the run has."""
+    """Return the figures of metrics.json that have no table of their own, as far as the run has them."""
     figures = [
         Figure(label, shown(metrics[name], form) + unit)
         for name, (label, form, unit) in OTHERS.items()
@@ -164,7 +181,7 @@ def other_figures(metrics: Mapping[str, Any]) -> list[Figure]:
 
 
 def stages(metrics: Mapping[str, Any]) -> list[Stage]:
-    """Where the time went, without stages that took none."""
+    """Return the time of each stage, without stages that took none."""
     seconds = metrics["seconds"]
     total = max(seconds["total"], 1e-9)
     return [
@@ -175,12 +192,12 @@ def stages(metrics: Mapping[str, Any]) -> list[Stage]:
 
 
 def shown(value: float | None, form: str) -> str:
-    """A figure, or a dash where there is none."""
+    """Format a figure; a dash if it is None or not finite."""
     return "–" if value is None or not math.isfinite(value) else format(value, form)
 
 
 def duration(seconds: float) -> str:
-    """Seconds as a person says them."""
+    """Format a duration for reading, such as "12 min"."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -188,7 +205,7 @@ def duration(seconds: float) -> str:
 
 
 def remarks(metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
-    """What the run said on its way, and what a reader of its figures should know."""
+    """Return the run's notes, with a warning if no frame was held out."""
     said = [without_credentials(note) for note in notes]
     scores = metrics[last_stage(metrics)]
     if not scores["held_out"]["count"]:

@@ -1,4 +1,4 @@
-"""Writes `report.html` from what a run has recorded."""
+"""Writes `report.html` from a run's record."""
 
 from __future__ import annotations
 
@@ -27,10 +27,19 @@ __all__ = ["ReportedRun", "write_report"]
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """All that a report is made of.
+    """The data of a report.
 
-    metrics: as in metrics.json. tracked: the tracker's T_camera_world (4, 4) of every frame; truth: the true ones, or
-    none. keyframes: positions among the frames. scene_depth: [scene units]. comparisons: of the last map.
+    Attributes:
+        config: The scene's settings.
+        record: Notes taken during the run.
+        metrics: Content of metrics.json.
+        scores: Scores of all frames in all versions.
+        versions: Map versions by name; the last one is the final map.
+        tracked: The tracker's T_camera_world (4, 4) of every frame.
+        truth: Ground-truth T_camera_world (4, 4) of every frame, or empty.
+        keyframes: Positions of the keyframes among the frames.
+        scene_depth: The scene's depth [scene units].
+        comparisons: Frames next to renders of the final map.
     """
 
     config: SceneConfig
@@ -46,7 +55,7 @@ class ReportedRun:
 
 
 def write_report(path: Path, run: ReportedRun) -> None:
-    """Write the page; it names nothing outside of itself that a browser would load."""
+    """Write the page. It is self-contained: a browser loads nothing else for it."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -72,7 +81,7 @@ def write_report(path: Path, run: ReportedRun) -> None:
 
 
 def _drawings(run: ReportedRun) -> dict[str, str]:
-    """The SVG of every drawing that the run has something for."""
+    """Return the SVG of every drawing that the run has data for."""
     last = list(run.versions.values())[-1]
     plan = plan_of(last.trajectory)
     floor = floor_plan(plan, last.gaussians, _centres(last.trajectory))
@@ -92,7 +101,7 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
 def _aligned(
     truth: Sequence[NDArray[np.float64]], estimate: Sequence[NDArray[np.float64]]
 ) -> NDArray[np.float64] | None:
-    """True camera centres (N, 3) in the world of the estimate, by the similarity that fits best; None without."""
+    """Align the true camera centres (N, 3) to the estimate by the best similarity. None without ground truth."""
     if len(truth) != len(estimate) or len(truth) < 3:
         return None
     there = _centres(truth)
@@ -109,7 +118,7 @@ def _svg_uri(svg: str) -> str:
 
 
 def _scale() -> str:
-    """The colours of the error maps from none to FULL_SCALE, as a strip."""
+    """Return the colour scale of the error maps, from 0 to FULL_SCALE, as a data URI."""
     strip = error_colours(np.linspace(0.0, FULL_SCALE, 128, dtype=np.float32)[None])
     _, data = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")

@@ -1,4 +1,4 @@
-"""Frames beside the map and where they differ, small enough to be put into a page."""
+"""Comparisons of frames and renders with their difference, small enough to embed in a page."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from modp_ti.outputs.evaluation import FrameScore
 
 __all__ = ["FULL_SCALE", "Album", "Comparison", "data_uri", "error_colours", "error_map", "picked"]
 
-# Error that has the last colour of the error maps.
+# Error at which the colour scale ends.
 FULL_SCALE = 0.2
-# Frames that are shown, and of these the worst ones; the others are spread over the ranks up to the best.
+# Number of frames shown, and how many of them are the worst ones. The others are spread evenly over the ranks up to the
+# best.
 SHOWN = 7
 WORST = 3
 # Longer side of a picture in the page [px], and its JPEG quality.
@@ -27,9 +28,14 @@ QUALITY = 85
 
 @dataclass(frozen=True)
 class Comparison:
-    """A frame, the map from its place, and their difference, each as the address of a picture within the page.
+    """A frame, the render from its pose, and their difference, each as a data URI.
 
-    rank: "worst", "median", "best" or empty. score: of the map that is shown.
+    Attributes:
+        score: The frame's score in the map shown.
+        rank: "worst", "median", "best" or empty.
+        frame: The frame's image.
+        render: The render.
+        error: The error map.
     """
 
     score: FrameScore
@@ -41,26 +47,43 @@ class Comparison:
 
 @dataclass
 class Album:
-    """Keeps the pictures that a report may need of an evaluation: of `wanted` frames, by index, as 8 bits."""
+    """Keeps 8-bit copies of the frames and renders that a report may show.
+
+    Attributes:
+        wanted: Indices of the frames to keep.
+        kept: Image and render by index.
+    """
 
     wanted: frozenset[int]
     kept: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, held_out: Sequence[bool]) -> Album:
-        """For frames of which those held out are in the folder of pictures anyhow; for others it keeps a few."""
+        """Create an album for a run.
+
+        With held-out frames it keeps nothing, as their pictures are in the `renders` folder. Otherwise it keeps a few
+        frames.
+
+        Args:
+            held_out: Whether each frame is held out.
+        """
         if any(held_out):
             return cls(frozenset())
         return cls(frozenset(np.linspace(0, len(held_out) - 1, min(SHOWN, len(held_out))).round().astype(int).tolist()))
 
     def keep(self, index: int, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
-        """Keep frame and render (H, W, 3) in [0, 1] where they are wanted."""
+        """Store the image and render (H, W, 3), in [0, 1], if the frame is wanted."""
         if index in self.wanted:
             image, render = (np.round(np.clip(p, 0, 1) * 255).astype(np.uint8) for p in (image, render))
             self.kept[index] = image, render
 
     def comparisons(self, scores: Iterable[FrameScore], renders: Path) -> list[Comparison]:
-        """What the page shows, the worst first, by the scores of one map. renders: folder of the held-out pairs."""
+        """Return the comparisons of the page, worst first.
+
+        Args:
+            scores: Scores of one map version.
+            renders: Folder with the pictures of the held-out frames.
+        """
         scores = list(scores)
         held_out = [score for score in scores if score.held_out]
         chosen = picked(held_out or [score for score in scores if score.index in self.kept])
@@ -71,7 +94,11 @@ class Album:
 
 
 def picked(scores: Sequence[FrameScore]) -> list[tuple[FrameScore, str]]:
-    """At most SHOWN scores with words for their ranks: the worst ones, then at equal steps to the best."""
+    """Choose at most SHOWN scores: the worst ones, then evenly spaced ranks up to the best.
+
+    Returns:
+        The scores with their rank in words, which may be empty.
+    """
     order = sorted(scores, key=lambda score: (score.psnr, score.index))
     last = len(order) - 1
     places = list(range(min(WORST, len(order))))
@@ -84,18 +111,18 @@ def picked(scores: Sequence[FrameScore]) -> list[tuple[FrameScore, str]]:
 
 
 def error_map(image: NDArray[np.uint8], render: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Difference (H, W) of two pictures (H, W, 3): mean of its size over the three colours, 1 from black to white."""
+    """Return the mean absolute difference (H, W) of two pictures (H, W, 3), scaled to [0, 1]."""
     return (np.abs(image.astype(np.float32) - render.astype(np.float32)).mean(axis=2) / 255.0).astype(np.float32)
 
 
 def error_colours(error: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3), RGB, of errors (H, W): from black for none to pale yellow for FULL_SCALE and more."""
+    """Map errors (H, W) to RGB colours (H, W, 3), from black for 0 to pale yellow for FULL_SCALE and more."""
     steps = np.round(np.clip(error / FULL_SCALE, 0.0, 1.0) * 255.0).astype(np.uint8)
     return cv2.applyColorMap(steps, cv2.COLORMAP_INFERNO)[..., ::-1]
 
 
 def data_uri(picture: NDArray[np.uint8], longest: int = LONGEST) -> str:
-    """A picture (H, W, 3), RGB, as the address of a JPEG that it holds itself, its sides at most `longest` pixels."""
+    """Encode a picture (H, W, 3) RGB as a JPEG data URI, scaled down to sides of at most `longest` pixels."""
     height, width = picture.shape[:2]
     factor = min(1.0, longest / max(height, width))
     if factor < 1.0:
@@ -112,7 +139,7 @@ def _comparison(score: FrameScore, rank: str, image: NDArray[np.uint8], render: 
 
 
 def _read_pair(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Frame and render of a picture that shows them side by side."""
+    """Split a side-by-side picture into frame and render."""
     pair = cv2.imread(str(path))[..., ::-1]
     half = pair.shape[1] // 2
     return pair[:, :half], pair[:, half:]

@@ -1,4 +1,4 @@
-"""The view from above: where up is, and what of the map lies below the cameras."""
+"""The view from above: the up direction, and the part of the map below the cameras."""
 
 from __future__ import annotations
 
@@ -12,28 +12,35 @@ from fields.map.gaussians import SH_C0
 
 __all__ = ["Plan", "floor_plan", "plan_of"]
 
-# Gaussians that are shown, and how opaque they are at least.
+# Maximum number of Gaussians drawn, and their minimum opacity.
 MOST_SHOWN = 20_000
 LEAST_OPACITY = 0.5
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A view from above: `right` and `ahead` on the page and `up` towards the reader, unit vectors (3,)."""
+    """Axes of a view from above.
+
+    Attributes:
+        right: (3,) unit vector to the right of the page.
+        ahead: (3,) unit vector to the top of the page.
+        up: (3,) unit vector towards the reader.
+    """
 
     right: NDArray[np.float64]
     ahead: NDArray[np.float64]
     up: NDArray[np.float64]
 
     def on_page(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Places (N, 2) of world points (N, 3)."""
+        """Project world points (N, 3) to the page (N, 2)."""
         return points @ np.stack([self.right, self.ahead], axis=1)
 
 
 def plan_of(poses: Sequence[NDArray[np.float64]]) -> Plan:
-    """The plan for cameras T_camera_world (4, 4): up as they were held on average, their longest way to the right.
+    """Return the plan for cameras at T_camera_world (4, 4).
 
-    The first camera looks up the page.
+    Up is the cameras' mean up direction. The longest extent of the path is horizontal, and the first camera faces the
+    top of the page.
     """
     T = np.asarray(poses)
     rotations = T[:, :3, :3]
@@ -54,9 +61,12 @@ def plan_of(poses: Sequence[NDArray[np.float64]]) -> Plan:
 def floor_plan(
     plan: Plan, gaussians: Mapping[str, NDArray], centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (N, 2) and colours (N, 3) of opaque Gaussians below the cameras at `centres` (M, 3), the lowest first.
+    """Return page positions (N, 2) and colours (N, 3) of the opaque Gaussians below the cameras, lowest first.
 
-    gaussians: by name as `GaussianField.to_numpy`.
+    Args:
+        plan: The axes of the view.
+        gaussians: Arrays by name, as from `GaussianField.to_numpy`.
+        centres: (M, 3) camera centres. Gaussians above their median height are left out.
     """
     position = np.asarray(gaussians["position"], dtype=np.float64)
     opaque = np.asarray(gaussians["opacity_logit"]).ravel() > np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
@@ -69,6 +79,6 @@ def floor_plan(
 
 
 def _unit(v: NDArray[np.float64], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The direction of `v`, or of `otherwise` where it has none."""
+    """Normalise `v`, or `otherwise` if `v` is close to zero."""
     v = v if np.linalg.norm(v) > 1e-6 else otherwise
     return v / np.linalg.norm(v)

@@ -1,4 +1,4 @@
-"""The drawings of a report, each as the text of an SVG picture."""
+"""The report's drawings. Each function returns an SVG as text."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Arguments = ParamSpec("Arguments")
 
 WIDTH = 9.2  # inches; the page scales it
 PANEL = 1.15  # width over height of a view from above
-# Colours that differ in print and for the colour-blind too (Okabe and Ito).
+# Colours that differ in print and for colour-blind readers (Okabe and Ito).
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 OF_STAGE = {"online": BLUE, "refined": ORANGE, "offline": ORANGE}
 STYLE = {
@@ -44,17 +44,17 @@ STYLE = {
 
 
 def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:
-    """The function, giving the SVG of the figure that it draws."""
+    """Decorator that turns a function returning a figure into one returning its SVG."""
 
     @functools.wraps(draw)
     def svg(*values: Arguments.args, **named: Arguments.kwargs) -> str:
-        # Imported here: a run must not wait for it before it begins. The note that its fonts are being listed, which
-        # it makes once on a machine, is no news for a user.
+        # Imported here so that a run does not wait for matplotlib at its start. The message about building its font
+        # cache, once per machine, does not concern the user.
         logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
         import matplotlib.style
 
         file = io.StringIO()
-        with matplotlib.style.context(["default", STYLE]):  # and not as the user has set matplotlib
+        with matplotlib.style.context(["default", STYLE]):  # ignore the user's matplotlib settings
             about = dict.fromkeys(("Date", "Creator", "Format", "Type"))
             draw(*values, **named).savefig(file, format="svg", dpi=130, metadata=about)
         return file.getvalue()
@@ -63,7 +63,7 @@ def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:
 
 
 def _figure(height: float) -> Figure:
-    """An empty figure. height: [inches]."""
+    """Return an empty figure of this height [inches]."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(WIDTH, height))
@@ -71,7 +71,7 @@ def _figure(height: float) -> Figure:
 
 @_drawn
 def psnr_of_frames(scores: Sequence[FrameScore]) -> Figure:
-    """PSNR of every frame in each version of the map; held-out frames as dots."""
+    """Plot the PSNR of every frame in each version of the map, with held-out frames as dots."""
     figure = _figure(3.0)
     axes = figure.add_subplot()
     for stage in dict.fromkeys(score.stage for score in scores):
@@ -88,7 +88,7 @@ def psnr_of_frames(scores: Sequence[FrameScore]) -> Figure:
 
 @_drawn
 def growth(frames: Sequence[FrameNote]) -> Figure:
-    """Gaussians, frames per second and PSNR of the views being optimised, over the frames as they were taken in."""
+    """Plot the number of Gaussians, frames per second and the PSNR of the optimised views over the frames."""
     mapped = [note for note in frames if note.psnr is not None]
     panels = 3 if mapped else 2
     window = max(5, len(frames) // 20)
@@ -106,7 +106,7 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
         axes[0].plot(*places, ".", ms=4, color=BLUE, label="keyframes")
         axes[0].legend(loc="upper left")
     _line(axes[1], x, frame_rate(frames, window), "frame-rate", color=GREEN)
-    axes[1].set_yscale("log")  # frames that are no keyframes pass a hundred times faster
+    axes[1].set_yscale("log")  # frames that are not keyframes are a hundred times faster
     _label(axes[1], "" if mapped else "frame", f"frames per second\n(last {window})")
     if mapped:
         y = np.array([note.psnr for note in mapped], float)
@@ -117,7 +117,7 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
 
 @_drawn
 def steps(notes: Sequence[StepNote]) -> Figure:
-    """PSNR over the steps of refinement or offline optimisation, with Gaussians where they change; smoothed."""
+    """Plot the smoothed PSNR over the steps of refinement or offline optimisation, and the Gaussians if recorded."""
     x = np.array([note.step for note in notes], float)
     gaussians = [note.gaussians for note in notes if note.gaussians is not None]
     panels = 2 if gaussians else 1
@@ -142,10 +142,15 @@ def trajectory(
     floor: tuple[NDArray[np.float64], NDArray[np.float64]],
     truth: NDArray[np.float64] | None = None,
 ) -> Figure:
-    """Camera centres of T_camera_world (4, 4) from above, over the map.
+    """Plot the camera centres from above, over the map.
 
-    keyframes: positions among the frames. floor: places (N, 2) and colours (N, 3) of Gaussians. truth: true centres
-    (M, 3) in the map's world.
+    Args:
+        plan: The axes of the view.
+        before: The tracker's T_camera_world (4, 4).
+        after: T_camera_world (4, 4) after mapping.
+        keyframes: Positions of the keyframes among the frames.
+        floor: Page positions (N, 2) and colours (N, 3) of Gaussians.
+        truth: (M, 3) true camera centres in the map's world, or None.
     """
     ways = {"after": plan.on_page(_centres(after)), "before": plan.on_page(_centres(before))}
     if truth is not None:
@@ -182,7 +187,13 @@ def pose_changes(
     versions: Mapping[str, Sequence[NDArray[np.float64]]],
     scene_depth: float,
 ) -> Figure:
-    """How far each frame's camera lies from where the tracker had put it; poses T_camera_world (4, 4) by version."""
+    """Plot how far each version moved and turned the cameras away from the tracker's poses.
+
+    Args:
+        tracked: The tracker's T_camera_world (4, 4).
+        versions: T_camera_world (4, 4) of every frame, by version.
+        scene_depth: The scene's depth [scene units].
+    """
     figure = _figure(3.4)
     above, below = figure.subplots(2, 1, sharex=True)
     x = np.arange(len(tracked), dtype=float)
@@ -200,7 +211,7 @@ def pose_changes(
 
 
 def _line(axes: Axes, x: NDArray, y: NDArray, name: str, **style: object) -> None:
-    """A curve with a name in the SVG; a single value is a dot, and what is not finite a gap."""
+    """Plot a curve with an id in the SVG. A single value becomes a dot; values that are not finite become gaps."""
     finite = np.isfinite(y)
     marker = {"marker": "o", "ms": 4} if finite.sum() < 2 else {}
     axes.plot(x, np.where(finite, y, np.nan), gid=name, **marker, **style)
@@ -217,7 +228,7 @@ def _centres(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
 
 
 def _extent(ways: NDArray[np.float64], floor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners of what is shown, of one shape: all of the ways, and the floor but for its outliers."""
+    """Return the corners of the plotted area, which has a fixed aspect: all paths, and the floor without outliers."""
     low, high = ways.min(axis=0), ways.max(axis=0)
     if len(floor):
         low = np.minimum(low, np.quantile(floor, 0.02, axis=0))

@@ -1,4 +1,4 @@
-"""`RunRecord`: what is noted while a run goes on, and no other of its files holds."""
+"""`RunRecord`: data for the report that is collected during a run and stored in no other output file."""
 
 from __future__ import annotations
 
@@ -15,9 +15,15 @@ __all__ = ["FrameNote", "RunRecord", "StepNote"]
 
 @dataclass(frozen=True, slots=True)
 class FrameNote:
-    """A frame that was taken in. done: seconds since the first began. gaussians: in the map when it was done.
+    """A processed frame.
 
-    psnr: of the views of its last optimisation step [dB], None where nothing was optimised.
+    Attributes:
+        index: The frame's index.
+        held_out: Whether it was held out.
+        is_keyframe: Whether it became a keyframe.
+        done: Time since the first frame began [s].
+        gaussians: Number of Gaussians after the frame.
+        psnr: Mean PSNR of the last optimisation step's views [dB], None if nothing was optimised.
     """
 
     index: int
@@ -30,7 +36,13 @@ class FrameNote:
 
 @dataclass(frozen=True, slots=True)
 class StepNote:
-    """A step of refinement or of offline optimisation. psnr: mean of its views [dB]. gaussians: where it says."""
+    """A step of refinement or offline optimisation.
+
+    Attributes:
+        step: Number of the step, from 1.
+        psnr: Mean PSNR of its views [dB].
+        gaussians: Number of Gaussians, None during refinement.
+    """
 
     step: int
     psnr: float
@@ -39,10 +51,15 @@ class StepNote:
 
 @dataclass
 class RunRecord:
-    """Frames and steps in their order.
+    """Frames and steps of a run, in order.
 
-    notes: one-line remarks that the run made, such as frames that were skipped. device: what it said of the backend
-    that it took. clock: seconds from any beginning. started: of the calendar, seconds since 1970.
+    Attributes:
+        clock: Returns seconds from an arbitrary origin.
+        frames: The processed frames.
+        steps: The finished steps.
+        notes: One-line notes of the run, for example about skipped frames.
+        device: Description of the backend.
+        started: When the run began [s since 1970].
     """
 
     clock: Callable[[], float] = time.perf_counter
@@ -54,11 +71,16 @@ class RunRecord:
     _first: float = 0.0
 
     def begin(self) -> None:
-        """The first frame is about to be taken in, or the next one of a resumed run."""
+        """Start the clock, before the first frame or before the next frame of a resumed run."""
         self._first = self.clock() - (self.frames[-1].done if self.frames else 0.0)
 
     def frame(self, index: int, report: FrameReport | None) -> None:
-        """Note a frame that is done; report: None for one that is held out."""
+        """Record a finished frame.
+
+        Args:
+            index: The frame's index.
+            report: What the frame did to the map, None for a held-out frame.
+        """
         done = self.clock() - self._first
         if report is None:
             before = self.frames[-1].gaussians if self.frames else 0
@@ -67,9 +89,9 @@ class RunRecord:
             self.frames.append(FrameNote(index, False, report.is_keyframe, done, report.gaussians, report.psnr))
 
     def refined(self, step: int, psnr: float) -> None:
-        """Note a step of post refinement; steps count from 1."""
+        """Record a refinement step. Steps count from 1."""
         self.steps.append(StepNote(step, psnr))
 
     def optimised(self, step: int, gaussians: int, psnr: float) -> None:
-        """Note a step of offline optimisation; steps count from 1."""
+        """Record a step of the offline optimisation. Steps count from 1."""
         self.steps.append(StepNote(step, psnr, gaussians))

@@ -1,1 +1,1 @@
-"""The viewer: a web page that shows a map while it grows, or a finished one."""
+"""The viewer: a web page that shows a growing or a finished map."""

@@ -1,4 +1,4 @@
-"""`CostLimit`: keeps what the viewer costs below a share of the mapper's time, by measuring it."""
+"""`CostLimit`: measures the viewer's cost and keeps it below a share of the mapper's time."""
 
 from __future__ import annotations
 
@@ -9,15 +9,22 @@ from contextlib import contextmanager
 
 __all__ = ["CostLimit", "ThreadClock"]
 
-# Seconds of mapping whose share can be saved up while nothing is shown.
+# Mapping time [s] whose share can be saved up while nothing is shown.
 SAVED_UP = 60.0
 
 
 class CostLimit:
-    """An account in seconds: `share` of the mapping time comes in, what the viewer costs goes out.
+    """A time budget that earns `share` of the elapsed time and pays for the viewer's work.
 
-    Something may be done while there is anything in it, and may overdraw it; nothing more is then done until mapping
-    has paid for it. So the cost stays below `share` of the time, but for the last thing done.
+    Work may start while the balance is positive, and may overdraw it. The next work then waits until the balance is
+    positive again. The total cost therefore exceeds `share` of the time by at most the last piece of work.
+
+    Args:
+        share: Fraction of the mapping time that the viewer may cost.
+        clock: Returns the time [s].
+
+    Attributes:
+        cost: Total cost so far [s].
     """
 
     def __init__(self, share: float, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -28,18 +35,18 @@ class CostLimit:
         self._seen = clock()
 
     def allows(self) -> bool:
-        """Whether something may be done now."""
+        """Return whether work may start now."""
         self._earn()
         return self._balance > 0.0
 
     def charge(self, seconds: float) -> None:
-        """Something has cost this much."""
+        """Subtract a cost [s] from the balance."""
         self.cost += seconds
         self._balance -= seconds
 
     @contextmanager
     def measured(self) -> Iterator[None]:
-        """Charge for the block, by the clock."""
+        """Charge the wall time of this context."""
         started = self._clock()
         try:
             yield
@@ -48,7 +55,7 @@ class CostLimit:
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Nothing comes in during the block: the mapper is held."""
+        """Earn nothing inside this context, since the mapper is paused."""
         self._earn()
         try:
             yield
@@ -62,9 +69,10 @@ class CostLimit:
 
 
 class ThreadClock:
-    """Processor time [s] that threads have taken since it was asked last. They must be alive at first.
+    """CPU time [s] that a set of threads has taken since the last query.
 
-    Where the system does not tell (it does on Linux), always 0.
+    The threads must be alive when the clock is created. On systems without per-thread CPU clocks, the result is always
+    0.
     """
 
     def __init__(self, threads: list[threading.Thread]) -> None:

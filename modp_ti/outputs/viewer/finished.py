@@ -1,4 +1,4 @@
-"""The page of a finished map: `modp-ti view OUT`."""
+"""The page of a finished map, for `modp-ti view OUT`."""
 
 from __future__ import annotations
 
@@ -33,17 +33,25 @@ from modp_ti.outputs.viewer.splats import splats_of
 
 __all__ = ["FinishedViewer"]
 
-# Largest pictures that are rendered for a browser [px].
+# Pictures for a browser are at most this large, or as large as the run's cameras if those are larger [px].
 PICTURE = 1280, 960
-# Tracked points that are shown; of more, as many at equal steps.
+# Maximum number of tracked points on the page. More are subsampled evenly.
 MAX_POINTS = 20_000
 
 
 class FinishedViewer:
-    """Serves the page of a finished run until `close`. The thread that makes it renders, in `serve`.
+    """Serves the page of a finished run until `close`.
 
-    Where the run kept its images (`export.images`), the chosen frame has its picture, and there is an error to show.
-    Raises InputError as `Page` does, and for a damaged run.
+    The thread that creates the viewer must call `serve`, which renders. If the run kept its images (`export.images`),
+    the page shows the chosen frame's image and offers the error mode.
+
+    Args:
+        run: The finished run.
+        settings: The viewer's settings.
+        device: "cpu", "cuda" or "auto".
+
+    Raises:
+        InputError: If the page cannot be served, or the run is damaged.
     """
 
     def __init__(self, run: FinishedRun, settings: ViewSettings, device: str) -> None:
@@ -68,14 +76,14 @@ class FinishedViewer:
             f"**{len(run)}** frames, {len(keyframes)} keyframes  \n{len(gaussians['position']):,} Gaussians"
         )
         self._show_frame(0)
-        self._renderer.view(PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16), run.poses[0])  # compiles what there is to
+        self._renderer.view(PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16), run.poses[0])  # compiles the kernels
 
     def close(self) -> None:
-        """Serve no longer."""
+        """Stop serving the page."""
         self.page.close()
 
     def serve(self, done: Callable[[], bool] = lambda: False) -> None:
-        """Render what browsers ask for, until `done`."""
+        """Render what browsers request, until `done` returns true."""
         while not done():
             index = self._chosen.take(timeout=0.0)
             if index is not None:
@@ -105,11 +113,11 @@ class FinishedViewer:
             else:
                 picture = picture_of(view, mode, self.run.record.scene_depth)
         except ValueError:
-            return  # from amidst large Gaussians there is more to draw than there is room for
+            return  # a viewpoint inside large Gaussians can exceed the renderer's capacity
         self.page.show_picture(browser.client, picture)
 
     def _photograph(self, index: int) -> Photograph:
-        """The kept image of a frame. Raises InputError where it is gone."""
+        """Return the kept image of a frame. Raises InputError if it is missing or damaged."""
         run = self.run
         path = run.folder / "colmap" / "images" / run.names[index]
         image = _kept_picture(path)
@@ -124,7 +132,7 @@ class FinishedViewer:
 
 
 def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
-    """A picture (H, W, 3) RGB that the run kept; None where it is missing or damaged."""
+    """Read a picture (H, W, 3) RGB that the run kept. None if it is missing or damaged."""
     try:
         data = read_bytes(path)
     except OSError:
@@ -133,7 +141,7 @@ def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
 
 
 def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:
-    """Points (N, 3) of the run's COLMAP model, which has been read before."""
+    """Return the points (N, 3) of the run's COLMAP model, at most MAX_POINTS of them."""
     points = read_colmap_model(run.folder / "colmap").points3D
     xyz = np.array([points[number].xyz for number in sorted(points)]).reshape(-1, 3)
     return xyz if len(xyz) <= MAX_POINTS else xyz[np.arange(MAX_POINTS) * len(xyz) // MAX_POINTS]

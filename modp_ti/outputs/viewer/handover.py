@@ -1,4 +1,7 @@
-"""What passes between the mapping thread and those of the viewer: nothing queues up, and nobody waits for a browser."""
+"""Data exchange between the mapping thread and the viewer's threads.
+
+Nothing queues up, and no thread waits for a browser.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +15,17 @@ from numpy.typing import NDArray
 
 __all__ = ["BrowserCamera", "Gate", "Latest", "Requests"]
 
-# Browsers that pictures are rendered for.
+# Maximum number of browsers that get rendered pictures.
 MAX_BROWSERS = 32
 
 T = TypeVar("T")
 
 
 class Latest(Generic[T]):
-    """Room for one value: a newer one takes the place of one that nobody has fetched yet.
+    """A slot for one value. A new value replaces one that has not been fetched, or is merged with it.
 
-    merge: (newer, waiting) -> what waits then.
+    Args:
+        merge: Combines (newer value, waiting value) into the value that waits next.
     """
 
     def __init__(self, merge: Callable[[T, T], T] = lambda newer, waiting: newer) -> None:
@@ -32,17 +36,24 @@ class Latest(Generic[T]):
 
     @property
     def waiting(self) -> T | None:
-        """What has not been fetched yet."""
+        """The value that has not been fetched yet, or None."""
         return self._value
 
     def put(self, value: T) -> None:
-        """Leave a value; never waits."""
+        """Store a value without waiting for a reader."""
         with self._changed:
             self._value = value if self._value is None else self._merge(value, self._value)
             self._changed.notify_all()
 
     def take(self, timeout: float | None = None) -> T | None:
-        """Fetch the value, waiting for one; None where none came in `timeout` seconds, and after `close`."""
+        """Fetch the value, waiting until there is one.
+
+        Args:
+            timeout: Longest time to wait [s], None for no limit.
+
+        Returns:
+            The value, or None after the timeout and after `close`.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._value is not None or self._closed, timeout)
             value, self._value = self._value, None
@@ -53,16 +64,16 @@ class Latest(Generic[T]):
         return self._closed
 
     def close(self) -> None:
-        """Let those who wait go."""
+        """Release all waiting readers. From here on, `take` returns None."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
 
 class Gate:
-    """Lets the mapping thread through, holds it while paused, lets one frame or step through for each step asked for.
+    """Controls whether the mapping thread proceeds. While paused, it lets one frame or step through per request.
 
-    A step that is asked for while another is under way is the same step: clicks do not pile up.
+    Requests for a step do not add up while one is pending, so repeated clicks have no delayed effect.
     """
 
     def __init__(self) -> None:
@@ -81,18 +92,26 @@ class Gate:
             self._changed.notify_all()
 
     def step(self) -> None:
-        """Let one through, and hold the next."""
+        """Let one frame or step through, then pause."""
         with self._changed:
             self._paused = self._step = True
             self._changed.notify_all()
 
     def wake(self) -> None:
-        """Have whoever is held look around."""
+        """Make a waiting `hold` call its `meanwhile` now."""
         with self._changed:
             self._changed.notify_all()
 
     def hold(self, meanwhile: Callable[[], None], every: float = 0.05) -> float:
-        """Return when the gate is open; the seconds that took. Meanwhile calls `meanwhile` every so many seconds."""
+        """Block while the gate is closed.
+
+        Args:
+            meanwhile: Called repeatedly while blocked.
+            every: Time between the calls [s].
+
+        Returns:
+            The time spent [s].
+        """
         started = time.perf_counter()
         while True:
             with self._changed:
@@ -107,9 +126,15 @@ class Gate:
 
 @dataclass(frozen=True)
 class BrowserCamera:
-    """Where a browser looks from, in the page's units: rotation camera to world (w, x, y, z) and centre.
+    """A browser's camera, in the page's units and with OpenCV axes.
 
-    OpenCV axes. fov: vertical [rad]. width, height: of its canvas [px].
+    Attributes:
+        client: The browser's id.
+        wxyz: Camera-to-world rotation as a quaternion (w, x, y, z).
+        position: (3,) camera centre.
+        fov: Vertical field of view [rad].
+        width: Width of the canvas [px].
+        height: Height of the canvas [px].
     """
 
     client: int
@@ -121,15 +146,19 @@ class BrowserCamera:
 
 
 class Requests:
-    """What browsers ask for: the last word of each, no more than there are browsers.
+    """The pictures that browsers need, with at most one pending request per browser.
 
-    A picture is due where a browser has moved, or another mode was chosen, or the map has changed since its last one.
+    A browser needs a new picture when its camera has moved, the mode has changed, or the map has changed since its last
+    one.
+
+    Args:
+        mode: The first mode.
     """
 
     def __init__(self, mode: str) -> None:
         self._mode = mode
         self._cameras: dict[int, BrowserCamera] = {}
-        self._due: list[int] = []  # browsers whose picture is out of date, the one that waits longest first
+        self._due: list[int] = []  # ids of browsers with an outdated picture, longest waiting first
         self._changed = threading.Condition()
 
     @property
@@ -137,11 +166,11 @@ class Requests:
         return self._mode
 
     def __len__(self) -> int:
-        """Browsers that are there."""
+        """Number of connected browsers."""
         return len(self._cameras)
 
     def look(self, camera: BrowserCamera) -> None:
-        """A browser is there, or has moved. Beyond MAX_BROWSERS, further ones see the page and get no pictures."""
+        """Register a browser or its new camera. Browsers beyond MAX_BROWSERS see the page but get no pictures."""
         with self._changed:
             if camera.client not in self._cameras and len(self._cameras) >= MAX_BROWSERS:
                 return
@@ -151,26 +180,30 @@ class Requests:
             self._changed.notify_all()
 
     def leave(self, client: int) -> None:
-        """A browser is gone."""
+        """Remove a browser that has disconnected."""
         with self._changed:
             self._cameras.pop(client, None)
             self._due = [other for other in self._due if other != client]
             self._changed.notify_all()
 
     def show(self, mode: str) -> None:
-        """Another mode for all browsers."""
+        """Change the mode for all browsers."""
         with self._changed:
             self._mode = mode
         self.outdate()
 
     def outdate(self) -> None:
-        """The map has changed."""
+        """Mark all pictures as outdated, after a change of the map."""
         with self._changed:
             self._due += [client for client in self._cameras if client not in self._due]
             self._changed.notify_all()
 
     def next(self, timeout: float = 0.0) -> BrowserCamera | None:
-        """The camera of the browser that has waited longest for a picture; None where none does."""
+        """Return the camera of the browser that has waited longest, or None if no picture is needed.
+
+        Args:
+            timeout: Longest time to wait for a request [s].
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._due, timeout)
             return self._cameras[self._due.pop(0)] if self._due else None

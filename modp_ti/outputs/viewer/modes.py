@@ -1,4 +1,4 @@
-"""What the page can show, as pictures of our own renderer from a browser's camera."""
+"""The display modes: pictures that the renderer computes for a browser's camera."""
 
 from __future__ import annotations
 
@@ -26,27 +26,31 @@ __all__ = [
     "pinhole_of",
 ]
 
-# Splats are drawn by the browser; the others are pictures behind the scene.
+# The browser draws splats itself. The other modes are background pictures from this program's renderer.
 SPLATS = "splats"
 MODES = (SPLATS, "colour", "depth", "opacity", "error")
-# Fields of view [rad] and canvases (width over height) of browsers that are not taken for a mistake.
+# Valid ranges of a browser's field of view [rad] and canvas aspect (width / height). Others are ignored as faulty.
 FIELDS_OF_VIEW = (np.radians(1.0), np.radians(170.0))
 ASPECTS = (0.1, 10.0)
 LEAST_SIDE = 16
-# Mean absolute difference of colours, in [0, 1], from which on an error is shown as the largest.
+# Mean absolute colour difference, in [0, 1], at which the error scale ends.
 LARGEST_ERROR = 0.25
-# What no photograph shows has no error.
+# Grey value of pixels that no photograph shows and that therefore have no error.
 UNSEEN = 40
-# A surface counts as seen by a photograph where the map's depth there agrees within this share.
+# A photograph sees a surface if the map's depth there agrees within this relative tolerance.
 SAME_SURFACE = 0.05
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A frame to compare the map with.
+    """A frame's image, to compare the map with.
 
-    rgba: (H, W, 4) uint8, 255 where it is valid. exposure: (3, 4), vignette: (H', W', 3) of any size, as in `Keyframe`;
-    None where there is none.
+    Attributes:
+        rgba: (H, W, 4) uint8; alpha is 255 where the pixel is valid.
+        camera: The frame's camera.
+        T_camera_world: (4, 4) refined pose.
+        exposure: (3, 4) as in `Keyframe`, or None.
+        vignette: (H', W', 3) of any size as in `Keyframe`, or None.
     """
 
     rgba: NDArray[np.uint8]
@@ -59,9 +63,18 @@ class Photograph:
 def pinhole_of(
     camera: BrowserCamera, units: float, max_width: int, max_height: int
 ) -> tuple[PinholeCamera, NDArray[np.float64]] | None:
-    """The browser's camera as one of ours, with T_camera_world (4, 4): as large as fits, of its canvas's shape.
+    """Convert a browser's camera to a pinhole camera and pose.
 
-    units: of the page, in a unit of the world. None for what no browser can mean.
+    The picture has the canvas's aspect ratio and the largest size that fits.
+
+    Args:
+        camera: The browser's camera.
+        units: Page units per world unit.
+        max_width: Largest width [px].
+        max_height: Largest height [px].
+
+    Returns:
+        The camera and T_camera_world (4, 4), or None if the browser's numbers are invalid.
     """
     numbers = np.concatenate([camera.wxyz, camera.position, [camera.fov]])
     if not np.isfinite(numbers).all() or np.linalg.norm(camera.wxyz) < 1e-6:
@@ -75,7 +88,7 @@ def pinhole_of(
     width = int(np.clip(round(height * aspect), min(LEAST_SIDE, max_width), max_width))
     height = int(np.clip(round(height), min(LEAST_SIDE, max_height), max_height))
     half = np.tan(camera.fov / 2)
-    # Each focal length of its own: the page stretches the picture over its canvas.
+    # fx and fy are computed separately, because the page stretches the picture over its canvas.
     pinhole = PinholeCamera(0.5 * width / (half * aspect), 0.5 * height / half, width / 2, height / 2, width, height)
     T = np.eye(4)
     T[:3, :3] = matrix_from_quaternion(camera.wxyz)
@@ -84,7 +97,7 @@ def pinhole_of(
 
 
 def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.uint8]:
-    """Colour, depth or opacity as a picture (H, W, 3)."""
+    """Return colour, depth or opacity of a view as a picture (H, W, 3)."""
     if mode == "depth":
         return depth_colours(view, scene_depth)
     if mode == "opacity":
@@ -95,9 +108,18 @@ def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.
 def nearest_photograph(
     poses: NDArray[np.float64], T_camera_world: NDArray[np.float64], scene_depth: float
 ) -> int | None:
-    """Which of the poses (N, 4, 4) sees most of what T_camera_world (4, 4) does; None where there is none.
+    """Find the pose that shares most of its view with a given pose.
 
-    By where the points at the scene's depth lie that both look at, and by where both are.
+    The measure adds the distance between the points at the scene's depth on both optical axes and half the distance
+    between the camera centres.
+
+    Args:
+        poses: (N, 4, 4) T_camera_world of the candidates.
+        T_camera_world: (4, 4) pose to compare with.
+        scene_depth: The scene's depth [scene units].
+
+    Returns:
+        Index of the pose, None if there are no candidates.
     """
     if len(poses) == 0:
         return None
@@ -114,10 +136,19 @@ def image_error(
     photograph: Photograph,
     seen: RenderedView,
 ) -> NDArray[np.float32]:
-    """How far the picture is from what a photograph shows of the same places: mean absolute difference (H, W).
+    """Compare a rendered view with a photograph of the same places.
 
-    Each pixel of `view` is looked up in the photograph by the map's depth there. seen: the map from the photograph's
-    own camera, which tells what is hidden from it. NaN where the photograph shows nothing of the place.
+    Each pixel of `view` is projected into the photograph with the map's depth.
+
+    Args:
+        view: Rendered view.
+        camera: Camera of `view`.
+        T_camera_world: (4, 4) pose of `view`.
+        photograph: Image to compare with.
+        seen: The map rendered from the photograph's camera, used to detect occlusion.
+
+    Returns:
+        (H, W) mean absolute colour difference, NaN where the photograph does not show the place.
     """
     import cv2
 
@@ -149,7 +180,7 @@ def image_error(
 
 
 def coloured_error(error: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """An error (H, W) as colours (H, W, 3), blue for none, red for large; dark grey where there is none to tell."""
+    """Map an error (H, W) to colours (H, W, 3): blue for 0, red for LARGEST_ERROR and more, dark grey for NaN."""
     import cv2
 
     known = np.isfinite(error)
@@ -165,5 +196,5 @@ def error_picture(
     photograph: Photograph,
     seen: RenderedView,
 ) -> NDArray[np.uint8]:
-    """`image_error` as colours (H, W, 3)."""
+    """Return `image_error` as colours (H, W, 3)."""
     return coloured_error(image_error(view, camera, T_camera_world, photograph, seen))

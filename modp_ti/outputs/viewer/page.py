@@ -1,4 +1,4 @@
-"""The page: what viser serves to browsers, its scene and its controls."""
+"""The web page that viser serves: its scene and its controls."""
 
 from __future__ import annotations
 
@@ -25,22 +25,28 @@ if TYPE_CHECKING:
 __all__ = ["Page", "ShownFrame"]
 
 TITLE = "MODP-Ti"
-# The scene's depth in the page's units: the world's may be anything, and browsers take covariances with 16 bits.
+# Depth of the scene in page units. The world's units are arbitrary, and browsers store covariances as 16-bit floats.
 DEPTH_ON_PAGE = 4.0
-# How far the first look is behind and above the first frame, in the page's units.
+# Position of the initial camera behind and above the first frame [page units].
 BEHIND, ABOVE = 2.0, 1.0
-# Depths of the frustums of keyframes and of the current frame, and size of points, in the page's units.
+# Depth of the frustums of keyframes and of the current frame, and size of points [page units].
 KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.015
 KEYFRAME_COLOUR, FRAME_COLOUR, POINT_COLOUR = (90, 140, 255), (255, 120, 30), (255, 60, 60)
 JPEG_QUALITY = 85
 KEYFRAMES, FRAME, POINTS = "Keyframes", "Current frame", "Tracked points"
-# Corners of a frustum's image, as (x, y) in {0, 1}.
+# Corners of a frustum's image as (x, y) in {0, 1}.
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """A frame at its refined T_camera_world (4, 4), with its picture (H, W, 3) uint8, or None."""
+    """A frame to show as a frustum.
+
+    Attributes:
+        T_camera_world: (4, 4) refined pose.
+        camera: The frame's camera.
+        picture: (H, W, 3) uint8 image, or None.
+    """
 
     T_camera_world: NDArray[np.float64]
     camera: PinholeCamera
@@ -48,14 +54,22 @@ class ShownFrame:
 
 
 class Page:
-    """Serves the page at `url` until `close`.
+    """Serves the web page at `url` until `close`.
 
-    port: where it is taken, the next free one is used; 0 for any. gate: has buttons to pause and to step; None for
-    none. modes: to choose from, the first at first. choose: called with the position of a frame when a slider over
-    `frames` frames is moved.
+    Args:
+        host: Address to listen on.
+        port: Port to listen on. If it is taken, the next free one is used; 0 picks any free port.
+        gate: The gate that the pause and step buttons control, None for a page without them.
+        modes: Display modes to choose from. The first one is shown first.
+        choose: Called with a frame's position when the frame slider moves, None for a page without slider.
+        frames: Number of frames of the slider.
 
-    requests: what the browsers look at. threads: those that serve. Raises InputError where viser is not installed, or
-    `host` is no address of this machine.
+    Attributes:
+        requests: The pictures that browsers need.
+        threads: The server's threads.
+
+    Raises:
+        InputError: If viser is not installed, or `host` is not an address of this machine.
     """
 
     def __init__(
@@ -80,13 +94,13 @@ class Page:
         self._units: float | None = None
         self._frame: ShownFrame | None = None
         self._nodes: dict[str, Any] = {}
-        self._lock = threading.Lock()  # nodes are changed by the publishing thread and by viser's
+        self._lock = threading.Lock()  # nodes are changed by the publishing thread and by viser's threads
         before = set(threading.enumerate())
         with _silent():
             self._server = viser.ViserServer(host=host, port=port, label=TITLE, verbose=False)
         self.threads = [thread for thread in threading.enumerate() if thread not in before]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        # Its share button would send the page through somebody else's server.
+        # The share button is hidden because it would route the page through a third party's server.
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.scene.world_axes.visible = False
         self._add_controls(modes, choose, frames)
@@ -94,7 +108,7 @@ class Page:
         self._server.on_client_disconnect(lambda client: self.requests.leave(client.client_id))
 
     def close(self) -> None:
-        """Serve no longer."""
+        """Stop serving the page."""
         with _silent():
             self._server.stop()
 
@@ -102,11 +116,16 @@ class Page:
 
     @property
     def units(self) -> float:
-        """Of the page, in a unit of the world; 1 before `settle`."""
+        """Page units per world unit; 1 before `settle`."""
         return self._units or 1.0
 
     def settle(self, scene_depth: float, T_camera_world: NDArray[np.float64]) -> None:
-        """Take the scene's depth and a first view (4, 4), from which up is known; once."""
+        """Set the page's scale and the initial view. Later calls have no effect.
+
+        Args:
+            scene_depth: The scene's depth [scene units].
+            T_camera_world: (4, 4) pose of the first view, which also defines the up direction.
+        """
         if self._units is not None:
             return
         self._units = DEPTH_ON_PAGE / scene_depth
@@ -120,11 +139,11 @@ class Page:
             _look(client, eye, target, up)
 
     def show_numbers(self, text: str) -> None:
-        """Markdown."""
+        """Show Markdown text in the numbers panel."""
         self._numbers.content = text
 
     def show_splats(self, splats: Splats) -> None:
-        """The map, in the page's units; drawn in the mode for it."""
+        """Replace the splats, which are visible in the splats mode."""
         note = "" if len(splats.centres) == splats.of else f"{len(splats.centres):,} of {splats.of:,} Gaussians drawn"
         if note != self._note.content:
             self._note.content = note
@@ -138,14 +157,14 @@ class Page:
                 self._nodes["splats"] = node
 
     def show_picture(self, client: int, picture: NDArray[np.uint8]) -> None:
-        """A picture (H, W, 3) behind the scene, for the browser that it was made for."""
+        """Set a picture (H, W, 3) as the background of one browser."""
         with self._lock:
             handle = self._server.get_clients().get(client)
             if handle is not None and self.requests.mode != SPLATS:
                 handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
 
     def show_frame(self, frame: ShownFrame) -> None:
-        """The current frame, as a frustum with its picture."""
+        """Show the current frame as a frustum with its image."""
         T_world_camera = inverse_se3(frame.T_camera_world)
         pose = {"wxyz": quaternion_from_matrix(T_world_camera[:3, :3]), "position": T_world_camera[:3, 3] * self.units}
         with self._lock:
@@ -171,7 +190,12 @@ class Page:
             node.image = frame.picture
 
     def show_keyframes(self, poses: NDArray[np.float64], camera: PinholeCamera) -> None:
-        """Frustums of keyframes at T_camera_world (N, 4, 4), all of one camera's shape."""
+        """Show keyframes as frustums.
+
+        Args:
+            poses: (N, 4, 4) T_camera_world.
+            camera: Camera that defines the shape of all frustums.
+        """
         lines = frustum_lines(poses, camera, self.units)
         with self._lock:
             if KEYFRAMES in self._nodes:
@@ -187,7 +211,7 @@ class Page:
                 )
 
     def show_points(self, xyz: NDArray[np.float64]) -> None:
-        """Tracked points (N, 3) of the world."""
+        """Show tracked points (N, 3), in world coordinates."""
         points = (xyz * self.units).astype(np.float32)
         with self._lock:
             if POINTS in self._nodes:
@@ -227,7 +251,7 @@ class Page:
         look.on_click(lambda event: self._look_from_frame(event.client))
 
     def show_paused(self, paused: bool) -> None:
-        """What the button for it says."""
+        """Set the label of the pause button."""
         self._pause.label = "Resume" if paused else "Pause"
 
     def _set_paused(self, paused: bool) -> None:
@@ -261,7 +285,7 @@ class Page:
 
     def _moved(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self._server.get_clients():
-            return  # a last word of one that has gone
+            return  # late message of a disconnected browser
         c = client.camera
         self.requests.look(BrowserCamera(client.client_id, c.wxyz, c.position, c.fov, c.image_width, c.image_height))
         if self._gate is not None:
@@ -277,7 +301,7 @@ class Page:
 
 
 def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: float) -> NDArray[np.float32]:
-    """Edges (8 N, 2, 3) of the frustums of cameras at T_camera_world (N, 4, 4), in the page's units."""
+    """Return the edges (8 N, 2, 3) of camera frustums in page units, for T_camera_world (N, 4, 4)."""
     size = np.array([camera.width, camera.height])
     corners = camera.unproject(CORNERS * size, np.full(4, KEYFRAME_SIZE))
     R = poses[:, :3, :3]
@@ -289,7 +313,7 @@ def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: floa
 
 
 def _vertical(camera: PinholeCamera) -> float:
-    """Vertical field of view [rad]."""
+    """Return the vertical field of view [rad]."""
     return float(2 * np.arctan(0.5 * camera.height / camera.fy))
 
 
@@ -301,7 +325,7 @@ def _look(client: viser.ClientHandle, eye: NDArray, target: NDArray, up: NDArray
 
 
 def _require_address(host: str) -> None:
-    """Raise InputError where no port of `host` can be opened: viser would wait for ever."""
+    """Raise InputError if no port of `host` can be opened, in which case viser would wait forever."""
     try:
         family = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0][0]
         with socket.create_server((host, 0), family=family):
@@ -315,7 +339,7 @@ def _require_address(host: str) -> None:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """What viser says of itself on the terminal is left out."""
+    """Suppress viser's own messages on the terminal."""
     import rich
 
     console = rich.get_console()

@@ -1,4 +1,4 @@
-"""Gaussians as a browser draws them."""
+"""Conversion of Gaussians to the splats that a browser draws."""
 
 from __future__ import annotations
 
@@ -15,9 +15,14 @@ __all__ = ["Splats", "splats_of"]
 
 @dataclass(frozen=True)
 class Splats:
-    """centres (N, 3) and covariances (N, 3, 3) in the page's units, colours (N, 3) and opacities (N, 1) uint8.
+    """Splats in the page's units.
 
-    of: how many Gaussians the map has.
+    Attributes:
+        centres: (N, 3).
+        covariances: (N, 3, 3).
+        colours: (N, 3) uint8.
+        opacities: (N, 1) uint8.
+        of: Number of Gaussians of the map, which may be larger than N.
     """
 
     centres: NDArray[np.float32]
@@ -28,10 +33,14 @@ class Splats:
 
 
 def splats_of(state: Mapping[str, NDArray], units: float, limit: int) -> Splats:
-    """Of Gaussians by name (`GaussianField.to_numpy`), their colours as they are without their harmonics.
+    """Convert Gaussians to splats with their constant (degree 0) colours.
 
-    Of more than `limit`, every n-th, as much larger as it takes to cover what the others did. units: of the page, in
-    a unit of the world.
+    If there are more than `limit`, every n-th Gaussian is kept and enlarged to cover the area of those left out.
+
+    Args:
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+        units: Page units per world unit.
+        limit: Maximum number of splats.
     """
     count = len(state["position"])
     chosen = np.arange(count) if count <= limit else np.arange(limit) * count // limit
