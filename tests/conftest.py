@@ -23,6 +23,11 @@ CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modp
 os.environ.setdefault("TI_OFFLINE_CACHE_FILE_PATH", str(CACHE))
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(1 << 30))
 
+# Two threads for each of two processes wait for one another. Other numbers of threads are the business of `--spread`.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("TI_CPU_MAX_NUM_THREADS", str(max(share, 1)))
+
 HERE = Path(__file__).resolve().parent
 SHARED_DATA = HERE.parents[1] / "shared" / "data"
 

@@ -9,6 +9,8 @@ from fault_injection.malformed import malformed_inputs, markdown, run_case
 from fault_injection.malformed_cases import CASES, Case
 from fault_injection.samples import SAMPLES, write_sample
 
+pytestmark = pytest.mark.slow
+
 READERS = list(dict.fromkeys(case.reader for case in CASES))
 
 

@@ -24,6 +24,8 @@ from modp_ti.outputs.report.record import RunRecord
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 3
 
 

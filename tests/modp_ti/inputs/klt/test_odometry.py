@@ -12,6 +12,8 @@ from modp_ti.inputs.klt.odometry import Odometry, View
 from modp_ti.inputs.synthetic.camera_path import look_at
 from modp_ti.outputs.evaluation import umeyama
 
+pytestmark = pytest.mark.slow
+
 BLACK = np.zeros((240, 320), np.uint8)
 
 

@@ -16,6 +16,8 @@ from modp_ti.inputs.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.inputs.sources.distortion import Distortion
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 
+pytestmark = pytest.mark.slow
+
 
 def known_camera(source: SourceSettings, box_room, distortion: Distortion | None = None) -> KltTracker:
     images = ImageFolder(source.path)

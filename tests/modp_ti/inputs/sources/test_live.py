@@ -24,6 +24,8 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.sources.live import WAITING, LiveSource
 
+pytestmark = pytest.mark.slow
+
 PATIENCE = 30.0  # seconds until a test gives up
 
 

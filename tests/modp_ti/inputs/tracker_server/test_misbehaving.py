@@ -27,6 +27,8 @@ from tests.modp_ti.inputs.tracker_server.clients import (
     opened,
 )
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = Path(__file__).with_name("misbehaving.py")
 
 

@@ -19,6 +19,8 @@ from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.trackers.colmap import open_colmap
 from modp_ti.inputs.trackers.transforms import open_transforms
 
+pytestmark = pytest.mark.real_data
+
 
 def reprojection_errors(frame: PosedImage) -> NDArray[np.float64]:
     """In pixels of the stored image."""

@@ -15,6 +15,8 @@ from pipelines.render.renderer import Renderer
 from tests.pipelines.differences import STEP, central_differences
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (CAMERA.height, CAMERA.width, 3)
 EXPOSURE = IDENTITY + np.random.default_rng(1).normal(scale=0.2, size=(3, 4))
 VIGNETTE = np.random.default_rng(2).uniform(0.2, 1.0, SHAPE).astype(np.float32)
