@@ -10,8 +10,8 @@ __all__ = ["NO_TILE", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "DevicePairs",
 # One thread per pixel. Square tiles keep the number of pairs low; the CPU's tiles are narrow for its vector units.
 TILE_WIDTH = TILE_HEIGHT = 16
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-# Key of unused entries, which sorts after all tiles. Keys have 16 bits if the number of tiles allows it, which halves the
-# passes of the sort.
+# Key of unused entries, which sorts after all tiles. Keys have 16 bits if the number of tiles allows it, which halves
+# the passes of the sort.
 NO_TILE = {torch.int16: 2**15 - 1, torch.int32: 2**31 - 1}
 # The tensors grow in multiples of this, so that they grow rarely.
 STEP = 1 << 16
@@ -40,7 +40,8 @@ class DevicePairs:
         capacity: Size of the tensors.
         room: Number of pairs that a view may currently have, at most `capacity`. Unused entries up to it are sorted as
             well.
-        total: Number of pairs of the last view, on the device. Pairs beyond `room` (the farthest ones) are dropped.
+        total: Number of pairs of the last view, on the device; `room` + 1 if there are more. Pairs beyond `room` (the
+            farthest ones) are dropped.
     """
 
     def __init__(self, builder: ti.FieldsBuilder, max_width: int, max_height: int, max_pairs: int = 1 << 26) -> None:

@@ -5,9 +5,9 @@ import taichi as ti
 
 __all__ = ["GROUP", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
 
-# Powers of two. A row of a tile is one vector of eight float32, the width that LLVM uses even if the processor has wider
-# vectors. Pixels of a row outside the ellipse are wasted work; rows outside it are skipped, so that tall tiles waste
-# nothing and keep the number of pairs low.
+# Powers of two. A row of a tile is one vector of eight float32, the width that LLVM uses even where the processor has
+# wider vectors. Pixels of a row outside the ellipse are wasted work. Rows outside it are skipped, so that tall tiles
+# waste nothing and keep the number of pairs low.
 TILE_WIDTH = 8
 TILE_HEIGHT = 32
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT

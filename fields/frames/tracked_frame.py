@@ -188,7 +188,7 @@ class TrackedFrame:
 
     @cached_property
     def rgba(self) -> NDArray[np.uint8]:
-        """Image (H, W, 4) with 8 bits per channel. The last channel is 255 at valid pixels; invalid pixels are all 0."""
+        """Image (H, W, 4) uint8. The last channel is 255 at valid pixels; invalid pixels are 0 in all channels."""
         rgba = np.full((*self.image.shape[:2], 4), 255, dtype=np.uint8)
         rgba[..., :3] = np.round(self.image * 255.0)
         if self.mask is not None:

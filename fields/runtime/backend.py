@@ -26,8 +26,8 @@ __all__ = [
 
 # Size of the arrays in Taichi's runtime, which does not check their bounds.
 MAX_SNODES = 1024
-# Taichi's own memory pool on a CUDA device, for the nodes of sparse fields [GB]. Only the occupancy voxels use it. Dense
-# fields and PyTorch allocate from the remaining memory.
+# Taichi's own memory pool on a CUDA device, for the nodes of sparse fields [GB]. Only the voxels use it; dense fields
+# and PyTorch use the remaining memory.
 SPARSE_POOL = 1.0
 
 
