@@ -24,7 +24,7 @@ class GaussianProcessDepth:
 
     The kernel is Matern 3/2 over the image plane, in units of the larger image side. Length scale and noise maximise
     the marginal likelihood of the view's own points over a small grid, with the signal variance in closed form. The
-    deviations are therefore calibrated to each scene.
+    deviations thus adapt to the scene, whether it is a room or a landscape.
 
     Args:
         settings: Settings of the depth estimation.
