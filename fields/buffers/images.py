@@ -28,13 +28,12 @@ class ImageBuffers:
     Planar buffers hold one plane per channel, row-major with a border of `PAD` zeros: pixel (x, y) of channel c is at
     `c * plane + (y + PAD) * stride + x + PAD`. Tile buffers hold the 256 pixels of a tile consecutively, so that a loop
     over them is one vector loop. Capacities are rounded up, mostly to powers of two, so that most image sizes share the
-    kernels of the offline cache.
+    kernels of the offline cache. The values have the Taichi type `real`, `ti.f32` or `ti.f64`.
 
     Args:
         builder: Builder that the buffers are placed in.
         max_width: Largest image width [px].
         max_height: Largest image height [px].
-        real: Taichi type of the values, `ti.f32` or `ti.f64`.
         cache_gb: Device memory for copies of reference images, on a GPU [GiB].
 
     Attributes:

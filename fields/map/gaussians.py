@@ -25,12 +25,12 @@ class GaussianField:
 
     Gaussians are always stored contiguously, at indices 0 to `count - 1`. A Gaussian takes 236 bytes at degree 0 in
     float32. The SNode tree is pointer(blocks) over dense(1024): memory follows the number of Gaussians, and no kernel
-    is recompiled when the map grows. On a GPU the storage is dense and holds `max_gaussians` from the start.
+    is recompiled when the map grows. On a GPU the storage is dense and holds `max_gaussians` from the start. The values
+    have the Taichi type `real`, `ti.f32` or `ti.f64`.
 
     Args:
         sh_degree: Degree of the spherical harmonics of colour.
         max_gaussians: Size of the pool, rounded up to a multiple of 1024.
-        real: Taichi type of the values, `ti.f32` or `ti.f64`.
 
     Attributes:
         position: Means (3).

@@ -45,7 +45,7 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
         seed: Seed of Taichi's random numbers.
 
     Returns:
-        The backend in use: "cpu", "cuda" or "vulkan".
+        Name of the backend in use, which is "cpu", "cuda" or "vulkan".
 
     Raises:
         RuntimeError: If "cuda" or "vulkan" was requested and does not start.

@@ -11,7 +11,7 @@ from fields.runtime.compiled_kernel import CompiledKernel
 
 __all__ = ["THREADS", "THREAD_BITS", "BlockSums", "max_over_block", "sum_over_block"]
 
-# Threads of every block that reduces. Down to the last warp, both halves at each level of the reduction are whole warps.
+# Threads of every block that reduces. Down to the last warp, both halves at each level of the sum are whole warps.
 THREADS = 256
 THREAD_BITS = THREADS.bit_length() - 1
 NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
