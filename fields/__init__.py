@@ -1,6 +1,6 @@
-"""What the map is: Taichi fields and their layout. Knows no files, no losses, no loops."""
+"""The data of the map: Taichi fields and their layout. Independent of files, losses and pipelines."""
 
 import os
 
-# Taichi greets on import; a program that others call should not.
+# A library should not print Taichi's greeting when it is imported.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")

@@ -1,1 +1,1 @@
-"""What happens to the map: render, compare, optimise, densify, select views, the online loop."""
+"""Operations on the map: rendering, losses, optimisation, densification, view selection, the online loop."""

@@ -1,4 +1,4 @@
-"""What a tracker's revised poses mean for the frames that it does not name, for keyframes, and for the world."""
+"""Pose corrections of a tracker: their effect on the frames in between, on keyframes, and on the world."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from fields.map.keyframes import Keyframe, KeyframeStore
 
 __all__ = ["CorrectionReport", "WorldMotion", "pending_motion_in_pixels", "revise"]
 
-# Moved points that tell a keyframe's change of scale.
+# Minimum number of moved points to estimate a keyframe's change of scale.
 MIN_POINTS = 10
 
 
 @dataclass(frozen=True)
 class WorldMotion:
-    """How a correction moves frames and the world around them.
+    """The motion of frames and of the world around them by a correction.
 
-    index: (N,) of the named frames whose former pose is known, increasing. T_camera_world: (N, 4, 4), their tracked
-    poses from now on. S: S_after_before (N, 4, 4), how the world around them moves.
+    Attributes:
+        index: Indices (N,) of the corrected frames whose former pose is known, increasing.
+        T_camera_world: Revised tracked poses (N, 4, 4) of these frames.
+        S: Similarities S_after_before (N, 4, 4) of the world around them.
     """
 
     index: NDArray[np.int64]
@@ -33,10 +35,17 @@ class WorldMotion:
     S: NDArray[np.float64]
 
     def of(self, index: int, T_tracked: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pose (4, 4) from now on, and motion S (4, 4), of frame `index`, which was at `T_tracked` (4, 4).
+        """Compute the revised pose of any frame.
 
-        A frame between named ones takes its place between the poses that it would have as part of either's world, by
-        index; one outside goes with the nearest.
+        A frame between two corrected ones moves with the world of each, and the two resulting poses are interpolated by
+        frame index. A frame outside the corrected range moves with the nearest corrected frame.
+
+        Args:
+            index: Index of the frame.
+            T_tracked: Former tracked pose (4, 4).
+
+        Returns:
+            Revised pose (4, 4), and similarity S_after_before (4, 4) of the world around the frame.
         """
         after = int(np.searchsorted(self.index, index))
         if after < len(self.index) and self.index[after] == index:
@@ -56,18 +65,30 @@ class WorldMotion:
 
 @dataclass(frozen=True)
 class CorrectionReport:
-    """What a correction did. motion: of frames and world. moved: whether Gaussians have moved."""
+    """Result of a correction.
+
+    Attributes:
+        motion: Motion of the frames and of the world.
+        moved: Whether Gaussians have moved.
+    """
 
     motion: WorldMotion
     moved: bool
 
 
 def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], correction: PoseCorrection) -> WorldMotion:
-    """Bring the keyframes of `store` up to date: poses, points, depths; return how the world moves.
+    """Apply a correction to the poses, points and depths of the keyframes.
 
-    tracked: T_camera_world (4, 4) of the frames so far by index, as the tracker had them. Named frames that are not
-    among them tell nothing. The Gaussians stay where they are: each keyframe's `pending_motion` says how they are to
-    follow.
+    The Gaussians are not moved. Each keyframe's `pending_motion` accumulates the motion that they have to follow.
+
+    Args:
+        store: The keyframes.
+        tracked: Former tracked T_camera_world (4, 4) of all frames so far, by index. Corrected frames that it does not
+            contain are ignored.
+        correction: The correction.
+
+    Returns:
+        Motion of the frames and of the world.
     """
     known = np.array([int(i) in tracked for i in correction.index])
     index, T_after = correction.index[known], correction.T_camera_world[known]
@@ -90,9 +111,10 @@ def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], cor
 
 
 def pending_motion_in_pixels(view: Keyframe) -> float:
-    """By how much the picture of a keyframe would be off if Gaussians stayed behind [px].
+    """Displacement of a keyframe's image by the motion that its Gaussians have not followed yet [px].
 
-    The mean over a grid of pixels at its median depth; infinite where they would not be before the camera at all.
+    This is the mean over a grid of pixels at the keyframe's median depth; infinite if one of them would lie behind or
+    too close to the camera.
     """
     if np.array_equal(view.pending_motion, np.eye(4)):
         return 0.0
@@ -115,9 +137,10 @@ def _scales(
     ids: NDArray[np.int64],
     xyz: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Change of scale (N,) at the named frames: that of the keyframes among them, by index between, 1 where none knows.
+    """Change of scale (N,) at the corrected frames; `ids` (M,) are sorted.
 
-    A keyframe's is the median over its moved points of their depth after by their depth before. ids (M,) are sorted.
+    The change at a keyframe is the median ratio of depths after and before, over its moved points. It is interpolated
+    by index for the other frames (on a log scale), and 1 if no keyframe has enough moved points.
     """
     place = {int(i): n for n, i in enumerate(index)}
     at, logs = [], []
@@ -136,7 +159,7 @@ def _scales(
 
 
 def _matches(points: SparsePoints, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of `points`, and of the sorted `ids`, that are the same point."""
+    """Rows of `points` and of the sorted `ids` that refer to the same points."""
     if len(ids) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     place = np.minimum(np.searchsorted(ids, points.ids), len(ids) - 1)

@@ -1,4 +1,4 @@
-"""`MemoryBudget`: what a map may take of the memory, so that a long recording ends with a map, not out of memory."""
+"""`MemoryBudget`: a limit on the memory of a map, so that long recordings do not run out of memory."""
 
 from __future__ import annotations
 
@@ -13,20 +13,27 @@ from pipelines.optimise.safeguards import Safeguards
 
 __all__ = ["OBSERVATION", "MemoryBudget"]
 
-# Bytes of a point that a frame saw: which, and its pixel.
+# Bytes of an observation: the id of the point and its pixel.
 OBSERVATION = 12
 
 
 class MemoryBudget:
-    """Keeps Gaussians, keyframes' images and points, voxels, and what is kept beside them within a number of bytes.
+    """Limits the memory of Gaussians, of the keyframes' images and points, of voxels, and of data kept outside the map.
 
-    It is reckoned from what the map holds, and not asked of the system: two runs refuse the same. What has no room is
-    left out and counted in `safeguards`: Gaussians are not added, and a frame that would have been a keyframe is one
-    like those between keyframes. The map goes on being optimised with what it has. A Gaussian is taken only if there is
-    room for the voxels that it may mark too, so the limit is never exceeded.
+    The usage is computed from the map's contents rather than queried from the OS, so that runs are reproducible.
+    Anything that does not fit is left out and counted in `safeguards`: Gaussians are not added, and a frame that would
+    have become a keyframe is treated as one between keyframes. The optimisation of the existing map continues. A
+    Gaussian is only added if the voxels that it may mark fit as well, so that the limit is never exceeded.
 
-    limit: in bytes, None for none; the pool of `gaussians` is a limit in any case. beside: bytes that others than the
-    map keep of the frames.
+    Args:
+        limit: Limit [bytes]; None for no limit. The pool of `gaussians` is a limit in any case.
+        gaussians: The Gaussians of the map.
+        keyframes: The keyframes of the map.
+        voxels: The voxels of the map, if it has any.
+        safeguards: Counter of what was left out.
+
+    Attributes:
+        beside: Bytes of data about the frames that are kept outside the map.
     """
 
     def __init__(
@@ -45,15 +52,19 @@ class MemoryBudget:
         self.beside = 0
 
     def held(self) -> int:
-        """Bytes that are held now."""
+        """Return the bytes currently in use."""
         voxels = 0 if self.voxels is None else self.voxels.nbytes
         return len(self.gaussians) * self.gaussians.bytes_each + self.keyframes.nbytes + voxels + self.beside
 
     def take_gaussians(self, position: NDArray[np.float64], size: float) -> int:
-        """Reserve room for Gaussians at positions (N, 3) with voxel target size `size`, in their order.
+        """Determine how many new Gaussians fit, together with the voxels that they may mark.
+
+        Args:
+            position: Positions (N, 3) in order of preference.
+            size: Target voxel size [scene units].
 
         Returns:
-            How many of the leading positions have room, with the voxels that they may mark; the others are counted.
+            Number of leading positions that fit. The others are counted as rejected.
         """
         taken = min(len(position), self.gaussians.capacity - len(self.gaussians))
         if self.limit is not None:
@@ -65,13 +76,13 @@ class MemoryBudget:
         return taken
 
     def takes_keyframe(self, frame: TrackedFrame) -> bool:
-        """Whether there is room for a frame's images and points; counted where not."""
+        """Whether a frame's images and points fit. Rejections are counted."""
         fits = self.limit is None or self.held() + self.keyframes.bytes_of(frame) <= self.limit
         self.safeguards.keyframes_without_room += not fits
         return fits
 
     def takes_observations(self, count: int) -> bool:
-        """Whether there is room for so many more of what frames saw of the tracker's points; counted where not."""
+        """Whether `count` more observations of tracked points fit. Rejections are counted."""
         fits = self.limit is None or self.held() + count * OBSERVATION <= self.limit
         self.safeguards.observations_without_room += 0 if fits else count
         return fits

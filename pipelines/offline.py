@@ -1,4 +1,4 @@
-"""Offline 3D Gaussian Splatting [Kerbl 2023] in the same renderer: the paper's baseline (Section 4)."""
+"""Offline 3D Gaussian Splatting [Kerbl 2023] with the same renderer: the paper's baseline (Section 4)."""
 
 from __future__ import annotations
 
@@ -28,25 +28,32 @@ from pipelines.stopwatch import Stopwatch
 
 __all__ = ["OfflineMapper", "Schedule", "scene_extent"]
 
-# Steps of the published run, whose step numbers the settings name.
+# Length of the published run, to which the step numbers in the settings refer.
 PUBLISHED_STEPS = 30_000
-# Density control waits for a picture to form, which takes as many steps in a short run: its start and its interval
-# do not scale, but are at most this share of the run.
+# Density control starts once the map resembles the scene, which takes the same number of steps in a short run. Its
+# start and interval therefore do not scale with the run, but are at most this fraction of it.
 LONGEST_WAIT = 1 / 12
-# An opacity needs some hundred looks to come back: resets are at least so far apart, or the rounds between them
-# see little but the recovery.
+# Minimum interval between opacity resets. An opacity takes some hundred steps to recover. With shorter intervals, the
+# rounds of density control would mostly see the recovery.
 LEAST_STEPS_BETWEEN_RESETS = 1_500
-# Extent that a scene has at least [scene depths]: cameras that only turn have none.
+# Minimum extent of a scene [scene depths], for cameras that only rotate.
 LEAST_EXTENT = 0.01
-# Size that a Gaussian of the start has at least [extents].
+# Minimum standard deviation of an initial Gaussian [extents].
 LEAST_SIZE = 1e-5
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Step numbers of a run, those of the published one in proportion to its length where they can be.
+    """Step numbers of a run, scaled from those of the published run where possible. Steps count from 1.
 
-    Steps count from 1.
+    Attributes:
+        steps: Number of optimisation steps.
+        highest_degree: Final degree of the spherical harmonics.
+        sh_every: Steps after which the degree increases by one.
+        densify_from: Step after which density control starts.
+        densify_until: Step at which density control ends.
+        densify_every: Interval of density control.
+        reset_every: Interval of opacity resets.
     """
 
     steps: int
@@ -59,6 +66,8 @@ class Schedule:
 
     @classmethod
     def of(cls, settings: OfflineSettings) -> Schedule:
+        """Compute the schedule of a run with these settings."""
+
         def scaled(step: int) -> int:
             return max(round(step * settings.steps / PUBLISHED_STEPS), 1)
 
@@ -74,7 +83,7 @@ class Schedule:
         )
 
     def sh_degree(self, step: int) -> int:
-        """Degree up to which harmonics are optimised in this step."""
+        """Highest degree of the harmonics that are optimised in this step."""
         return min(step // self.sh_every, self.highest_degree)
 
     def adapts_at(self, step: int) -> bool:
@@ -87,9 +96,17 @@ class Schedule:
 
 
 def scene_extent(store: KeyframeStore) -> float:
-    """1.1 times the largest distance of a camera from the mean of all [scene units], the unit of 3DGS's settings.
+    """Extent of a scene, the unit of length of 3DGS's settings.
 
-    Raises ValueError where there is no camera.
+    Args:
+        store: All views.
+
+    Returns:
+        1.1 times the largest distance of a camera from the mean camera centre, and at least `LEAST_EXTENT` scene depths
+        [scene units].
+
+    Raises:
+        ValueError: If there is no view.
     """
     if len(store) == 0:
         raise ValueError("there is no frame to map")
@@ -99,10 +116,16 @@ def scene_extent(store: KeyframeStore) -> float:
 
 
 class OfflineMapper(Pipeline):
-    """Collects all frames, then optimises Gaussians from their tracked points on one random view a step.
+    """Offline 3DGS: collects all frames, then optimises Gaussians on one random view per step.
 
-    `process` takes the frames one by one as `OnlineMapper` does; `finish`, which is `initialise` and `optimise`, then
-    makes the map. `keyframes` are all frames, at their tracked poses.
+    `process` only stores the frames, and `keyframes` holds all of them at their tracked poses. `finish` builds the map:
+    it calls `initialise`, which creates Gaussians from the tracked points, and `optimise`.
+
+    Args:
+        settings: Settings of the offline mapper.
+        max_width: Largest image width [px].
+        max_height: Largest image height [px].
+        seed: Seed of the random generator.
     """
 
     def __init__(self, settings: OfflineSettings, max_width: int, max_height: int, seed: int = 0) -> None:
@@ -124,28 +147,37 @@ class OfflineMapper(Pipeline):
         return self.settings.near * self.keyframes.scene_depth
 
     def process(self, frame: TrackedFrame) -> FrameReport:
-        """Keep the next frame. Held-out frames must not come here: ValueError."""
+        """Store the next frame.
+
+        Raises:
+            ValueError: If the frame is held out for evaluation.
+        """
         if frame.held_out:
             raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
         self.keyframes.append(frame)
         return FrameReport(frame.index, True, len(self.keyframes), 0, None)
 
     def correct(self, correction: PoseCorrection) -> CorrectionReport:
-        """Take over revised poses and points; the map, which is made afterwards, has them from the start."""
+        """Apply revised poses and points to the stored frames. The map is built later, so no Gaussians move."""
         motion = revise(self.keyframes, {view.index: view.T_tracked for view in self.keyframes}, correction)
         return CorrectionReport(motion, moved=False)
 
     def initialise(self) -> None:
-        """Begin the map with the tracked points of the frames so far. Raises ValueError where they are too few."""
+        """Create the initial Gaussians from the tracked points of all frames.
+
+        Raises:
+            ValueError: If there are too few points or no frame.
+        """
         with self.stopwatch.measure("optimise"):
             points = union_of_points(self.keyframes)
             extent = scene_extent(self.keyframes)
             initialise(self.gaussians, points, self.settings.initial_opacity, LEAST_SIZE * extent)
 
     def optimise(self, progress: Callable[[int, int, float], None] | None = None) -> None:
-        """Run all steps on an initialised map.
+        """Run all optimisation steps on an initialised map.
 
-        progress: called after every step with (steps done, Gaussians, PSNR of its view).
+        Args:
+            progress: Called after every step with (steps done, number of Gaussians, PSNR of its view).
         """
         schedule, extent = Schedule.of(self.settings), scene_extent(self.keyframes)
         views: list[int] = []
@@ -162,7 +194,14 @@ class OfflineMapper(Pipeline):
                 progress(step, len(self.gaussians), psnr)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> None:
-        """Make the map. progress: see `optimise`. Raises NothingToMapError where the tracked points are too few."""
+        """Build the map from the stored frames.
+
+        Args:
+            progress: See `optimise`.
+
+        Raises:
+            NothingToMapError: If there are too few tracked points or no frame.
+        """
         try:
             self.initialise()
         except ValueError as error:
@@ -170,7 +209,7 @@ class OfflineMapper(Pipeline):
         self.optimise(progress)
 
     def caught(self) -> Safeguards:
-        """What the safeguards have caught so far. Waits for the device."""
+        """Return the safeguards' counts so far. Waits for the device."""
         steps, exploded = self.gaussians.take_caught()
         self.safeguards.gaussian_steps += steps
         self.safeguards.exploded_gaussians += exploded
@@ -187,7 +226,7 @@ class OfflineMapper(Pipeline):
         )
 
     def _step(self, view: Keyframe, rates: LearningRates, sh_degree: int) -> float:
-        """One Adam step on one view; its PSNR before the step, on a GPU that of the view before."""
+        """Make one Adam step on one view. Returns its PSNR before the step; on a GPU, that of the previous view."""
         renderer = self.renderer
         renderer.forward(view.camera, view.T_camera_world, self.near, exact=False)
         renderer.develop(None, view.vignette)
@@ -202,7 +241,7 @@ class OfflineMapper(Pipeline):
         return known.psnr
 
     def compile(self) -> None:
-        """Compile every kernel on a scene of four Gaussians, so that timing starts warm. The map must be empty."""
+        """Compile all kernels on a scene of four Gaussians, so that timings exclude it. The map must be empty."""
         camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
         with self.stopwatch.measure("compile"):
             image = np.full((16, 16, 3), 0.5, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The online loop: track, add, filter, select views, optimise (the paper's overview figure)."""
+"""The online mapping loop: track, add, filter, select views, optimise (the paper's overview figure)."""
 
 from __future__ import annotations
 
@@ -39,26 +39,36 @@ from pipelines.stopwatch import Stopwatch
 
 __all__ = ["OnlineMapper"]
 
-# Opacity of the render below which a pixel counts as a hole.
+# A pixel whose rendered opacity is below this counts as a hole.
 HOLE = 0.5
 
 
 @dataclass(slots=True)
 class Anchor:
-    """A view that placed Gaussians: the keyframe that they move with, and the spacing asked for [scene units]."""
+    """A view that placed Gaussians.
+
+    Attributes:
+        keyframe: Keyframe that these Gaussians move with.
+        spacing: Target voxel size that the view asked for [scene units].
+    """
 
     keyframe: Keyframe
     spacing: float
 
 
 class OnlineMapper(Pipeline):
-    """Turns a stream of `TrackedFrame`s into a Gaussian map while they arrive.
+    """Builds a Gaussian map from a stream of `TrackedFrame`s.
 
-    Images may have any size up to `max_width` x `max_height`. Depth estimation and view selection can be replaced by
-    any object of their Protocols.
+    Each Gaussian stores the view that placed it (`GaussianField.anchor`, an index into `anchors`). When the tracker
+    corrects the pose of that view, the Gaussian moves with it.
 
-    Gaussians know the view that placed them (`GaussianField.anchor`, a place in `anchors`), and follow when the tracker
-    corrects its pose.
+    Args:
+        settings: Settings of the mapping.
+        max_width: Largest image width [px].
+        max_height: Largest image height [px].
+        seed: Seed of the random generator.
+        depth: Depth estimator; None builds the one that `settings.depth` names.
+        views: View selection; None for `LocalGlobalViews`.
     """
 
     can_be_refined: ClassVar[bool] = True
@@ -91,7 +101,7 @@ class OnlineMapper(Pipeline):
         self.budget = MemoryBudget(limit, self.gaussians, self.keyframes, self.voxels, self.optimiser.safeguards)
         self.motion = GaussianMotion(self.gaussians)
         self.anchors: list[Anchor] = []
-        self._tracked: dict[int, NDArray[np.float64]] = {}  # the tracker's pose of every frame so far
+        self._tracked: dict[int, NDArray[np.float64]] = {}  # T_camera_world from the tracker, by frame index
         self._frames = 0
 
     @property
@@ -102,7 +112,11 @@ class OnlineMapper(Pipeline):
     # ---- the loop --------------------------------------------------------------------------------------------
 
     def process(self, frame: TrackedFrame) -> FrameReport:
-        """Take in the next frame. Held-out frames must not come here: ValueError."""
+        """Process the next frame.
+
+        Raises:
+            ValueError: If the frame is held out for evaluation.
+        """
         if frame.held_out:
             raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
         self._frames += 1
@@ -126,21 +140,22 @@ class OnlineMapper(Pipeline):
             self._add(view.at_level(level), compensate=self.settings.densify.error_compensation)
             psnr = self.optimise(self.settings.optimise.steps, level)
         elif len(self.keyframes):
-            # Other frames only bring their points, at the pose that the keyframes around them imply.
+            # Other frames only add their tracked points, at a pose corrected by the neighbouring keyframes.
             self._add(self.keyframes.view(frame), compensate=False)
             if is_wanted:
-                # Without room for it, the map is optimised for those that there are. Far from them every frame is
-                # wanted: a share of the steps for each.
+                # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them,
+                # every frame asks to be a keyframe; each therefore gets only 1 / max_gap of the steps.
                 steps = -(-self.settings.optimise.steps // self.settings.keyframes.max_gap)
                 count = 1 + self.settings.views.local_views + self.settings.views.global_views
                 psnr = self._optimise_evenly(np.arange(len(self.keyframes)), steps, count)
         return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr)
 
     def correct(self, correction: PoseCorrection) -> CorrectionReport:
-        """Take over poses and points that the tracker has revised; Gaussians follow the views that placed them.
+        """Apply poses and points that the tracker has revised.
 
-        They do once a keyframe's picture would be off by more than `min_pixels` otherwise. The voxels are then marked
-        anew, and some steps on the keyframes that have moved mend the seams.
+        Keyframe poses change at once. Gaussians move with the views that placed them as soon as a keyframe's image
+        would otherwise be displaced by more than `corrections.min_pixels`. The voxels are then marked again, and
+        `corrections.steps` optimisation steps on the keyframes that moved remove the seams.
         """
         settings = self.settings.corrections
         with self.stopwatch.measure("correct"):
@@ -157,7 +172,7 @@ class OnlineMapper(Pipeline):
         return CorrectionReport(motion, moved=True)
 
     def _follow(self) -> None:
-        """Move Gaussians and voxels as the keyframes that anchor them have moved."""
+        """Move the Gaussians by the pending motion of their anchors, and mark the voxels again."""
         first = self.keyframes[0].pending_motion
         turns = {
             view.index: sh_rotation(
@@ -179,17 +194,17 @@ class OnlineMapper(Pipeline):
             view.pending_motion = NO_MOTION
 
     def _mark(self) -> None:
-        """Mark the voxels of all Gaussians, each to the level that its view had asked for."""
+        """Mark the voxels of all Gaussians, each down to the level of its anchor's spacing."""
         anchor = self.gaussians.anchors()
         spacing = np.array([a.spacing for a in self.anchors] + [self.voxels.coarsest])[anchor]  # -1: the coarsest
         position = self.gaussians.to_numpy()["position"]
-        order = np.argsort(spacing, kind="stable")  # a GPU takes the places of one level together
+        order = np.argsort(spacing, kind="stable")  # on a GPU, `update` runs once per run of equal levels
         self.voxels.update(position[order], spacing[order])
 
     def _optimise_evenly(self, among: NDArray[np.int64], steps: int, views: int) -> float | None:
-        """Optimise the map, and no pose, for so many keyframes `among` (N,) a step, drawn by their errors alone.
+        """Optimise the map, but no poses, on `views` keyframes per step, drawn from `among` (N,) by error alone.
 
-        Returns the last step's mean PSNR.
+        Returns the mean PSNR of the last step.
         """
         if len(self.gaussians) == 0:
             return None
@@ -202,20 +217,32 @@ class OnlineMapper(Pipeline):
             return self.optimiser.settle() if steps > 0 else None
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
-        """After the last frame: more steps on the last keyframe, and a last removal of transparent Gaussians."""
+        """Finish the map after the last frame: further steps on the last keyframe, then a final pruning.
+
+        Args:
+            progress: Not called by the online loop.
+
+        Returns:
+            Mean PSNR of the last step; None if nothing was optimised.
+        """
         psnr = self.optimise(self.settings.optimise.last_steps - self.settings.optimise.steps)
         self.prune()
         return psnr
 
     def _draw_level(self, view: Keyframe) -> int:
-        """Pyramid level of a new keyframe, among those that its image has."""
+        """Draw the pyramid level of a new keyframe from the levels that its image has."""
         p = np.array(self.settings.levels.probabilities[: len(view.pyramid)])
         return int(self.rng.choice(len(p), p=p / p.sum()))
 
     def optimise(self, steps: int, level: int = 0) -> float | None:
-        """Optimise the map for the last keyframe and the views chosen with it, on a pyramid level.
+        """Optimise the map on the last keyframe and the views selected with it.
 
-        Returns the last step's mean PSNR.
+        Args:
+            steps: Number of optimisation steps.
+            level: Pyramid level of the images.
+
+        Returns:
+            Mean PSNR of the last step; None if nothing was optimised.
         """
         if len(self.keyframes) == 0 or len(self.gaussians) == 0:
             return None
@@ -237,13 +264,17 @@ class OnlineMapper(Pipeline):
             return self.optimiser.settle() if steps > 0 else None
 
     def prune(self) -> int:
-        """Remove Gaussians that have become transparent; return how many."""
+        """Remove Gaussians whose opacity is below `densify.prune_opacity`.
+
+        Returns:
+            Number of Gaussians removed.
+        """
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
 
     # ---- adding Gaussians ------------------------------------------------------------------------------------
 
     def _add(self, view: Keyframe, compensate: bool) -> None:
-        """Densify from one view: tracked points, then pixels of high error, each filtered by the voxels."""
+        """Densify from one view: tracked points, then high-error pixels, both filtered by the voxels."""
         self.anchors.append(Anchor(self.keyframes[-1], self.settings.voxels.target * view.view_scale))
         self._grow(tracked_seeds(view), view)
         if not compensate:
@@ -277,10 +308,10 @@ class OnlineMapper(Pipeline):
     ) -> None:
         refine(self, settings, progress, done)
 
-    # ---- what was caught and left out ------------------------------------------------------------------------
+    # ---- safeguards and budget -------------------------------------------------------------------------------
 
     def caught(self) -> Safeguards:
-        """What the safeguards have caught so far. Waits for the device."""
+        """Return the safeguards' counts so far. Waits for the device."""
         return self.optimiser.caught()
 
     @property
@@ -296,7 +327,10 @@ class OnlineMapper(Pipeline):
     # ---- snapshots -------------------------------------------------------------------------------------------
 
     def state(self) -> MapState:
-        """All that the next frame or step depends on, but for the keyframes' images. Between two steps."""
+        """Return everything that the next frame or step depends on, except the keyframes' images.
+
+        Call it between two steps.
+        """
         self.optimiser.settle()
         groups = {
             "gaussians": self.gaussians.to_numpy() | self.gaussians.history(),
@@ -328,10 +362,15 @@ class OnlineMapper(Pipeline):
         return MapState.of(groups, numbers)
 
     def restore(self, state: MapState, frames: Iterable[TrackedFrame]) -> None:
-        """Become the mapper that `state` was taken of. This one must be fresh, and of the same settings.
+        """Restore a saved state into a new mapper with the same settings.
 
-        frames: the same as those it had taken in, held-out ones left out: the keyframes take their images from them.
-        Raises KeyError, TypeError or ValueError for a state that does not fit; the mapper is of no use then.
+        Args:
+            state: Result of `state`.
+            frames: The frames that the saved mapper had processed, without held-out ones. The keyframes take their
+                images from them.
+
+        Raises:
+            KeyError, TypeError, ValueError: If the state does not fit. The mapper is then unusable.
         """
         rows = KeyframeRows(state.group("keyframes"))
         for frame in frames:
@@ -362,7 +401,7 @@ class OnlineMapper(Pipeline):
     # ---- compiling -------------------------------------------------------------------------------------------
 
     def compile(self) -> None:
-        """Compile every kernel on two views of four Gaussians, so that no frame waits for it. The map must be empty."""
+        """Compile all kernels ahead of the first frame, on two views of four Gaussians. The map must be empty."""
         camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
         pixels = np.array([[4.0, 4.0], [12.0, 4.0], [4.0, 12.0], [12.0, 12.0]])
         points = SparsePoints(camera.unproject(pixels, np.ones(4)), pixels, np.arange(4))

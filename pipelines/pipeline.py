@@ -1,4 +1,4 @@
-"""What makes a map of frames: the online loop and the offline baseline, as those see them who drive either."""
+"""`Pipeline`: the common interface of the online mapper and the offline baseline."""
 
 from __future__ import annotations
 
@@ -23,12 +23,20 @@ __all__ = ["FrameReport", "NothingToMapError", "Pipeline"]
 
 
 class NothingToMapError(ValueError):
-    """The frames bring nothing that a map could be made of."""
+    """Raised if the frames contain nothing that a map could be built from."""
 
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What a frame did to the map. psnr: mean of the last step's views, None where nothing was optimised."""
+    """Result of processing one frame.
+
+    Attributes:
+        index: Index of the frame.
+        is_keyframe: Whether the frame became a keyframe.
+        keyframes: Number of keyframes.
+        gaussians: Number of Gaussians.
+        psnr: Mean PSNR of the last step's views [dB]; None if nothing was optimised.
+    """
 
     index: int
     is_keyframe: bool
@@ -38,14 +46,14 @@ class FrameReport:
 
 
 class Pipeline(ABC):
-    """Takes in frames one by one and turns them into Gaussians.
+    """Builds a map of Gaussians from frames that are processed one by one.
 
-    What only the online loop can do has a default here: a map that is made of all frames at once refuses no frame,
-    keeps no budget, and cannot be refined or resumed.
+    Operations that only the online mapper supports have defaults here, which `OfflineMapper` uses: it rejects no frame,
+    has no memory budget, and cannot be refined or resumed.
     """
 
     can_be_refined: ClassVar[bool] = False
-    """Whether `refine` may follow `finish`."""
+    """Whether `refine` may be called after `finish`."""
 
     gaussians: GaussianField
     keyframes: KeyframeStore
@@ -60,55 +68,61 @@ class Pipeline(ABC):
 
     @abstractmethod
     def compile(self) -> None:
-        """Compile every kernel, so that no frame waits for it. The map must be empty."""
+        """Compile all kernels ahead of the first frame. The map must be empty."""
 
     @abstractmethod
     def process(self, frame: TrackedFrame) -> FrameReport:
-        """Take in the next frame. Held-out frames must not come here: ValueError."""
+        """Process the next frame.
+
+        Raises:
+            ValueError: If the frame is held out for evaluation.
+        """
 
     @abstractmethod
     def correct(self, correction: PoseCorrection) -> CorrectionReport:
-        """Take over poses and points that the tracker has revised."""
+        """Apply poses and points that the tracker has revised."""
 
     @abstractmethod
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> object:
-        """Do what follows the last frame.
+        """Finish the map after the last frame.
 
         Args:
-            progress: Of an offline map, see `OfflineMapper.optimise`.
+            progress: Callback of an offline map, see `OfflineMapper.optimise`.
 
         Raises:
-            NothingToMapError: Where there is nothing to start from.
+            NothingToMapError: If there are no points to start from.
         """
 
     @abstractmethod
     def caught(self) -> Safeguards:
-        """What the safeguards have caught so far. Waits for the device."""
+        """Return the safeguards' counts so far. Waits for the device."""
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """How many frames did not touch the map because something is wrong with them, by what."""
+        """Number of frames that were rejected as implausible, by reason."""
         return {}
 
     def takes_observations(self, count: int) -> bool:
-        """Whether there is room to keep so many more of what frames saw of the tracker's points; counted where not."""
+        """Whether the budget has room for `count` more observations of tracked points. Rejections are counted."""
         return True
 
     def count_beside(self, nbytes: int) -> None:  # noqa: B027 - a pipeline without a budget has nothing to count
-        """Count so many bytes, which others than the map keep of the frames, in the map's budget."""
+        """Set the bytes that are kept outside the map and count towards its memory budget."""
 
     def refine(
         self, settings: RefineSettings, progress: Callable[[int, float], None] | None = None, done: int = 0
     ) -> None:
-        """Optimise the finished map for all keyframes alike, see `pipelines.refinement.refine`.
+        """Optimise the finished map on all keyframes, see `pipelines.refinement.refine`.
 
         Raises:
-            ValueError: Where it cannot be refined: an offline map has been optimised so from the start.
+            ValueError: If the map cannot be refined: an offline map is optimised on all frames from the start.
         """
         raise ValueError("this map cannot be refined")
 
     def state(self) -> MapState:
-        """All that the next frame or step depends on, but for the keyframes' images. Between two steps.
+        """Return everything that the next frame or step depends on, except the keyframes' images.
+
+        Call it between two steps.
 
         Raises:
             ValueError: For an offline map.
@@ -116,14 +130,15 @@ class Pipeline(ABC):
         raise ValueError("an offline map has no state between two frames")
 
     def restore(self, state: MapState, frames: Iterable[TrackedFrame]) -> None:
-        """Become the pipeline that `state` was taken of. This one must be fresh, and of the same settings.
+        """Restore a saved state into a new pipeline with the same settings.
 
         Args:
-            state: What `state` gave.
-            frames: The same as those it had taken in, held-out ones left out: keyframes take their images from them.
+            state: Result of `state`.
+            frames: The frames that the saved pipeline had processed, without held-out ones. The keyframes take their
+                images from them.
 
         Raises:
-            KeyError, TypeError, ValueError: For a state that does not fit, and for an offline map; the pipeline is of
-                no use then.
+            KeyError, TypeError, ValueError: If the state does not fit, and for an offline map. The pipeline is then
+                unusable.
         """
         raise ValueError("an offline map cannot be resumed")

@@ -1,4 +1,4 @@
-"""Post refinement: the finished map, optimised on all keyframes alike (Section 4.7)."""
+"""Post refinement: optimisation of the finished map on all keyframes (Section 4.7)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["decay", "refine"]
 
 
 def decay(step: int, steps: int, final: float) -> float:
-    """Exponential factor from 1 at step 0 to `final` at the last."""
+    """Exponential factor that decays from 1 at step 0 to `final` at the last of `steps` steps."""
     return float(final ** (step / max(steps - 1, 1)))
 
 
@@ -25,12 +25,17 @@ def refine(
     progress: Callable[[int, float], None] | None = None,
     done: int = 0,
 ) -> None:
-    """Run `settings.steps` steps on error-weighted draws of keyframes; positions, scales and poses slow down.
+    """Optimise a finished map on error-weighted draws from all keyframes.
 
-    Gaussians that show next to nothing in every keyframe are removed before the first.
+    The rates of positions, scales and poses decay. Before the first step, Gaussians that cover fewer than
+    `settings.min_contribution` pixels in every keyframe are removed.
 
-    progress: called after every step with (steps done, mean PSNR of its views). done: steps that the map has had when
-    it was restored; those that follow are the same as ever.
+    Args:
+        mapper: Mapper after `finish`.
+        settings: Settings of the refinement.
+        progress: Called after every step with (steps done, mean PSNR of its views).
+        done: Number of steps made before the mapper was restored. The remaining steps are the same as without the
+            interruption.
     """
     store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
     pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0

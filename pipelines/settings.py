@@ -1,8 +1,9 @@
-"""Settings of everything that happens to the map: one section a concept, each field with its default and meaning.
+"""Settings of the pipelines, with one section per concept.
 
-The sections are part of the one configuration model (`modp_ti.config.settings.SceneConfig`). Lengths are relative to
-the scene: a `view scale` is the median of depth / focal length over a view's tracked points (Section 3.2.1), the width
-of a pixel out there; the `scene depth` is the median depth of the tracked points over all keyframes.
+The sections are part of the configuration model (`modp_ti.config.settings.SceneConfig`). Lengths are relative to the
+scene. A `view scale` is the median of depth / focal length over a view's tracked points, the width of a pixel at the
+median depth (Section 3.2.1). The `scene depth` is the median over all keyframes of the median depth of their tracked
+points.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ __all__ = [
 
 
 class StrictModel(BaseModel):
-    """Immutable section of the configuration; an unknown key is an error."""
+    """Immutable section of the configuration. Unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
@@ -64,7 +65,7 @@ class KeyframeSettings(StrictModel):
 
 
 class EpipolarSettings(StrictModel):
-    """Search along epipolar lines in neighbour keyframes."""
+    """Depth from a search along epipolar lines in neighbouring keyframes."""
 
     views: int = Field(default=8, ge=1, description="neighbours that are searched")
     parallax: float = Field(
@@ -115,7 +116,7 @@ class DepthSettings(StrictModel):
 
 
 class DensifySettings(StrictModel):
-    """Where new Gaussians go and how they begin (Section 3.2.2)."""
+    """Positions and initial values of new Gaussians (Section 3.2.2)."""
 
     error_compensation: bool = Field(
         default=True, description="also add Gaussians at pixels of low SSIM, not only at tracked points"
@@ -151,7 +152,7 @@ class VoxelSettings(StrictModel):
 
 
 class ViewSettings(StrictModel):
-    """Which keyframes an optimisation step looks at (Section 3.3.2)."""
+    """Selection of the keyframes of an optimisation step (Section 3.3.2)."""
 
     local_views: int = Field(default=1, ge=0, description="views from the local bank per step")
     bank: int = Field(default=10, ge=1, description="keyframes in the local bank")
@@ -176,7 +177,7 @@ class PoseSettings(StrictModel):
 
 
 class CorrectionSettings(StrictModel):
-    """What a tracker's corrections of former poses (bundle adjustment, closed loops) do to the map."""
+    """Effect of a tracker's pose corrections (bundle adjustment, loop closures) on the map."""
 
     enabled: bool = Field(
         default=True,
@@ -194,7 +195,7 @@ class CorrectionSettings(StrictModel):
 
 
 class LevelSettings(StrictModel):
-    """Image pyramid: the level that a new keyframe is optimised and densified on."""
+    """Image pyramid: the level on which a new keyframe is optimised and densified."""
 
     probabilities: tuple[float, ...] = Field(
         default=(0.4, 0.3, 0.2, 0.1),
@@ -202,8 +203,7 @@ class LevelSettings(StrictModel):
         max_length=MAX_LEVELS,
         description="of drawing the full size, the half, the quarter, ...; [1] for full size only: slower and finer",
     )
-    # With levels down to 33 pixels the maps of desk and fox lose half a decibel and more. Half of 320x240 is still
-    # worth its speed.
+    # Levels down to 33 pixels cost half a decibel or more on desk and fox. Half of 320x240 is still worth its speed.
     min_side: int = Field(
         default=96,
         ge=1,
@@ -212,7 +212,7 @@ class LevelSettings(StrictModel):
 
 
 class ExposureSettings(StrictModel):
-    """Exposure of every keyframe: image = A colour + b, for cameras that set their exposure by themselves."""
+    """Exposure of every keyframe, image = A colour + b, for cameras with automatic exposure."""
 
     enabled: bool = Field(default=False, description="estimate the exposure of keyframes with the map")
     learning_rate: float = Field(default=0.005, ge=0, description="Adam step of A (3x3) and b")
@@ -227,7 +227,7 @@ class ExposureSettings(StrictModel):
 
 
 class GateSettings(StrictModel):
-    """Frames that must not touch the map: blank ones, repeated ones, and those whose pose cannot be right."""
+    """Rejection of implausible frames: blank images, repeated images, and jumps of the pose."""
 
     enabled: bool = Field(default=True, description="leave such frames out; they keep their place in the outputs")
     min_contrast: float = Field(
@@ -318,7 +318,7 @@ class RefineSettings(StrictModel):
 
 
 class OfflineSettings(StrictModel):
-    """Offline 3DGS [Kerbl 2023], the baseline: all frames at once, from the tracked points.
+    """Offline 3DGS [Kerbl 2023], the baseline: optimisation on all frames, starting from the tracked points.
 
     An `extent` is 1.1 times the largest distance of a camera from the mean of all of them. Step numbers marked "of
     30,000" are those of the published run and scale with `steps`.

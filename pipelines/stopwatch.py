@@ -1,4 +1,4 @@
-"""Seconds per stage, as in the paper's breakdown of time."""
+"""Time per stage, as in the paper's breakdown of time."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ BREAKDOWN = ("optimise", "select", "depth", "occupancy")
 
 
 class Stopwatch:
-    """Adds up wall-clock seconds under names."""
+    """Accumulates wall-clock time by stage.
+
+    Attributes:
+        seconds: Time of each stage [s].
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
-        """Count the time of the block under `stage`."""
+        """Context manager that adds the time of its block to `stage`."""
         start = time.perf_counter()
         try:
             yield
@@ -29,7 +33,15 @@ class Stopwatch:
 
 
 def breakdown_percent(seconds: Mapping[str, float], total: float) -> dict[str, float]:
-    """Percent of `total` seconds of mapping that each stage took, and `others`, as in the paper's breakdown of time."""
+    """Compute the percentage of each stage, as in the paper's breakdown of time.
+
+    Args:
+        seconds: Time of each stage [s].
+        total: Total time of the mapping [s].
+
+    Returns:
+        Percentages of the paper's stages, and of the rest as `others`.
+    """
     percent = {stage: 100.0 * seconds.get(stage, 0.0) / total for stage in BREAKDOWN}
     percent["others"] = 100.0 - sum(percent.values())
     return {stage: round(value, 2) for stage, value in percent.items()}

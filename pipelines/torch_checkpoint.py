@@ -1,4 +1,4 @@
-"""Files of trained weights: tensors by name, read without running what is pickled in them, every entry checked."""
+"""Safe reading of trained weights: no pickled code is run, and every entry is checked."""
 
 from __future__ import annotations
 
@@ -12,24 +12,33 @@ import torch
 
 __all__ = ["read_checkpoint", "require_entries"]
 
-# Files older than PyTorch 1.6 are pickles one after the other: this number first, then version, system and content.
+# Files from before PyTorch 1.6 are consecutive pickles: this number, then version, system information and content.
 MAGIC = 0x1950A86A20F9469CFC6C
 PICKLES = 4
-# Whole numbers up to this are in every such file: the version is 1001.
+# Integers up to this occur in every such file: the version is 1001.
 SMALL = 4096
 
 
 def read_checkpoint(path: Path, key: str | None = None) -> dict[str, torch.Tensor]:
-    """The tensors of a file that `torch.save` wrote, on the CPU as float32; of its entry `key` where one is given.
+    """Read the tensors of a file written by `torch.save`.
 
-    Raises ValueError (one line) where the file is none, holds code, or holds anything but finite tensors by name.
+    Args:
+        path: The file.
+        key: Entry that holds the tensors; None if the file itself is a dictionary of tensors.
+
+    Returns:
+        Tensors by name, on the CPU as float32.
+
+    Raises:
+        ValueError: If the file does not exist, contains code, or contains anything but finite tensors by name. The
+            message is one line.
     """
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     _require_bounded(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the unpickler and the archive reader have no common one
+    except Exception as error:  # the unpickler and the archive reader have no common base class
         reason = str(error).strip().splitlines()
         raise ValueError(
             f"{path}: cannot be loaded as weights only ({reason[0] if reason else type(error).__name__})"
@@ -43,7 +52,7 @@ def read_checkpoint(path: Path, key: str | None = None) -> dict[str, torch.Tenso
     for name, value in content.items():
         if not isinstance(value, torch.Tensor):
             raise ValueError(f"{path}: entry `{name}` is {type(value).__name__}, not a tensor")
-        # A tensor may repeat what is stored, up to any size, or hold nothing at all.
+        # A strided view can repeat its storage up to any size, and a meta tensor has no storage.
         plain = value.layout is torch.strided and value.device.type == "cpu" and not value.is_quantized
         if not plain or value.numel() * value.element_size() > path.stat().st_size:
             raise ValueError(f"{path}: entry `{name}` is no plain tensor that the file has room for")
@@ -53,7 +62,7 @@ def read_checkpoint(path: Path, key: str | None = None) -> dict[str, torch.Tenso
 
 
 def _require_bounded(path: Path) -> None:
-    """Raises ValueError where loading would allocate more than the file has: nothing is loaded for that."""
+    """Raise ValueError if loading would allocate more than the size of the file, without loading it."""
     size = path.stat().st_size
     try:
         if zipfile.is_zipfile(path):
@@ -68,7 +77,7 @@ def _require_bounded(path: Path) -> None:
             raise ValueError("it is empty")
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             for _ in range(PICKLES):
-                for _, argument, _ in pickletools.genops(content):  # which looks at the pickle and runs nothing of it
+                for _, argument, _ in pickletools.genops(content):  # parses the pickle without running it
                     if isinstance(argument, int) and argument > max(size, SMALL) and argument != MAGIC:
                         raise ValueError("it announces more than is in the file")
     except (ValueError, OSError, IndexError, OverflowError, zipfile.BadZipFile, NotImplementedError) as error:
@@ -79,7 +88,16 @@ def _require_bounded(path: Path) -> None:
 
 
 def require_entries(path: Path, entries: Mapping[str, torch.Tensor], shapes: Mapping[str, Sequence[int]]) -> None:
-    """Raise ValueError naming the first entry of `entries` that is missing, has another shape, or is unexpected."""
+    """Check the names and shapes of all entries.
+
+    Args:
+        path: The file, for the error message.
+        entries: Tensors by name.
+        shapes: Expected shapes by name.
+
+    Raises:
+        ValueError: Names the first entry that is missing, has another shape, or is unexpected.
+    """
     for name, shape in shapes.items():
         if name not in entries:
             raise ValueError(f"{path}: entry `{name}` is missing")

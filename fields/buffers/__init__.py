@@ -1,1 +1,1 @@
-"""What a render needs: the picture and its gradients, tiles, pairs, the view, projected Gaussians."""
+"""Buffers of the renderer: images and gradients, tiles, (tile, Gaussian) pairs, the view, projected Gaussians."""

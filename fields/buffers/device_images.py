@@ -1,4 +1,4 @@
-"""`DeviceImages`: copies of host images on the device, as many as fit, the least recently used leaving first."""
+"""`DeviceImages`: a least-recently-used cache of host images on the device."""
 
 import weakref
 from collections import OrderedDict
@@ -12,9 +12,16 @@ __all__ = ["DeviceImages"]
 
 
 class DeviceImages:
-    """Keyframe images stay in host memory; a step finds those that it needs here, or has them streamed.
+    """Cache of device copies of keyframe images, which stay in host memory.
 
-    An image is known by its array, which must not change; a copy goes with its array.
+    An image is identified by its array object, whose contents must not change. When the array is garbage collected, its
+    copy is dropped.
+
+    Args:
+        max_bytes: Capacity [bytes].
+
+    Attributes:
+        bytes: Bytes of all copies.
     """
 
     def __init__(self, max_bytes: float) -> None:
@@ -30,7 +37,7 @@ class DeviceImages:
         return id(image) in self._copies
 
     def of(self, image: np.ndarray) -> torch.Tensor:
-        """The device's copy of a uint8 image, now the most recently used one. Does not wait for the device."""
+        """Return the device copy of a uint8 image, uploading it if necessary. Does not wait for the device."""
         key = id(image)
         if key in self._copies:
             self._copies.move_to_end(key)
@@ -46,7 +53,7 @@ class DeviceImages:
         host = torch.from_numpy(image)
         if self._device.type == "cpu":
             return host.clone()
-        # From pinned memory: a copy from any other would wait for the kernels before it.
+        # A copy from memory that is not pinned would wait for the kernels launched before.
         pinned = torch.empty(host.shape, dtype=host.dtype, pin_memory=True)
         pinned.copy_(host)
         return pinned.to(self._device, non_blocking=True)

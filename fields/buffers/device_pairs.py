@@ -1,4 +1,4 @@
-"""`DevicePairs`: the GPU's lists of which Gaussians reach which tile, in tensors that grow between renders."""
+"""`DevicePairs`: the GPU's (tile, Gaussian) pairs, in tensors that grow between renders."""
 
 import taichi as ti
 import torch
@@ -7,17 +7,18 @@ from fields.runtime.backend import torch_device
 
 __all__ = ["NO_TILE", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "DevicePairs", "tile_count"]
 
-# A thread a pixel; square, for few pairs. The CPU's tiles are narrow for the sake of its vectors.
+# One thread per pixel. Square tiles keep the number of pairs low; the CPU's tiles are narrow for its vector units.
 TILE_WIDTH = TILE_HEIGHT = 16
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-# Key of the unused entries: behind all tiles. Keys have 16 bits where tiles allow, which halves the passes of the sort.
+# Key of unused entries, which sorts after all tiles. Keys have 16 bits if the number of tiles allows it, which halves
+# the passes of the sort.
 NO_TILE = {torch.int16: 2**15 - 1, torch.int32: 2**31 - 1}
-# Room grows by whole steps, so that it seldom does.
+# The tensors grow in multiples of this, so that they grow rarely.
 STEP = 1 << 16
 
 
 def tile_count(width: int, height: int) -> int:
-    """Tiles of an image."""
+    """Number of tiles of an image."""
     return -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
 
 
@@ -25,13 +26,22 @@ def tile_count(width: int, height: int) -> int:
 class DevicePairs:
     """Pairs (tile, Gaussian) in two orders: as emitted, slot by slot (nearest first), and sorted by tile.
 
-    Per tile: `first` and `tile_count` of its sorted pairs, `reached`: how many of them were composited before it was
-    opaque. Per emitted pair: `key` (its tile), `emitted_slot` and `gradient` (ten sums over the tile's pixels, those
-    of a slot one after another from `projected.first_pair`). Per sorted pair: `slot` of the projected Gaussian, `rows`
-    as in `TilePairs`, and `origin`: its place in the emitted order.
-
-    room: how many pairs a view may have at present, of the `capacity` of the tensors; what is beyond the used ones is
-    sorted with them. total: pairs of the last view, on the device; those beyond `room` (the farthest) are left out.
+    Attributes:
+        first: Per tile, the index of its first sorted pair.
+        tile_count: Per tile, the number of its pairs.
+        reached: Per tile, the number of pairs that were composited before the tile was opaque.
+        key: Per emitted pair, its tile.
+        emitted_slot: Per emitted pair, the slot of the projected Gaussian.
+        gradient: Per emitted pair, ten sums over the tile's pixels. Those of a slot are contiguous from
+            `projected.first_pair`.
+        slot: Per sorted pair, the slot of the projected Gaussian.
+        rows: Per sorted pair, the rows that its ellipse reaches, as in `TilePairs`.
+        origin: Per sorted pair, its index in the emitted order.
+        capacity: Size of the tensors.
+        room: Number of pairs that a view may currently have, at most `capacity`. Unused entries up to it are sorted as
+            well.
+        total: Number of pairs of the last view, on the device; `room` + 1 if there are more. Pairs beyond `room` (the
+            farthest ones) are dropped.
     """
 
     def __init__(self, builder: ti.FieldsBuilder, max_width: int, max_height: int, max_pairs: int = 1 << 26) -> None:
@@ -49,9 +59,9 @@ class DevicePairs:
         self.last_placed = self.total
 
     def make_room(self, pairs: int) -> None:
-        """Have room for `pairs` pairs, and less than a step more, up to `max_pairs`.
+        """Set `room` to `pairs`, rounded up to a multiple of `STEP` and limited to `max_pairs`.
 
-        What the tensors held is lost where they grow.
+        If the tensors have to grow, their contents are lost.
         """
         self.room = n = min(-(-pairs // STEP) * STEP, self.max_pairs)
         if n <= self.capacity:
@@ -63,10 +73,10 @@ class DevicePairs:
             torch.empty(n, dtype=torch.int32, device=self.device) for _ in range(3)
         )
         self.gradient = torch.empty(10 * n, dtype=torch.float32, device=self.device)
-        # Until the first sort.
+        # A placeholder, which the first sort replaces.
         self.origin = torch.empty(n, dtype=torch.int64, device=self.device)
 
     @property
     def count(self) -> int:
-        """Pairs of the last view that there was room for. Waits for the device."""
+        """Number of pairs of the last view, at most `room`. Waits for the device."""
         return min(self.total[None], self.room)

@@ -1,4 +1,4 @@
-"""`ImageBuffers`: the picture being rendered, its reference, and their gradients."""
+"""`ImageBuffers`: the rendered image, the reference image, and gradients."""
 
 import numpy as np
 import taichi as ti
@@ -12,26 +12,32 @@ from fields.runtime.parallel import HANDED_OUT
 
 __all__ = ["PAD", "SCRATCH_ROWS", "STRIPS", "ImageBuffers"]
 
-# Border of zeros around every plane [px]: an 11x11 window reads 5 beyond the image without a branch.
+# Border of zeros around every plane [px]. An 11x11 window reads 5 px beyond the image without a branch.
 PAD = 8
-# Strips of rows that the loss works on in parallel, each channel of each with this many scratch rows of its own.
+# The loss works on strips of rows in parallel, with separate scratch rows for each channel of a strip.
 STRIPS = 32
 SCRATCH_ROWS = 8
-# A thread takes eight rows at a time.
+# Eight rows per chunk, see `fields.runtime.parallel`.
 SPREAD = HANDED_OUT // 8
 
 
 @ti.data_oriented
 class ImageBuffers:
-    """Images up to `max_width` x `max_height` pixels, any smaller size without recompiling.
+    """Image buffers for any size up to a maximum, without recompilation.
 
-    Planar buffers hold one plane a channel, row-major with a border of `PAD` zeros: pixel (x, y) of channel c is
-    at `c * plane + (y + PAD) * stride + x + PAD`. Tile buffers hold the 256 pixels of a tile consecutively, so
-    that a loop over them is one vector loop. Capacities are powers of two, so that most image sizes share the
-    kernels of the offline cache.
+    Planar buffers hold one plane per channel, row-major with a border of `PAD` zeros: pixel (x, y) of channel c is at
+    `c * plane + (y + PAD) * stride + x + PAD`. Tile buffers hold the 256 pixels of a tile consecutively, so that a loop
+    over them is one vector loop. Capacities are rounded up, mostly to powers of two, so that most image sizes share the
+    kernels of the offline cache. The values have the Taichi type `real`, `ti.f32` or `ti.f64`.
 
-    cache_gb: device memory for copies of reference images, on a GPU.
-    masked: whether the reference has masked pixels. On a GPU always False: the loss masks them on its way.
+    Args:
+        builder: Builder that the buffers are placed in.
+        max_width: Largest image width [px].
+        max_height: Largest image height [px].
+        cache_gb: Device memory for copies of reference images, on a GPU [GiB].
+
+    Attributes:
+        masked: Whether the reference has masked pixels. Always False on a GPU, where the loss handles the mask itself.
     """
 
     def __init__(
@@ -42,8 +48,8 @@ class ImageBuffers:
         self.max_width, self.max_height = max_width, max_height
         tiles = -(-max_width // TILE_WIDTH) * -(-max_height // TILE_HEIGHT)
         self.max_tiles = 1 << (tiles - 1).bit_length()
-        # Constants of the kernels, so that LLVM sees that rows do not overlap; a power of two plus the border, so that
-        # the rows of a window do not fall into the same cache set.
+        # Compile-time constants, so that LLVM sees that rows do not overlap. The border added to a power of two keeps
+        # the rows of a window out of the same cache set.
         self.stride = (1 << (max_width - 1).bit_length()) + 2 * PAD
         self.plane = self.stride * (-(-max_height // 256) * 256 + 2 * PAD)
         self.width = self.height = 0
@@ -56,14 +62,14 @@ class ImageBuffers:
         def scalar():
             return ti.field(real)
 
-        # Tile buffers: accumulators of compositing, and what its backward pass carries along a ray.
+        # Tile buffers: accumulators of compositing, and the per-pixel state of its backward pass.
         self.transmittance, self.red, self.green, self.blue, self.z = (scalar() for _ in range(5))
         self.behind, self.red_grad, self.green_grad, self.blue_grad, self.z_grad = (scalar() for _ in range(5))
         # Planar buffers.
         self.colour, self.depth, self.opacity = scalar(), scalar(), scalar()
         self.colour_grad, self.depth_grad, self.opacity_grad = scalar(), scalar(), scalar()
         self.reference, self.valid = scalar(), scalar()
-        # SSIM: its derivatives by the render's local mean, square and product (3 planes a channel), its map.
+        # SSIM: derivatives with respect to the render's local mean, square and product (3 planes per channel); the map.
         self.ssim_partial, self.ssim = scalar(), scalar()
         self.rows = scalar()
         self.background = ti.Vector.field(3, real)
@@ -82,7 +88,15 @@ class ImageBuffers:
         builder.place(self.background)
 
     def resize(self, width: int, height: int) -> None:
-        """Lay the buffers out for images of `width` x `height`. Raises ValueError beyond the capacity."""
+        """Set the image size, and clear the planar buffers if it changes.
+
+        Args:
+            width: Image width [px].
+            height: Image height [px].
+
+        Raises:
+            ValueError: If the size exceeds the capacity.
+        """
         if (width, height) == (self.width, self.height):
             return
         if width > self.max_width or height > self.max_height:
@@ -110,59 +124,70 @@ class ImageBuffers:
 
     @ti.kernel
     def clip_colour(self):
-        """Clip the rendered image to [0, 1], as a file of it would."""
+        """Clip the rendered image to [0, 1]."""
         for i in range(3 * self.plane):
             self.colour[i] = ti.min(ti.max(self.colour[i], 0.0), 1.0)
 
     # ---- to and from NumPy -----------------------------------------------------------------------------------
 
     def set_reference(self, image: np.ndarray) -> None:
-        """Take a reference image (H, W, 4) uint8: RGB and 255 where the pixel is valid, 0 where it is masked."""
+        """Set the reference image.
+
+        Args:
+            image: RGB and validity (H, W, 4) uint8. The last channel is 255 at valid pixels and 0 at masked ones.
+        """
         self.masked = self._references is None and not image[..., 3].all()
         pixels = np.ascontiguousarray(image) if self._references is None else self._references.of(image)
         self._take_reference(self.width * self.height, self.width, self.height, pixels)
 
     def set_gradients(self, *gradients: np.ndarray | torch.Tensor) -> None:
-        """Set d loss / d image: colour (H, W, 3), depth (H, W), opacity (H, W).
+        """Set d loss / d image.
 
-        Tensors must be contiguous, of the buffers' type, and lie where kernels run.
+        Args:
+            *gradients: Gradients of colour (H, W, 3), depth (H, W) and opacity (H, W). Tensors must be contiguous, of
+                the buffers' type, and on the device that kernels run on.
         """
         arrays = [a if isinstance(a, torch.Tensor) else np.ascontiguousarray(a, dtype=self.dtype) for a in gradients]
         self._set_gradients(self.width, self.height, *arrays)
 
     def read_into(self, colour: torch.Tensor, depth: torch.Tensor, opacity: torch.Tensor) -> None:
-        """Write the rendered picture into tensors: colour (H, W, 3), depth (H, W), opacity (H, W).
+        """Write the rendered image into tensors.
 
-        They must be contiguous, of the buffers' type, and lie where kernels run.
+        The tensors must be contiguous, of the buffers' type, and on the device that kernels run on.
+
+        Args:
+            colour: Output (H, W, 3).
+            depth: Output (H, W).
+            opacity: Output (H, W).
         """
         self._read_picture(self.width, self.height, colour, depth, opacity)
 
     def colour_to_numpy(self) -> np.ndarray:
-        """The rendered image (H, W, 3), not clipped."""
+        """Return the rendered image (H, W, 3), not clipped."""
         out = np.empty((self.height, self.width, 3), dtype=self.dtype)
         self._read_planes(self.width, self.height, self.colour, out)
         return out
 
     def depth_to_numpy(self) -> np.ndarray:
-        """Composited depth (H, W): the sum of weight times z, not divided by opacity."""
+        """Return the composited depth (H, W): the sum of weight times z, not divided by opacity."""
         out = np.empty((self.height, self.width, 1), dtype=self.dtype)
         self._read_planes(self.width, self.height, self.depth, out)
         return out[..., 0]
 
     def opacity_to_numpy(self) -> np.ndarray:
-        """Composited opacity (H, W): 1 minus the transmittance behind the last Gaussian."""
+        """Return the composited opacity (H, W): 1 minus the transmittance behind the last Gaussian."""
         out = np.empty((self.height, self.width, 1), dtype=self.dtype)
         self._read_planes(self.width, self.height, self.opacity, out)
         return out[..., 0]
 
     def colour_gradient_to_numpy(self) -> np.ndarray:
-        """d loss / d colour (H, W, 3)."""
+        """Return d loss / d colour (H, W, 3)."""
         out = np.empty((self.height, self.width, 3), dtype=self.dtype)
         self._read_planes(self.width, self.height, self.colour_grad, out)
         return out
 
     def ssim_to_numpy(self) -> np.ndarray:
-        """The last SSIM map (H, W, 3)."""
+        """Return the last SSIM map (H, W, 3)."""
         out = np.empty((self.height, self.width, 3), dtype=self.dtype)
         self._read_planes(self.width, self.height, self.ssim, out)
         return out
@@ -176,7 +201,7 @@ class ImageBuffers:
             if i % SPREAD == 0:
                 y = i // SPREAD
                 row = (y + PAD) * self.stride + PAD
-                # A first access out here makes Taichi fetch the tree's root once, not at every pixel.
+                # A first access outside the loop makes Taichi fetch the tree's root once, and not at every pixel.
                 self.valid[row] = 0.0
                 for c in ti.static(range(3)):
                     for x in range(width):
@@ -188,7 +213,7 @@ class ImageBuffers:
     def _set_reference_pixels(
         self, alone: ti.template(), width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.u8, ndim=3)
     ):
-        """The same with a thread a pixel, for a GPU."""
+        """The same with one thread per pixel, for a GPU."""
         ti.loop_config(serialize=alone)
         for i in range(width * height):
             x, y = i % width, i // width

@@ -11,17 +11,22 @@ BLOCK = 1024
 
 @ti.data_oriented
 class ProjectedGaussians:
-    """One slot per visible Gaussian, with the gradients of all that compositing reads.
+    """One slot per visible Gaussian, with the gradients of the values that compositing reads.
 
-    gaussian: index in the `GaussianField`, rising with the slot on the CPU, so that memory is read in its order. order:
-    the slots, nearest first; on a GPU they are in that order themselves. mean (2): pixel position. conic (3): inverse
-    2D covariance (xx, xy, yy) [1/px^2]. opacity: after the anti-aliasing compensation. colour (3), depth: z in the
-    camera frame.
-    tangent (6): a copy per slot of the camera tangent xi = 0, so that its gradient is gathered without contention
-    and in a fixed order. first_pair, end_pair: index of the slot's first tile pair, and of the one behind its last.
-
-    seen: how many slots there are, where kernels read it. count: the same as far as the host knows it: on a GPU, where
-    nothing is read back, an upper bound.
+    Attributes:
+        gaussian: Index in the `GaussianField`. On the CPU it increases with the slot, so that memory is read in order.
+        order: The slots, nearest first. On a GPU, the slots are in that order themselves.
+        mean: Pixel position (2).
+        conic: Inverse 2D covariance (3) as (xx, xy, yy) [1/px^2].
+        opacity: Opacity after the anti-aliasing compensation.
+        colour: Colour (3) as seen from the view.
+        depth: z in the camera frame [scene units].
+        tangent: Camera tangent xi = 0 (6), one copy per slot, so that its gradient is gathered without contention and
+            in a fixed order.
+        first_pair: Index of the slot's first tile pair.
+        end_pair: Index after the slot's last tile pair.
+        seen: Number of slots, as read by kernels.
+        count: Number of slots as known to the host. On a GPU, where it is not read back, this is an upper bound.
     """
 
     def __init__(self, builder: ti.FieldsBuilder, capacity: int, real=ti.f32) -> None:

@@ -1,16 +1,17 @@
-"""`TilePairs`: which Gaussians reach which tile of the image, nearest first."""
+"""`TilePairs`: lists of the Gaussians that reach each tile, nearest first."""
 
 import numpy as np
 import taichi as ti
 
 __all__ = ["GROUP", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
 
-# Powers of two. A row of a tile is one vector of eight float32, as LLVM makes them even where there are wider ones:
-# what an ellipse does not reach of a row is wasted work. A tall tile wastes none, and keeps the pairs few.
+# Powers of two. A row of a tile is one vector of eight float32, the width that LLVM uses even where the processor has
+# wider vectors. Pixels of a row outside the ellipse are wasted work. Rows outside it are skipped, so that tall tiles
+# waste nothing and keep the number of pairs low.
 TILE_WIDTH = 8
 TILE_HEIGHT = 32
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-# Pairs that a tile composites between two looks at what is left to do.
+# Number of pairs that a tile composites between two checks for opacity.
 GROUP = 16
 BLOCK = 4096
 
@@ -19,12 +20,19 @@ BLOCK = 4096
 class TilePairs:
     """Pairs (tile, Gaussian), sorted by tile and within a tile by depth.
 
-    Per tile: `first` and `count` of its pairs, `reached`: how many of them were composited before it was opaque.
-    Per pair, in the order of depth, chunk by chunk: `emitted_tile` and `emitted_rows`, before they are sorted.
-    Per sorted pair: `slot` of the projected Gaussian, `rows`: first row and row behind the last that its ellipse
-    reaches in the tile (first | last << 16), `gradient`: ten sums over the tile's pixels (see `compositing.py`).
-    `staged`, GROUP of a tile: what compositing needs of the Gaussians of the pairs that it is at, close together.
-    `position[e]` for e from slot s's `first_pair` to its `end_pair` are the places of its pairs.
+    Attributes:
+        first: Per tile, the index of its first pair.
+        tile_count: Per tile, the number of its pairs.
+        reached: Per tile, the number of pairs that were composited before the tile was opaque.
+        emitted_tile: Per unsorted pair, in depth order chunk by chunk, its tile.
+        emitted_rows: Per unsorted pair, its rows.
+        slot: Per sorted pair, the slot of the projected Gaussian.
+        rows: Per sorted pair, the first row that its ellipse reaches in the tile and the row after the last, packed as
+            first | last << 16.
+        gradient: Per sorted pair, ten sums over the tile's pixels (see `compositing.py`).
+        staged: Per tile, contiguous copies of the Gaussians of the `GROUP` pairs that are being composited.
+        position: `position[e]`, for e from `first_pair` to `end_pair` of a slot, are the indices of its sorted pairs.
+        count: Number of pairs.
     """
 
     def __init__(
@@ -32,7 +40,7 @@ class TilePairs:
     ) -> None:
         self.max_tiles = max_tiles
         self.max_pairs = max_pairs
-        # Pairs of one chunk at most: the nearest have the largest ellipses.
+        # Largest number of pairs of one chunk. The chunk of the nearest Gaussians has the largest ellipses.
         self.segment = max_pairs // 4
         self.count = 0
         self.first = ti.field(ti.i32)
@@ -60,7 +68,7 @@ class TilePairs:
         self.last_placed = self.emitted_rows
 
     def rows_to_numpy(self) -> np.ndarray:
-        """`rows` of all pairs (count,) int32, in the order of the lists."""
+        """Return `rows` (count,) int32 of all sorted pairs."""
         out = np.zeros(self.count, dtype=np.int32)
         if self.count:
             self._read_rows(out)

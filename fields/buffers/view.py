@@ -1,4 +1,4 @@
-"""`ViewField`: the camera that is being rendered, where kernels can read it."""
+"""`ViewField`: the pose and camera of the current render, as fields for kernels."""
 
 import numpy as np
 import taichi as ti
@@ -10,16 +10,22 @@ from fields.runtime.compiled_kernel import CompiledKernel
 
 __all__ = ["ViewField"]
 
-# Projection linearises at most this share of half the image outside the frame (1.3 tan(fov / 2), as 3DGS does).
+# Projection is linearised up to this fraction of half the image outside the frame (1.3 tan(fov / 2), as in 3DGS).
 FRUSTUM_MARGIN = 0.3
 
 
 @ti.data_oriented
 class ViewField:
-    """Pose and intrinsics of one view: rotation and translation of T_camera_world, focal lengths, centre, size.
+    """Pose and intrinsics of one view.
 
-    `limits` are the bounds of x/z and y/z (left, right, top, bottom) between which the projection is linearised;
-    `near` is the depth below which nothing is drawn, in scene units.
+    Attributes:
+        rotation: Rotation (3, 3) of T_camera_world.
+        translation: Translation (3,) of T_camera_world.
+        focal: Focal lengths (2,) [px].
+        centre: Principal point (2,) [px].
+        limits: Bounds (left, right, top, bottom) of x/z and y/z within which the projection is linearised.
+        near: Depth below which nothing is drawn [scene units].
+        size: Width and height [px].
     """
 
     def __init__(self, builder: ti.FieldsBuilder, real=ti.f32) -> None:
@@ -38,7 +44,13 @@ class ViewField:
         self.height = 0
 
     def set(self, camera: PinholeCamera, T_camera_world: ArrayLike, near: float) -> None:
-        """Look through `camera` from `T_camera_world` (4, 4)."""
+        """Set the view.
+
+        Args:
+            camera: Intrinsics.
+            T_camera_world: Pose (4, 4).
+            near: Depth below which nothing is drawn [scene units].
+        """
         T = np.asarray(T_camera_world, dtype=np.float64)
         margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
         margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy

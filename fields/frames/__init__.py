@@ -1,1 +1,1 @@
-"""What a tracker hands over: frames with their poses and points, and corrections of poses."""
+"""Input of the mapper: tracked frames with their points, and corrections of poses."""

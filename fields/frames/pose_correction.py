@@ -1,4 +1,4 @@
-"""`PoseCorrection`: what a tracker hands to the mapper when it revises poses that it has delivered before."""
+"""`PoseCorrection`: a tracker's revision of poses that it delivered earlier."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ __all__ = ["PoseCorrection"]
 
 @dataclass(frozen=True)
 class PoseCorrection:
-    """Revised poses and points, after a bundle adjustment or a closed loop.
+    """Revised poses and points after a bundle adjustment or a loop closure.
 
-    index: (N,) int64, of the frames, increasing. T_camera_world: (N, 4, 4) float64, their tracked poses from now on; a
-    frame that is not named follows those around it. ids (M,) int64 and xyz (M, 3) float64: tracked points that moved,
-    world frame; may be empty.
+    Frames that are not listed follow the listed frames around them.
+
+    Attributes:
+        index: Indices (N,) int64 of the frames, increasing.
+        T_camera_world: Revised tracked poses (N, 4, 4) float64.
+        ids: Ids (M,) int64 of the tracked points that moved; may be empty.
+        xyz: New positions (M, 3) float64 of these points in the world frame.
+
+    Raises:
+        ValueError: If there is no pose, a value is not finite, the shapes disagree, or the indices are negative or not
+            increasing.
     """
 
     index: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""Image pyramid of a keyframe."""
+"""Image pyramids."""
 
 from __future__ import annotations
 
@@ -12,25 +12,38 @@ from fields.geometry.camera import PinholeCamera
 
 __all__ = ["MAX_LEVELS", "ImageLevel", "build_pyramid"]
 
-# The eighth halving of the largest image that anyone maps is a thumbnail.
+# Even the largest images are thumbnails after this many levels.
 MAX_LEVELS = 8
 
-# No level is made whose shorter side would have fewer pixels: two windows of the loss.
+# Minimum shorter side of a level [px]: twice the width of the loss's window.
 MIN_SIDE = 22
 
 
 @dataclass(frozen=True, slots=True)
 class ImageLevel:
-    """One level: rgba (H, W, 4) uint8, 255 in the last channel where the pixel is valid, and its camera."""
+    """One level of an image pyramid.
+
+    Attributes:
+        rgba: Image (H, W, 4) uint8; the last channel is 255 at valid pixels.
+        camera: Camera of the level.
+    """
 
     rgba: NDArray[np.uint8]
     camera: PinholeCamera
 
 
 def build_pyramid(rgba: NDArray[np.uint8], camera: PinholeCamera, levels: int = MAX_LEVELS) -> tuple[ImageLevel, ...]:
-    """Up to `levels` levels of halved size, the given image first.
+    """Build an image pyramid of halved sizes, by area averaging.
 
-    A pixel is the mean of those that it covers, and valid where all of them are.
+    A pixel is valid if all pixels that it covers are valid.
+
+    Args:
+        rgba: Image (H, W, 4) uint8 with its mask in the last channel.
+        camera: Camera of the image.
+        levels: Maximum number of levels.
+
+    Returns:
+        The levels, the given image first. No level has a side shorter than 22 pixels, except possibly the first.
     """
     pyramid = [ImageLevel(rgba, camera)]
     while len(pyramid) < levels:

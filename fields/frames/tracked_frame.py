@@ -1,4 +1,4 @@
-"""`TrackedFrame`: what a tracker hands to the mapper, and the only thing that the mapper takes in."""
+"""`TrackedFrame`: the input of the mapper, a frame with its tracked pose and points."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from fields.geometry.camera import PinholeCamera
 
 __all__ = ["SparsePoints", "TrackedFrame"]
 
-# Entries by which a pose may miss being rigid.
+# Largest deviation of a pose's entries from a rigid motion.
 MAX_DRIFT = 1e-3
-# Numbers for the points of a frame that come without: those of another frame are others.
+# Generated ids start at index * IDS_PER_FRAME, so that the ids of different frames never coincide.
 IDS_PER_FRAME = 1 << 32
 
 
@@ -27,8 +27,13 @@ def _empty(*shape: int) -> NDArray[np.float64]:
 class SparsePoints:
     """Tracked 3D points observed in one frame (P_i of the paper).
 
-    xyz: (N, 3) float64, world frame. pixels: (N, 2) float64, (x, y) observed in the undistorted image, pixel
-    centres at +0.5. ids: (N,) int64, the same number for the same point in every frame.
+    Attributes:
+        xyz: Positions (N, 3) float64 in the world frame.
+        pixels: Observations (N, 2) float64 as (x, y) in the undistorted image, with pixel centres at +0.5.
+        ids: Ids (N,) int64, the same for the same point in every frame.
+
+    Raises:
+        ValueError: If the shapes disagree or a value is not finite.
     """
 
     xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
@@ -48,7 +53,7 @@ class SparsePoints:
         return len(self.ids)
 
     def depths(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Depth (N,) of the points before a camera at this pose; negative behind it."""
+        """Return the depths (N,) of the points in a camera at `T_camera_world` (4, 4); negative behind the camera."""
         return self.xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
 
 
@@ -56,15 +61,23 @@ class SparsePoints:
 class TrackedFrame:
     """One frame with its tracked pose.
 
-    index: position among the frames that the tracker delivered, from 0. timestamp: seconds.
-    image: (H, W, 3) float32 RGB in [0, 1], undistorted. camera: its intrinsics.
-    T_camera_world: (4, 4) float64, world to camera, OpenCV axes.
-    mask: (H, W) bool, True where the pixel is valid; None where all are.
-    vignette: (H, W, 3) float32 in (0, 1], the share of the light that reaches each pixel, one array for all frames of
-    a camera; None for all of it. The image shows the scene times the vignette.
-    held_out: only for evaluation; such a frame never touches the map.
+    `rgba` and `pyramid` are computed on first access. A background thread may access them before the mapper does.
 
-    `rgba` and `pyramid` are made when first asked for, which a thread may do before the mapper takes the frame in.
+    Attributes:
+        index: Position among the frames that the tracker delivered, from 0.
+        timestamp: Time stamp [s].
+        name: Name of the frame, used in error messages.
+        image: Undistorted image (H, W, 3) float32, RGB in [0, 1].
+        camera: Intrinsics of the image.
+        T_camera_world: Pose (4, 4) float64, world to camera, OpenCV axes.
+        points: Tracked points.
+        mask: Validity mask (H, W) bool, True at valid pixels; None if all pixels are valid.
+        vignette: Fraction of the light that reaches each pixel, (H, W, 3) float32 in (0, 1], one array for all frames
+            of a camera; None for no vignetting. The image is the scene times the vignette.
+        held_out: Whether the frame is for evaluation only. Such a frame never touches the map.
+
+    Raises:
+        ValueError: If the shapes or dtypes do not fit, or the pose is not finite.
     """
 
     index: int
@@ -108,15 +121,27 @@ class TrackedFrame:
         mask: NDArray[np.bool_] | None = None,
         held_out: bool = False,
     ) -> TrackedFrame:
-        """A frame of what one's own loop has, looked over: most mistakes in conventions are found here.
+        """Build a frame from plain arrays, with checks for most mistakes in conventions.
 
-        index: 0, 1, 2, ... in the order of the frames. image: (H, W, 3) RGB without distortion, uint8, or float32 in
-        [0, 1]. T_camera_world: (4, 4), world to camera, OpenCV axes. intrinsics: fx, fy, cx, cy [px], the centre of the
-        first pixel being (0.5, 0.5). xyz (N, 3): tracked points in the world, pixels (N, 2): where the image shows
-        them, as (x, y). ids (N,): the same integer for the same point in every frame; without, all are new ones.
-        timestamp: seconds, the index where it is not given. mask, held_out: as in the class.
+        Args:
+            index: 0, 1, 2, ... in the order of the frames.
+            image: Undistorted RGB image (H, W, 3), uint8, or float32 in [0, 1].
+            T_camera_world: Pose (4, 4), world to camera, OpenCV axes.
+            intrinsics: fx, fy, cx, cy [px]. The centre of the first pixel is at (0.5, 0.5).
+            xyz: Tracked points (N, 3) in the world frame.
+            pixels: Observations (N, 2) of these points in the image, as (x, y).
+            ids: Integer ids (N,), the same for the same point in every frame. None treats all points as new.
+            timestamp: Time stamp [s]; None for the index.
+            name: Name of the frame; None for `frame INDEX`.
+            mask: Validity mask (H, W) bool, True at valid pixels; None if all pixels are valid.
+            held_out: Whether the frame is for evaluation only.
 
-        Raises TypeError or ValueError in one line, naming the frame.
+        Returns:
+            The frame.
+
+        Raises:
+            TypeError: If a dtype is wrong. The message is one line and names the frame.
+            ValueError: If a shape or value is wrong. The message is one line and names the frame.
         """
         name = f"frame {index}" if name is None else name
         image = np.asarray(image)
@@ -163,7 +188,7 @@ class TrackedFrame:
 
     @cached_property
     def rgba(self) -> NDArray[np.uint8]:
-        """The image with 8 bits a channel (H, W, 4), 255 in the last where the pixel is valid and all 0 where not."""
+        """Image (H, W, 4) uint8. The last channel is 255 at valid pixels; invalid pixels are 0 in all channels."""
         rgba = np.full((*self.image.shape[:2], 4), 255, dtype=np.uint8)
         rgba[..., :3] = np.round(self.image * 255.0)
         if self.mask is not None:
@@ -172,12 +197,12 @@ class TrackedFrame:
 
     @cached_property
     def pyramid(self) -> tuple[ImageLevel, ...]:
-        """`rgba` and its halved sizes, as many levels as `build_pyramid` makes."""
+        """Image pyramid of `rgba`, see `build_pyramid`."""
         return build_pyramid(self.rgba, self.camera)
 
 
 def _is_rigid(T: NDArray[np.float64]) -> bool:
-    """Whether T (4, 4) is a rotation and a translation."""
+    """Whether T (4, 4) is a rigid motion, up to `MAX_DRIFT`."""
     R = T[:3, :3]
     off = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
     return bool(np.isfinite(T).all() and off < MAX_DRIFT and np.linalg.det(R) > 0)

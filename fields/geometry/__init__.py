@@ -1,1 +1,1 @@
-"""Rigid motions, similarities, the camera and small vectors, for NumPy, PyTorch and Taichi."""
+"""Geometry for NumPy, PyTorch and Taichi: rigid motions, similarities, the camera model, 3-vectors."""

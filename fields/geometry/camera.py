@@ -1,4 +1,4 @@
-"""The one camera type: an undistorted pinhole camera."""
+"""`PinholeCamera`: an undistorted pinhole camera."""
 
 from __future__ import annotations
 
@@ -12,9 +12,20 @@ __all__ = ["PinholeCamera"]
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Pinhole intrinsics in pixels. OpenCV axes; the centre of pixel (row 0, column 0) is (0.5, 0.5).
+    """Pinhole intrinsics with OpenCV axes. The centre of pixel (row 0, column 0) is at (0.5, 0.5).
 
-    Distortion is removed by the source before a frame reaches anything that takes this type.
+    There is no distortion model: sources undistort their images.
+
+    Attributes:
+        fx: Horizontal focal length [px].
+        fy: Vertical focal length [px].
+        cx: Horizontal principal point [px].
+        cy: Vertical principal point [px].
+        width: Image width [px].
+        height: Image height [px].
+
+    Raises:
+        ValueError: If the size or a focal length is not positive.
     """
 
     fx: float
@@ -32,30 +43,30 @@ class PinholeCamera:
 
     @property
     def focal(self) -> float:
-        """Geometric mean of the focal lengths [px]: the f of Eq. 1 (a pixel at depth d is d / f wide)."""
+        """Geometric mean of the focal lengths [px], f of Eq. 1. A pixel at depth d is d / f wide."""
         return float(np.sqrt(self.fx * self.fy))
 
     def matrix(self) -> NDArray[np.float64]:
-        """3x3 intrinsic matrix K for pixel centres at +0.5."""
+        """Return the intrinsic matrix K (3, 3), for pixel centres at +0.5."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """The camera of the same view resampled to `width` x `height` pixels."""
+        """Return the camera of the image resampled to `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
     def project(self, points_camera: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pixels (N, 2) as (x, y) of camera-frame points (N, 3) with z > 0."""
+        """Project points (N, 3) in the camera frame, with z > 0, to pixels (N, 2) as (x, y)."""
         p = np.asarray(points_camera, dtype=np.float64)
         return np.stack([self.fx * p[:, 0] / p[:, 2] + self.cx, self.fy * p[:, 1] / p[:, 2] + self.cy], axis=1)
 
     def unproject(self, pixels: NDArray[np.floating], depth: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Camera-frame points (N, 3) of pixels (N, 2) as (x, y) at depth z (N,)."""
+        """Unproject pixels (N, 2) as (x, y) at depth z (N,) to points (N, 3) in the camera frame."""
         uv = np.asarray(pixels, dtype=np.float64)
         z = np.asarray(depth, dtype=np.float64)
         return np.stack([(uv[:, 0] - self.cx) / self.fx * z, (uv[:, 1] - self.cy) / self.fy * z, z], axis=1)
 
     def contains(self, pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which of the pixels (N, 2) as (x, y) lie inside the image."""
+        """Return whether each of the pixels (N, 2) as (x, y) lies inside the image."""
         uv = np.asarray(pixels)
         return (uv[:, 0] >= 0) & (uv[:, 0] < self.width) & (uv[:, 1] >= 0) & (uv[:, 1] < self.height)

@@ -1,7 +1,7 @@
-"""SE(3): rigid motions and their tangents, as NumPy functions and as Taichi and PyTorch functions of the same names.
+"""SE(3): rigid motions and their tangents in NumPy, some of them also in PyTorch (`torch_`) and Taichi (`ti_`).
 
-The tangent is xi = (rho, omega): translation first, then rotation. Increments act on the left,
-T <- exp(xi) T, so that xi of a `T_camera_world` is expressed in the camera frame.
+The tangent is xi = (rho, omega): translation first, then rotation. Increments act on the left, T <- exp(xi) T, so that
+the tangent of a `T_camera_world` is expressed in the camera frame.
 """
 
 import numpy as np
@@ -22,12 +22,12 @@ __all__ = [
     "torch_exp_se3",
 ]
 
-# Below this angle [rad] the closed forms lose digits and their series are exact to rounding.
+# Below this angle [rad], the closed forms lose precision and their series are exact to rounding.
 SMALL_ANGLE = 1e-4
 
 
 def hat(v: ArrayLike) -> NDArray[np.float64]:
-    """The 3x3 skew matrix with hat(v) @ u = v x u."""
+    """Skew-symmetric matrix (3, 3) with hat(v) @ u = v x u."""
     x, y, z = np.asarray(v, dtype=np.float64)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
@@ -41,7 +41,7 @@ def _coefficients(theta: float) -> tuple[float, float, float]:
 
 
 def exp_se3(xi: ArrayLike) -> NDArray[np.float64]:
-    """Rigid motion (4, 4) of the tangent xi = (rho, omega) (6,)."""
+    """Exponential map: rigid motion (4, 4) of a tangent xi = (rho, omega) (6,)."""
     xi = np.asarray(xi, dtype=np.float64)
     omega = hat(xi[3:])
     a, b, c = _coefficients(float(np.linalg.norm(xi[3:])))
@@ -52,7 +52,7 @@ def exp_se3(xi: ArrayLike) -> NDArray[np.float64]:
 
 
 def log_se3(T: ArrayLike) -> NDArray[np.float64]:
-    """Tangent (6,) of a rigid motion (4, 4), rotation angle in [0, pi]; the inverse of `exp_se3`."""
+    """Logarithm: tangent (6,) of a rigid motion (4, 4), with a rotation angle in [0, pi]. Inverse of `exp_se3`."""
     T = np.asarray(T, dtype=np.float64)
     q = quaternion_from_matrix(T[:3, :3])
     if q[0] < 0:
@@ -67,7 +67,7 @@ def log_se3(T: ArrayLike) -> NDArray[np.float64]:
 
 
 def inverse_se3(T: ArrayLike) -> NDArray[np.float64]:
-    """Inverse (4, 4) of a rigid motion, exact in its structure."""
+    """Inverse (4, 4) of a rigid motion (4, 4), from its transposed rotation."""
     T = np.asarray(T, dtype=np.float64)
     inverse = np.eye(4)
     inverse[:3, :3] = T[:3, :3].T
@@ -76,12 +76,12 @@ def inverse_se3(T: ArrayLike) -> NDArray[np.float64]:
 
 
 def interpolate_se3(T_a: ArrayLike, T_b: ArrayLike, t: float) -> NDArray[np.float64]:
-    """The motion at t in [0, 1] on the screw from `T_a` to `T_b`, both (4, 4)."""
+    """Interpolate between `T_a` (t = 0) and `T_b` (t = 1), both (4, 4), along a screw motion."""
     return exp_se3(t * log_se3(np.asarray(T_b) @ inverse_se3(T_a))) @ np.asarray(T_a, dtype=np.float64)
 
 
 def orthonormalised(T: ArrayLike) -> NDArray[np.float64]:
-    """The rigid motion nearest to T (4, 4): what long products of increments are brought back to."""
+    """Rigid motion nearest to T (4, 4). Removes the drift of long products of increments."""
     T = np.array(T, dtype=np.float64)
     u, _, vt = np.linalg.svd(T[:3, :3])
     T[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
@@ -89,7 +89,7 @@ def orthonormalised(T: ArrayLike) -> NDArray[np.float64]:
 
 
 def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
-    """Rotation (3, 3) of a quaternion (w, x, y, z), normalised first."""
+    """Rotation matrix (3, 3) of a quaternion (w, x, y, z) of any length but zero."""
     w, x, y, z = np.asarray(q, dtype=np.float64) / np.linalg.norm(q)
     return np.array(
         [
@@ -101,7 +101,7 @@ def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
 
 
 def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
-    """Unit quaternion (w, x, y, z) of a rotation (3, 3), by the largest component for a stable root."""
+    """Unit quaternion (w, x, y, z) of a rotation matrix (3, 3), from its largest component for numerical stability."""
     R = np.asarray(R, dtype=np.float64)
     squares = np.array(
         [
@@ -125,7 +125,7 @@ def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
 
 
 def torch_exp_se3(xi: torch.Tensor) -> torch.Tensor:
-    """Differentiable twin of `exp_se3`, for a tangent (..., 6)."""
+    """PyTorch version of `exp_se3`: differentiable, for tangents (..., 6)."""
     zero = torch.zeros_like(xi[..., 0])
     a, b, c, x, y, z = xi.unbind(-1)
     rows = [(zero, -z, y, a), (z, zero, -x, b), (-y, x, zero, c), (zero, zero, zero, zero)]
@@ -134,7 +134,7 @@ def torch_exp_se3(xi: torch.Tensor) -> torch.Tensor:
 
 @ti.func
 def ti_rotation_from_quaternion(q):
-    """Taichi twin of `matrix_from_quaternion` for a quaternion of any length but zero."""
+    """Taichi version of `matrix_from_quaternion`, for a quaternion of any length but zero."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     s = 2.0 / (w * w + x * x + y * y + z * z)
     return ti.Matrix(

@@ -1,6 +1,6 @@
-"""Similarities of the world: how places move when poses are revised.
+"""Similarity transforms of the world, for the revision of poses.
 
-A similarity is a (4, 4) matrix S_after_before, x -> s R x + t.
+A similarity is a matrix S_after_before (4, 4), x -> s R x + t.
 """
 
 from __future__ import annotations
@@ -14,15 +14,22 @@ __all__ = ["motion_around", "moved_points", "moved_pose", "scale_of"]
 
 
 def scale_of(S: ArrayLike) -> NDArray[np.float64]:
-    """Scale s () of a similarity (4, 4), or (N,) of N."""
+    """Scale s of a similarity (4, 4), or scales (N,) of N similarities (N, 4, 4)."""
     return np.cbrt(np.linalg.det(np.asarray(S, dtype=np.float64)[..., :3, :3]))
 
 
 def motion_around(T_before: ArrayLike, T_after: ArrayLike, scale: float = 1.0) -> NDArray[np.float64]:
-    """S_after_before (4, 4) of what a camera sees that was at `T_before` and is at `T_after` (T_camera_world, 4x4).
+    """Similarity of the world around a camera whose pose is revised.
 
-    In the camera's own frame everything stays where it was, `scale` times as far away. Exactly the identity where the
-    pose is the same to the last bit and the scale is 1.
+    In the camera frame, everything keeps its direction and moves to `scale` times its distance.
+
+    Args:
+        T_before: Former pose T_camera_world (4, 4).
+        T_after: Revised pose T_camera_world (4, 4).
+        scale: Change of scale.
+
+    Returns:
+        S_after_before (4, 4), exactly the identity if the poses are bit-identical and the scale is 1.
     """
     if scale == 1.0 and np.array_equal(T_before, T_after):
         return np.eye(4)
@@ -30,12 +37,12 @@ def motion_around(T_before: ArrayLike, T_after: ArrayLike, scale: float = 1.0) -
 
 
 def moved_pose(S: NDArray[np.float64], T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T_camera_world (4, 4) of a camera that goes with a world that moves by S: it sees there what it saw before."""
+    """T_camera_world (4, 4) of a camera that moves with the world by S (4, 4), so that its image stays the same."""
     s = float(scale_of(S))
     T = orthonormalised(np.diag([s, s, s, 1.0]) @ T_camera_world @ np.linalg.inv(S))
     return T_camera_world.copy() if np.array_equal(S, np.eye(4)) else T
 
 
 def moved_points(S: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (N, 3) after the motion S (4, 4)."""
+    """Apply a similarity S (4, 4) to points (N, 3)."""
     return xyz.copy() if np.array_equal(S, np.eye(4)) else xyz @ S[:3, :3].T + S[:3, 3]

@@ -1,7 +1,7 @@
-"""Straight-line products of 3-vectors for differentiated kernels.
+"""Products of 3-vectors as single expressions, for differentiated kernels.
 
-Taichi's own `@` and `dot` sum into a mutable local; reverse-mode differentiation has to keep every state of such a
-local on a stack, which made the projection's gradient three times slower. These are single expressions.
+Taichi's own `@` and `dot` accumulate into a mutable local variable. Reverse-mode differentiation keeps every state of
+such a variable on a stack, which made the gradient of the projection three times slower.
 """
 
 import taichi as ti

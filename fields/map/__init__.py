@@ -1,1 +1,1 @@
-"""What the map is: Gaussians, keyframes and the voxels that are occupied."""
+"""The contents of the map: Gaussians, keyframes and occupancy voxels."""

@@ -1,4 +1,4 @@
-"""`GaussianMotion`: moves Gaussians with the views that placed them, when a tracker has revised those."""
+"""`GaussianMotion`: moves Gaussians with the views that placed them, after a tracker has revised their poses."""
 
 import numpy as np
 import taichi as ti
@@ -16,11 +16,11 @@ BLOCKS = ti.types.ndarray(ndim=3)
 
 @ti.data_oriented
 class GaussianMotion:
-    """A similarity for every anchor: its Gaussians are carried along, turned and scaled, colours and all.
+    """Applies one similarity per anchor to the anchor's Gaussians: position, rotation, scale and harmonics.
 
-    What Adam remembers goes with them, so that the next steps are those of a Gaussian that had always been there. For a
-    value that changes by y = M x, gradients change by M^-T: first moments are multiplied by it, second moments by its
-    elements squared, as if the components of a gradient were uncorrelated.
+    Adam's moments are transformed as well, so that optimisation continues as if the Gaussian had always been at its new
+    place. If a value changes by y = M x, its gradient changes by M^-T. First moments are multiplied by M^-T, and second
+    moments by its squared elements, which assumes uncorrelated gradient components.
     """
 
     def __init__(self, gaussians: GaussianField) -> None:
@@ -29,11 +29,15 @@ class GaussianMotion:
     def move(self, S: NDArray[np.float64], sh_rotation: NDArray[np.float64]) -> None:
         """Move every Gaussian by the similarity of its anchor.
 
-        S: S_after_before (A, 4, 4), a row an anchor. sh_rotation: (A, K, K), what the turn makes of the coefficients of
-        K harmonics. Gaussians of an anchor whose S is the identity, and those without an anchor, keep every bit.
-        Gradients of those that move are dropped: call it between steps.
+        Gaussians without an anchor, and those of an anchor whose similarity is the identity, stay bit-identical. The
+        gradients of Gaussians that move are set to zero, so call this between steps.
 
-        Raises ValueError where a Gaussian's anchor has no row.
+        Args:
+            S: Similarities S_after_before (A, 4, 4), one per anchor.
+            sh_rotation: Matrices (A, K, K) that rotate the K harmonic coefficients.
+
+        Raises:
+            ValueError: If the anchor of a Gaussian is not a row of `S`.
         """
         g = self.gaussians
         if g.count == 0:
@@ -84,14 +88,14 @@ class GaussianMotion:
                 + linear[a, 4 * r + 2] * p[2]
                 + linear[a, 4 * r + 3]
             )
-            # y = s R x, so that a gradient becomes R g / s.
+            # With y = s R x, a gradient g becomes R g / s.
             x, y, z = rotations[a, 3 * r], rotations[a, 3 * r + 1], rotations[a, 3 * r + 2]
             shrink = scales[a, 1]
             self.gaussians.position_m[i][r] = (x * m[0] + y * m[1] + z * m[2]) * shrink
             self.gaussians.position_v[i][r] = (x * x * v[0] + y * y * v[1] + z * z * v[2]) * shrink * shrink
             self.gaussians.log_scale[i][r] = self.gaussians.log_scale[i][r] + scales[a, 0]
         w = ti.Vector([quaternions[a, 0], quaternions[a, 1], quaternions[a, 2], quaternions[a, 3]])
-        # The product with a quaternion from the left is an orthogonal matrix.
+        # Left multiplication by a unit quaternion is an orthogonal matrix, so that L^-T = L.
         L = ti.Matrix(
             [
                 [w[0], -w[1], -w[2], -w[3]],
@@ -112,8 +116,8 @@ class GaussianMotion:
 
     @ti.func
     def _turn(self, field: ti.template(), i, a, sh_rotation: ti.template(), squared: ti.template()):
-        """field[i] <- M field[i], by way of the gradient's place."""
-        # The constant harmonic stays.
+        """field[i] <- M field[i], with the gradient of `sh` as scratch space."""
+        # The constant harmonic is invariant under rotation.
         for k in range(1, self.gaussians.sh_count):
             total = 0.0 * field[i, 0]
             for j in range(1, self.gaussians.sh_count):

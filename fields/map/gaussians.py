@@ -1,4 +1,4 @@
-"""`GaussianField`: the map's Gaussians, a pool that grows without recompiling the kernels that use it."""
+"""`GaussianField`: the Gaussians of a map, in a pool that grows without recompiling kernels."""
 
 from collections.abc import Sequence
 
@@ -15,22 +15,33 @@ __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
 SH_C0 = 0.28209479177387814
 BLOCK = 1024
 NO_ANCHOR = -1
-# Ends of the names of Adam's first and second moments.
+# Suffixes of the names of Adam's first and second moments.
 MOMENTS = ("_m", "_v")
 
 
 @ti.data_oriented
 class GaussianField:
-    """Anisotropic Gaussians in world space, with their gradients and Adam moments beside the values.
+    """Anisotropic Gaussians in the world frame, with their gradients and Adam moments.
 
-    SNode tree: pointer(blocks) over dense(1024), so that memory follows the number of Gaussians and no kernel is
-    compiled anew when it grows; dense on a GPU, which holds `max_gaussians` from the start. Gaussians are
-    `0 .. count - 1`, always contiguous.
+    Gaussians are always stored contiguously, at indices 0 to `count - 1`. A Gaussian takes 236 bytes at degree 0 in
+    float32. The SNode tree is pointer(blocks) over dense(1024): memory follows the number of Gaussians, and no kernel
+    is recompiled when the map grows. On a GPU the storage is dense and holds `max_gaussians` from the start. The values
+    have the Taichi type `real`, `ti.f32` or `ti.f64`.
 
-    position (3), log_scale (3), quaternion (4; w, x, y, z, any length but zero), opacity_logit (1),
-    sh (K, 3) with K = (sh_degree + 1)^2 coefficients: the layout of 3DGS files. `steps` counts the updates that
-    a Gaussian has had; `anchor` is the number of the view that placed it, NO_ANCHOR where nobody has said.
-    236 bytes per Gaussian at degree 0 in float32.
+    Args:
+        sh_degree: Degree of the spherical harmonics of colour.
+        max_gaussians: Size of the pool, rounded up to a multiple of 1024.
+
+    Attributes:
+        position: Means (3).
+        log_scale: Logarithms of the standard deviations (3).
+        quaternion: Rotations (4) as (w, x, y, z), of any length but zero.
+        opacity_logit: Logits of the opacities.
+        sh: Coefficients (K, 3) of the harmonics, K = (sh_degree + 1)^2, in the layout of 3DGS files.
+        steps: Number of Adam updates of each Gaussian.
+        anchor: Number of the view that placed each Gaussian; NO_ANCHOR if it is not known.
+        count: Number of Gaussians.
+        capacity: Size of the pool.
     """
 
     def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:
@@ -57,7 +68,7 @@ class GaussianField:
 
         builder = ti.FieldsBuilder()
         blocks = growing(builder, self.capacity // BLOCK)
-        # One dense child a use: culling reads positions without dragging moments through the cache.
+        # One dense child per access pattern, so that culling does not load Adam's moments into the cache.
         geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
         blocks.dense(ti.i, BLOCK).place(*geometry)
         blocks.dense(ti.i, BLOCK).place(*(f.grad for f in geometry))
@@ -78,7 +89,7 @@ class GaussianField:
 
     @property
     def bytes_each(self) -> int:
-        """Bytes of a Gaussian: values, gradients and two moments, and three integers."""
+        """Bytes of one Gaussian: values, gradients, two moments and three integers."""
         return 4 * (11 + 3 * self.sh_count) * np.dtype(self.dtype).itemsize + 3 * 4
 
     # ---- growing and shrinking -------------------------------------------------------------------------------
@@ -92,11 +103,19 @@ class GaussianField:
         sh: NDArray,
         anchor: int = NO_ANCHOR,
     ) -> None:
-        """Add N Gaussians: position (N, 3), log_scale (N, 3), quaternion (N, 4), opacity_logit (N,), sh (N, K, 3).
+        """Add N Gaussians with zero gradients, moments and step counts.
 
-        Gradients, moments and step counts of the new ones are zero. anchor: of all of them.
-        Raises ValueError naming the first Gaussian that holds NaN, infinity or a zero quaternion, or where the
-        shapes disagree or the pool is full.
+        Args:
+            position: Means (N, 3) in the world frame.
+            log_scale: Logarithms of the standard deviations (N, 3).
+            quaternion: Rotations (N, 4) as (w, x, y, z).
+            opacity_logit: Logits (N,) of the opacities.
+            sh: Coefficients (N, K, 3) of the harmonics.
+            anchor: Anchor of all new Gaussians.
+
+        Raises:
+            ValueError: If a value is NaN or infinite or a quaternion is zero (the message names the first such
+                Gaussian), if the shapes disagree, or if the pool is full.
         """
         arrays = [
             np.ascontiguousarray(a, dtype=self.dtype) for a in (position, log_scale, quaternion, opacity_logit, sh)
@@ -119,9 +138,15 @@ class GaussianField:
             self.count += n
 
     def remove(self, keep: NDArray[np.bool_]) -> int:
-        """Keep the Gaussians where `keep` (count,) is true; return how many went.
+        """Remove the Gaussians where `keep` is false.
 
-        Survivors from the end move into the holes, in order: parallel, and the same on every run.
+        Kept Gaussians from the end fill the holes in order, which is parallel and deterministic.
+
+        Args:
+            keep: Flags (count,).
+
+        Returns:
+            Number of Gaussians removed.
         """
         if keep.shape != (self.count,):
             raise ValueError(f"keep has shape {keep.shape}, expected ({self.count},)")
@@ -138,18 +163,22 @@ class GaussianField:
     # ---- saving and loading ----------------------------------------------------------------------------------
 
     def to_numpy(self) -> dict[str, NDArray]:
-        """Values of all Gaussians by name: position (N, 3), log_scale, quaternion, opacity_logit (N,), sh (N, K, 3)."""
+        """Return the values of all Gaussians by name.
+
+        Returns:
+            position (N, 3), log_scale (N, 3), quaternion (N, 4), opacity_logit (N,) and sh (N, K, 3).
+        """
         return self._to_numpy([getattr(self, name) for name in _NAMES])
 
     def anchors(self) -> NDArray[np.int32]:
-        """The anchor of every Gaussian (N,)."""
+        """Return the anchor (N,) of every Gaussian."""
         out = np.zeros(self.count, dtype=np.int32)
         if self.count:
             self._read_numbers(self.anchor, out)
         return out
 
     def gradients_to_numpy(self) -> dict[str, NDArray]:
-        """Gradients of all Gaussians, by the names and shapes of `to_numpy`."""
+        """Return the gradients of all Gaussians, with the names and shapes of `to_numpy`."""
         return self._to_numpy([getattr(self, name).grad for name in _NAMES])
 
     def _to_numpy(self, fields: list) -> dict[str, NDArray]:
@@ -160,10 +189,13 @@ class GaussianField:
         return dict(zip(_NAMES, arrays, strict=True))
 
     def load(self, state: dict[str, NDArray]) -> None:
-        """Replace the content by the values of `state`, as `to_numpy` gives them.
+        """Replace all Gaussians by those of `state`.
 
-        Their anchors are those of its entry `anchor` (N,), without one they have none. Raises as `append` does, the
-        content then being what it was.
+        Args:
+            state: Values in the form of `to_numpy`, and optionally their anchors (N,) as `anchor`.
+
+        Raises:
+            ValueError: As in `append`. The Gaussians are then unchanged.
         """
         before, self.count = self.count, 0
         try:
@@ -178,9 +210,9 @@ class GaussianField:
             self._write_numbers(self.anchor, np.ascontiguousarray(anchor, dtype=np.int32))
 
     def history(self) -> dict[str, NDArray]:
-        """What the Gaussians remember beside their values: `NAME_m` and `NAME_v` of each value, `steps` and `anchor`.
+        """Return the optimiser state: moments `NAME_m` and `NAME_v` of each value, `steps` and `anchor`.
 
-        With the values of `to_numpy` it is all that they are between two steps.
+        Together with `to_numpy`, this is the complete state of the Gaussians between two steps.
         """
         moments = {
             name + end: array
@@ -193,10 +225,14 @@ class GaussianField:
         return moments | {"steps": steps, "anchor": self.anchors()}
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Replace the content by values and history, as `to_numpy` and `history` gave them.
+        """Replace all Gaussians by saved values and optimiser state.
 
-        Raises KeyError for what is missing, and ValueError as `append` does and for moments that are not of the values'
-        shapes or not finite.
+        Args:
+            state: The entries of `to_numpy` and `history`.
+
+        Raises:
+            KeyError: If an entry is missing.
+            ValueError: As in `append`, and if a moment is not finite or its shape differs from that of its value.
         """
         for name in (name + end for end in MOMENTS for name in _NAMES):
             if state[name].shape != state[name[:-2]].shape or not np.isfinite(state[name]).all():
@@ -213,10 +249,16 @@ class GaussianField:
         self._write_numbers(self.steps, np.ascontiguousarray(state["steps"], dtype=np.int32))
 
     def take(self, tensors: Sequence[torch.Tensor]) -> None:
-        """Replace the content by tensors in the order and shapes of `append`, without a way over the host.
+        """Replace all Gaussians by tensors, without a copy through the host.
 
-        They must be contiguous, of the field's type, lie where kernels run and hold what `append` does not refuse,
-        which is not looked at again. Raises ValueError where the pool is too small.
+        The values are not checked; they must satisfy the conditions of `append`.
+
+        Args:
+            tensors: Values in the order and shapes of `append`, contiguous, of the field's type, and on the device that
+                kernels run on.
+
+        Raises:
+            ValueError: If the pool is too small.
         """
         count = len(tensors[0])
         if count > self.capacity:
@@ -226,23 +268,23 @@ class GaussianField:
             self._write(0, NO_ANCHOR, *tensors)
 
     def gradients_into(self, tensors: Sequence[torch.Tensor]) -> None:
-        """Write the gradients of all Gaussians into tensors as `take` has them."""
+        """Write the gradients of all Gaussians into tensors of the form that `take` expects."""
         if self.count:
             self._read(self.count, *(getattr(self, name).grad for name in _NAMES), *tensors)
 
     def clear_gradients(self) -> None:
-        """Drop what the views rendered since the last Adam step have added to the gradients."""
+        """Set the gradients accumulated since the last Adam step to zero."""
         if self.count:
             self._clear_gradients(self.count)
 
     def take_caught(self) -> tuple[int, int]:
-        """Steps that were left out and Gaussians that had exploded (see `Adam`), since this was asked last."""
+        """Return and reset the numbers of skipped steps and of exploded Gaussians, see `Adam`."""
         caught = self._caught[0], self._caught[1]
         self._caught.fill(0)
         return caught
 
     def opacities(self) -> NDArray:
-        """Opacity in (0, 1) of all Gaussians (N,)."""
+        """Return the opacity (N,) in (0, 1) of all Gaussians."""
         return 1.0 / (1.0 + np.exp(-self.to_numpy()["opacity_logit"]))
 
     @ti.kernel
@@ -264,7 +306,7 @@ class GaussianField:
 
     @ti.func
     def _forget(self, i):
-        """A Gaussian's first state: no gradient, no history."""
+        """Zero the gradients, moments and step count of one Gaussian."""
         self.forget_gradient(i)
         self.position_m[i].fill(0.0)
         self.position_v[i].fill(0.0)

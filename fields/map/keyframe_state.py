@@ -1,4 +1,4 @@
-"""Keyframes as plain arrays, and back: all that is known of them but their images, which their frames bring again."""
+"""Saving and restoring keyframes as plain arrays. Images are not saved; they are taken from the frames again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fields.map.keyframes import Keyframe, KeyframeStore
 
 __all__ = ["KeyframeRows", "keyframe_arrays"]
 
-# Fields of `Keyframe` that are one number or one small matrix each, with their shapes.
+# Scalars and small matrices of a `Keyframe`, with their shapes.
 NUMBERS: dict[str, tuple[int, ...]] = {
     "index": (),
     "T_tracked": (4, 4),
@@ -27,16 +27,22 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "exposure_steps": (),
     "lag": (4, 4),
 }
-# Fields whose arrays have another name in a snapshot.
+# Names in a snapshot that differ from the name of the field.
 FIELDS = {"lag": "pending_motion"}
 WHOLE = ("index", "pose_steps", "exposure_steps")
 POINTS = {"xyz": 3, "pixels": 2}
 
 
 def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
-    """A row a keyframe, by the names of its fields (see FIELDS); exposure NaN where it has none.
+    """Store keyframes as arrays.
 
-    points: how many tracked points each has; xyz (P, 3), pixels (P, 2) and ids (P,) are those of all, in their order.
+    Args:
+        store: The keyframes.
+
+    Returns:
+        One array per field of `NUMBERS` and `exposure`, with one row per keyframe. The rows of `exposure` are NaN for
+        keyframes without one. `points` holds the number of tracked points of each keyframe; `xyz` (P, 3), `pixels`
+        (P, 2) and `ids` (P,) hold the points of all keyframes, concatenated.
     """
     views = list(store)
     arrays = {
@@ -57,9 +63,17 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
 
 
 class KeyframeRows:
-    """What `keyframe_arrays` gave, to be put back into a store, frame by frame.
+    """Restores the keyframes of `keyframe_arrays` into a store, frame by frame.
 
-    Raises KeyError or ValueError for arrays that are missing or of other shapes.
+    Args:
+        arrays: Result of `keyframe_arrays`.
+
+    Attributes:
+        rows: Row of each keyframe, by frame index.
+
+    Raises:
+        KeyError: If an array is missing.
+        ValueError: If an array has another shape, or a value that must be finite is not.
     """
 
     def __init__(self, arrays: Mapping[str, NDArray]) -> None:
@@ -77,7 +91,15 @@ class KeyframeRows:
         self.rows = {int(index): row for row, index in enumerate(arrays["index"])}
 
     def put(self, frame: TrackedFrame, store: KeyframeStore) -> None:
-        """Make the keyframe of `frame`, the next of those in `rows`, as it was. Raises ValueError for another one."""
+        """Restore the next keyframe from its frame.
+
+        Args:
+            frame: Frame of the next row.
+            store: Store that the keyframe is appended to.
+
+        Raises:
+            ValueError: If `frame` is not the frame of the next row.
+        """
         row = len(store)
         if self.rows.get(frame.index) != row:
             raise ValueError(f"frame {frame.index} is not keyframe {row}")

@@ -1,4 +1,4 @@
-"""Keyframes: what the map keeps of the frames that it is optimised on."""
+"""Keyframes: the frames that the map is optimised on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["NO_MOTION", "Keyframe", "KeyframeStore"]
 
 
 def _unchanging(array: NDArray[np.float64]) -> NDArray[np.float64]:
-    """One array for all keyframes whose value it still is: a long recording has thousands."""
+    """Make a default value read-only, so that all keyframes can share it. A long recording has thousands."""
     array.flags.writeable = False
     return array
 
@@ -32,17 +32,31 @@ NO_EXPOSURE_MOMENT = _unchanging(np.zeros((3, 4)))
 
 @dataclass(slots=True)
 class Keyframe:
-    """One keyframe. Images stay in host memory with 8 bits a channel.
+    """One keyframe. Images stay in host memory with 8 bits per channel.
 
-    index: of its frame. rgba: (H, W, 4) uint8, the image and 255 where it is valid; camera: of that image. pyramid:
-    the same at halved sizes, itself first. T_tracked: the tracker's T_camera_world; T_camera_world: the refined one.
-    median_depth: of its tracked points [scene units]; view_scale:
-    median_depth / focal, the width of a pixel out there (Section 3.2.1). error: mean absolute error when the frame was
-    optimised last (err(j) of Eq. 2). vignette: as in `TrackedFrame`, at full size. exposure: (3, 4) affine colour
-    transform (A, b), image = (A colour + b) vignette; None for an identity that is not estimated. pending_motion: the
-    motion (4, 4) of the world around it, by corrections of the tracker, that its Gaussians have not followed yet.
+    Arrays are replaced and never modified in place, since views may share them.
 
-    Arrays are replaced, never written into: they may be other views' as well.
+    Attributes:
+        index: Index of the frame.
+        rgba: Image (H, W, 4) uint8; the last channel is 255 at valid pixels.
+        camera: Camera of `rgba`.
+        T_tracked: Pose T_camera_world (4, 4) from the tracker.
+        T_camera_world: Refined pose (4, 4).
+        points: Tracked points.
+        median_depth: Median depth of the tracked points [scene units].
+        error: Mean absolute error when the keyframe was last optimised, err(j) of Eq. 2.
+        pyramid: Images at halved sizes, the first at the size of `rgba`.
+        pose_m: First moment (6,) of Adam on the pose.
+        pose_v: Second moment (6,) of Adam on the pose.
+        pose_steps: Number of Adam steps of the pose.
+        vignette: Vignette as in `TrackedFrame`, at full size.
+        exposure: Affine colour transform (A, b) (3, 4), image = (A colour + b) vignette; None if exposure is not
+            estimated.
+        exposure_m: First moment (3, 4) of Adam on the exposure.
+        exposure_v: Second moment (3, 4) of Adam on the exposure.
+        exposure_steps: Number of Adam steps of the exposure.
+        pending_motion: Similarity (4, 4) of the world around the keyframe, by the tracker's corrections, that its
+            Gaussians have not followed yet.
     """
 
     index: int
@@ -66,14 +80,15 @@ class Keyframe:
 
     @property
     def view_scale(self) -> float:
+        """Width of a pixel at the median depth, median_depth / focal [scene units] (Section 3.2.1)."""
         return self.median_depth / self.camera.focal
 
     def image(self, level: int) -> ImageLevel:
-        """The image of a pyramid level; the coarsest where there are fewer."""
+        """Return the image of a pyramid level, or the coarsest one if there are fewer levels."""
         return self.pyramid[min(level, len(self.pyramid) - 1)]
 
     def at_level(self, level: int) -> Keyframe:
-        """This view with the image of a pyramid level, for reading only."""
+        """Return a read-only copy of this view at a pyramid level."""
         image = self.image(level)
         scale = np.array([image.camera.width / self.camera.width, image.camera.height / self.camera.height])
         points = replace(self.points, pixels=self.points.pixels * scale)
@@ -81,14 +96,18 @@ class Keyframe:
 
     @property
     def correction(self) -> NDArray[np.float64]:
-        """The motion (4, 4) that refinement has put on the left of the tracked pose."""
+        """Rigid motion (4, 4) that refinement applied on the left of the tracked pose."""
         return self.T_camera_world @ inverse_se3(self.T_tracked)
 
     def revise(self, T_tracked: NDArray[np.float64], S: NDArray[np.float64]) -> None:
-        """Take over the tracker's revised pose (4, 4), S_after_before (4, 4) being how the world around it moves.
+        """Apply a revised pose of the tracker.
 
-        What refinement has put on the tracked pose stays on it, at the scale of S, and so do Adam's moments, which are
-        in pixels of this camera. The tracked points and their depths move with the world.
+        The refinement of the pose is kept, with its translation scaled by S. Adam's moments are kept unchanged, since
+        they are in pixels of this camera. The tracked points and the median depth move with the world.
+
+        Args:
+            T_tracked: Revised pose T_camera_world (4, 4).
+            S: Similarity S_after_before (4, 4) of the world around the keyframe.
         """
         if np.array_equal(S, np.eye(4)) and np.array_equal(T_tracked, self.T_tracked):
             return
@@ -102,13 +121,13 @@ class Keyframe:
         self.pending_motion = S @ self.pending_motion
 
     def revise_points(self, points: SparsePoints) -> None:
-        """Take over the tracker's revised points."""
+        """Replace the tracked points by the tracker's revised ones, and update the median depth."""
         self.points = points
         self.median_depth = _median_depth(points, self.T_tracked, self.median_depth)
 
 
 def _median_depth(points: SparsePoints, T_camera_world: NDArray[np.float64], otherwise: float) -> float:
-    """Median depth of the points before the camera; `otherwise` where there are none."""
+    """Median depth of the points in front of the camera; `otherwise` if there are none."""
     depth = points.depths(T_camera_world)
     depth = depth[depth > 0]
     return float(np.median(depth)) if len(depth) else otherwise
@@ -121,17 +140,25 @@ def _nbytes(pyramid: tuple[ImageLevel, ...], points: SparsePoints) -> int:
 class KeyframeStore:
     """The keyframes in the order of their frames.
 
-    What is asked of it frame by frame takes no longer with a thousand keyframes than with ten, but for `errors`, which
-    are a few microseconds.
+    The cost of the per-frame operations does not grow with the number of keyframes, except for `errors`, which takes a
+    few microseconds.
+
+    Attributes:
+        nbytes: Bytes of the keyframes' images and points.
     """
 
     def __init__(self, levels: int = 1, min_side: int = 1) -> None:
-        """levels: of the keyframes' image pyramids; all but the first have sides of at least min_side [px]."""
+        """Create an empty store.
+
+        Args:
+            levels: Number of pyramid levels that a keyframe keeps.
+            min_side: Minimum side length of all levels but the first [px].
+        """
         self.levels = levels
         self.min_side = min_side
         self._keyframes: list[Keyframe] = []
         self._depths = RunningMedian()
-        self.nbytes = 0  # of the keyframes' images and points
+        self.nbytes = 0
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -144,24 +171,24 @@ class KeyframeStore:
 
     @property
     def scene_depth(self) -> float:
-        """Median over the keyframes of the median depth of their tracked points: the unit of all lengths."""
+        """Median over the keyframes of the median depth of their tracked points, the unit of length of the settings."""
         return self._depths.value if len(self._depths) else 1.0
 
     def bytes_of(self, frame: TrackedFrame) -> int:
-        """Bytes that a frame would take as a keyframe."""
+        """Return the number of bytes that a frame would take as a keyframe."""
         return _nbytes(self._kept(frame, self.levels), frame.points)
 
     def errors(self) -> NDArray[np.float64]:
-        """The keyframes' errors (N,)."""
+        """Return the errors (N,) of all keyframes."""
         return np.fromiter((k.error for k in self._keyframes), np.float64, len(self._keyframes))
 
     def _kept(self, frame: TrackedFrame, levels: int) -> tuple[ImageLevel, ...]:
-        """The first `levels` levels of a frame's pyramid, without those that are too small."""
+        """First `levels` levels of a frame's pyramid, except those that are smaller than `min_side`."""
         first, *others = frame.pyramid[:levels]
         return (first, *(o for o in others if min(o.camera.width, o.camera.height) >= self.min_side))
 
     def append(self, frame: TrackedFrame) -> Keyframe:
-        """Keep `frame`. It starts at the mean error of the others (1 for the first), so that it is drawn soon."""
+        """Add a frame as a keyframe. Its error starts at the mean of the others (1 for the first keyframe)."""
         keyframe = self.view(frame, self.levels)
         self._keyframes.append(keyframe)
         self.nbytes += _nbytes(keyframe.pyramid, keyframe.points)
@@ -169,13 +196,20 @@ class KeyframeStore:
         return keyframe
 
     def take_in_depths(self) -> None:
-        """Bring the scene's depth up to date with keyframes whose median depths have changed."""
+        """Recompute `scene_depth` after median depths have changed."""
         self._depths = RunningMedian()
         for keyframe in self._keyframes:
             self._depths.add(keyframe.median_depth)
 
     def view(self, frame: TrackedFrame, levels: int = 1) -> Keyframe:
-        """`frame` as a keyframe would be, with the pose and exposure that those around it imply, but not kept."""
+        """Return a frame as a keyframe, without adding it to the store.
+
+        Pose and exposure are interpolated between the surrounding keyframes, see `corrected` and `exposure_at`.
+
+        Args:
+            frame: The frame.
+            levels: Number of pyramid levels.
+        """
         return Keyframe(
             index=frame.index,
             rgba=frame.rgba,
@@ -191,9 +225,17 @@ class KeyframeStore:
         )
 
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:
-        """T_camera_world (4, 4) of frame `index`: its tracked pose with the corrections of the keyframes around it.
+        """Apply the refinement of the surrounding keyframes to a tracked pose (Section 3.3.3).
 
-        The correction is interpolated between the two by frame index, and the nearest one's outside (Section 3.3.3).
+        The correction is interpolated by frame index between the keyframes before and after the frame. Outside the
+        range of the keyframes, that of the nearest one is used.
+
+        Args:
+            index: Index of the frame.
+            T_tracked: Tracked pose T_camera_world (4, 4).
+
+        Returns:
+            Corrected pose T_camera_world (4, 4).
         """
         if not self._keyframes:
             return np.array(T_tracked, dtype=np.float64)
@@ -203,9 +245,9 @@ class KeyframeStore:
         return interpolate_se3(a.correction, b.correction, t) @ T_tracked
 
     def exposure_at(self, index: int) -> NDArray[np.float64] | None:
-        """Exposure (3, 4) of frame `index`: interpolated between those of the keyframes around it, as poses are.
+        """Interpolate the exposure (3, 4) of frame `index` between the surrounding keyframes, as for poses.
 
-        None where exposure is not estimated.
+        Returns None if exposure is not estimated.
         """
         if not self._keyframes:
             return None
@@ -215,7 +257,7 @@ class KeyframeStore:
         return (1.0 - t) * a.exposure + t * b.exposure
 
     def _around(self, index: int) -> tuple[Keyframe, Keyframe, float]:
-        """The keyframes before and after frame `index`, and its place between them; twice the nearest one outside."""
+        """Keyframes before and after frame `index`, and its position between them; outside, twice the nearest."""
         after = bisect_left(self._keyframes, index, key=lambda keyframe: keyframe.index)
         if after == 0 or after == len(self._keyframes):
             nearest = self._keyframes[min(after, len(self._keyframes) - 1)]

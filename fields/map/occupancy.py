@@ -9,20 +9,21 @@ from fields.runtime.parallel import HANDED_OUT
 
 __all__ = ["OccupancyVoxels"]
 
-# A brick holds four levels of the same place: 16^3 cells of the finest of them, then 8^3, 4^3 and 2^3, a bit a cell, in
-# words of 4^3 cells (the last is filled by an eighth).
+# A brick holds four levels of the same place: 16^3 cells of the finest of them, then 8^3, 4^3 and 2^3, with one bit per
+# cell, in words of 4^3 cells. The last word is only one eighth full.
 BRICK_LEVELS = 4
 BRICK = 2**BRICK_LEVELS
 FIRST_WORD = (0, 64, 72, 73)
 WORDS = 74
-# Fan-outs a side of the pointer levels above the bricks; small ones at the bottom, where surfaces leave nodes empty.
+# Fan-outs per axis of the pointer levels above the bricks. They are small at the bottom, where most of a node around a
+# surface is empty.
 POINTERS = (64, 16, 8, 2, 2)
 BRICKS = int(np.prod(POINTERS))
 SIDE = BRICK * BRICKS
 MAX_LEVELS = 16
-# Shares of the world that are admitted to at the same time.
+# Number of groups of bricks that the CPU processes in parallel in `admit`.
 SHARES = 8
-# Cells are clipped to this before they become integers; no level reaches it.
+# Cell indices are clipped to this before the conversion to integers. It is out of range at every level.
 FARTHEST = 2.0**31 - 1.0
 
 CELLS = ti.types.ndarray(dtype=ti.i32, ndim=2)
@@ -32,24 +33,33 @@ FLAGS = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
 @ti.data_oriented
 class OccupancyVoxels:
-    """Which places of the world already hold a Gaussian, at `levels` cell sizes `coarsest / 2^l`.
+    """Multi-level occupancy voxels: mark where the map already holds Gaussians, at several cell sizes.
 
-    levels, resolution, coarsest: L, n and S_init of the paper. The finest level covers at least `resolution * coarsest`
-    a side around `origin`. Cells are the floor of the offset by the cell size: the same width on both sides of the
-    origin, never repeated. A position that a level does not reach is answered by the coarser ones.
+    Level l has cells of size `coarsest / 2^l`. A position belongs to the cell floor(offset / cell size), where offset
+    is relative to `origin`. The finest level covers at least `resolution * coarsest` per axis around the origin. Beyond
+    the range of a level, the next coarser level that covers the position is used.
 
-    A position is asked for with a target size: the levels used are those whose cells are no smaller than it, and
-    always the coarsest, so that no target size goes unanswered.
+    Every query has a target size. It uses the levels whose cells are no smaller than the target size, and always the
+    coarsest level.
 
-    Cells nest, and a cell is never marked without those around it on the coarser levels. The AND of the paper over the
-    levels from the coarsest is therefore the bit of the finest level asked for, and marking goes from there to the
-    coarser levels, until one is marked already.
+    Cells are nested, and marking a cell also marks the cells that contain it on all coarser levels. The paper's AND
+    over the levels, from the coarsest on, is therefore the bit of the finest level used. Marking goes from that level
+    to the coarser ones and stops at the first cell that is already marked.
 
-    SNode tree: five pointer levels over bricks of four levels each (592 bytes), the stacks of four levels behind one
-    another along the first axis, since every further tree costs address space, of which Taichi 1.7.4 manages the
-    first GB well. Memory follows the occupied places: 300,000 points on the walls of a room 80 coarsest cells wide take
-    20 MB down to the fourth of eight levels, where the mapper asks, and 260 MB down to the eighth, where no two points
-    share a brick.
+    The SNode tree has five pointer levels over bricks of 592 bytes, each of which holds four voxel levels. The bricks
+    for further voxel levels follow along the first axis of the same tree, because every additional tree takes address
+    space, of which Taichi 1.7.4 handles only the first GB well. Memory is proportional to the occupied bricks. 300,000
+    points on the walls of a room 80 coarsest cells wide take 20 MB down to the fourth of eight levels, which the mapper
+    uses, and 260 MB down to the eighth, where no two points share a brick.
+
+    Args:
+        coarsest: Size of the coarsest cell [scene units], S_init of the paper.
+        levels: Number of levels, L of the paper.
+        resolution: Number of coarsest cells per axis that the finest level covers, n of the paper.
+        origin: Centre (3,) of the covered volume in the world frame.
+
+    Raises:
+        ValueError: If the levels and resolution exceed the range of the tree, or `coarsest` is not positive.
     """
 
     def __init__(
@@ -78,23 +88,35 @@ class OccupancyVoxels:
         refuse_too_many_fields(self.words)
 
     def settle(self, coarsest: float, origin: ArrayLike) -> None:
-        """Choose the coarsest cell's size and the middle of the extent, while nothing is marked yet."""
+        """Set the size of the coarsest cell and the centre of the covered volume. No cell may be marked yet.
+
+        Args:
+            coarsest: Size of the coarsest cell [scene units].
+            origin: Centre (3,) in the world frame.
+
+        Raises:
+            ValueError: If `coarsest` is not positive.
+        """
         if not coarsest > 0:
             raise ValueError(f"voxels need a positive cell, got {coarsest=}")
         self.coarsest = float(coarsest)
         self.origin = np.array(origin, dtype=np.float64)
 
     def clear(self) -> None:
-        """Forget all marks. The memory of the places stays, for those around them."""
+        """Remove all marks. The bricks stay allocated for later marks nearby."""
         self._clear()
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the marks."""
+        """Bytes of the allocated bricks."""
         return self._count_bricks() * WORDS * 8
 
     def marks(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
-        """All marks: places (M, 4) of words that have any, in their order, and the words (M,). For `restore`."""
+        """Return all marks, for `restore`.
+
+        Returns:
+            Places (M, 4) of the non-zero words, in lexicographic order, and the words (M,).
+        """
         count = self._count_bricks()
         corners, words = np.zeros((count, 3), dtype=np.int32), np.zeros((count, WORDS), dtype=np.uint64)
         if count:
@@ -106,9 +128,14 @@ class OccupancyVoxels:
         return places[order], words[brick, word][order]
 
     def restore(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
-        """Replace all marks by those that `marks` gave, of voxels with as many levels.
+        """Replace all marks by saved ones. The number of levels must be that of the saved voxels.
 
-        Raises ValueError for places that there are not.
+        Args:
+            places: Places (M, 4) from `marks`.
+            words: Words (M,) from `marks`.
+
+        Raises:
+            ValueError: If the shapes disagree or a place is out of range.
         """
         limit = [BRICKS * -(-self.levels // BRICK_LEVELS), BRICKS, BRICKS, WORDS]
         if places.shape != (len(words), 4) or words.ndim != 1:
@@ -121,27 +148,45 @@ class OccupancyVoxels:
             self._write_words(places, np.ascontiguousarray(words, dtype=np.uint64))
 
     def level_of(self, size: ArrayLike) -> NDArray[np.int32]:
-        """The finest level whose cells are at least `size` wide; 0, the coarsest, for sizes beyond all of them."""
+        """Return the finest level whose cells are at least `size` wide; 0 if no level has such cells."""
         size = np.maximum(np.asarray(size, dtype=np.float64), 1e-300)
-        # The slack keeps a size of exactly S_init / 2^l at level l.
+        # The tolerance keeps a size of exactly S_init / 2^l at level l.
         level = np.floor(np.log2(self.coarsest / size) + 1e-9)
         return np.clip(level, 0, self.levels - 1).astype(np.int32)
 
     def query(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:
-        """Whether each position (N, 3) is occupied at its target size (N,) or (): AND from the coarsest level."""
+        """Return whether each position is occupied at its target size.
+
+        Args:
+            position: Positions (N, 3) in the world frame.
+            size: Target sizes (N,) or () [scene units].
+
+        Returns:
+            Flags (N,). Positions outside the range of all levels count as occupied.
+        """
         cells, level = self._cells(position, size)
         out = np.empty(len(cells), dtype=np.uint8)
         self._query(cells, level, out)
         return out.astype(bool)
 
     def update(self, position: ArrayLike, size: ArrayLike) -> None:
-        """Mark each position (N, 3) as occupied on the levels from the coarsest to that of its target size."""
+        """Mark each position as occupied, from the coarsest level down to that of its target size.
+
+        Args:
+            position: Positions (N, 3) in the world frame.
+            size: Target sizes (N,) or () [scene units].
+        """
         self.admit(position, size)
 
     def bytes_to_mark(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.int64]:
-        """Upper bound (N,) on the bytes that `nbytes` grows by when each position is marked after those before it.
+        """Return an upper bound (N,) on the growth of `nbytes` when the positions are marked in order.
 
-        A brick counts as new if the position's coarsest cell in it is not marked, though another of its cells may be.
+        A brick counts as new if the coarsest cell of the position in it is unmarked, even if another of its cells is
+        marked.
+
+        Args:
+            position: Positions (N, 3) in the world frame.
+            size: Target sizes (N,) or () [scene units].
         """
         cells, level = self._cells(position, size)
         cost = np.zeros(len(cells), dtype=np.int64)
@@ -156,9 +201,16 @@ class OccupancyVoxels:
         return cost
 
     def admit(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:
-        """Which of the positions (N, 3) may hold a new Gaussian at target size (N,) or (): the first of each free cell.
+        """Admit the first position of each free cell, and mark the admitted positions.
 
-        The admitted ones are marked. The order of the batch decides, so that every run decides alike.
+        The result depends only on the order of the batch and is therefore deterministic.
+
+        Args:
+            position: Positions (N, 3) in the world frame.
+            size: Target sizes (N,) or () [scene units].
+
+        Returns:
+            Flags (N,) of the admitted positions.
         """
         cells, level = self._cells(position, size)
         if on_gpu():
@@ -168,17 +220,17 @@ class OccupancyVoxels:
         return out.astype(bool)
 
     def _admit_together(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """`admit` on a GPU, whose threads are many and slow one by one: a level at a time, each in parallel.
+        """`admit` on a GPU, in parallel over the points of each run of equal levels.
 
-        Points of one level are answered by those before them only in their own cell, so that the first of each cell
-        stands for it. Of different levels, the batch is cut where the level changes.
+        Within one level, a point is only affected by earlier points of its own cell, so the first point represents the
+        cell. The batch is split where the level changes.
         """
         admitted = np.zeros(len(cells), dtype=bool)
         cuts = np.flatnonzero(np.diff(level)) + 1
         for run in np.split(np.arange(len(cells)), cuts):
             if len(run) == 0:
                 continue
-            # Where the asked level does not reach, a coarser one answers: its cell is what a point stands for.
+            # Beyond the range of its level, a point is represented by its cell on the coarser level that is used.
             depth = self._depth_reached(cells[run], level[run])
             place = np.column_stack([cells[run] >> depth[:, None], depth])
             first = run[np.sort(np.unique(place, axis=0, return_index=True)[1])]
@@ -191,7 +243,7 @@ class OccupancyVoxels:
         return admitted
 
     def _depth_reached(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.int32]:
-        """`_reached` on the host: depth (N,), in levels above the finest, of the first level that reaches each cell."""
+        """`_reached` on the host: depth (N,), in levels above the finest, of the first level that covers each cell."""
         depth = self.levels - 1 - level
         reach = np.maximum(cells, -1 - cells).max(axis=1)
         for _ in range(-(-self.levels // BRICK_LEVELS)):
@@ -201,9 +253,9 @@ class OccupancyVoxels:
         return depth
 
     def _cells(self, position: ArrayLike, size: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Cells (N, 3) of the finest level, and the level (N,) that is asked for.
+        """Cells (N, 3) of the finest level, and the level (N,) of the target size.
 
-        Here and not in a kernel, where the compiler may replace the division by a product that rounds otherwise.
+        Computed in NumPy, because a kernel's compiler may replace the division by a product that rounds differently.
         """
         position = np.asarray(position, dtype=np.float64)
         if position.ndim != 2 or position.shape[1] != 3:
@@ -213,14 +265,14 @@ class OccupancyVoxels:
         cells = position - self.origin
         cells /= self.coarsest / 2 ** (self.levels - 1)
         np.floor(cells, out=cells)
-        # fmax and not clip: a NaN becomes a place beyond reach.
+        # Unlike clip, fmax maps NaN to a cell that is out of range.
         np.fmin(np.fmax(cells, -FARTHEST, out=cells), FARTHEST, out=cells)
         level = np.broadcast_to(self.level_of(size), len(cells))
         return cells.astype(np.int32), np.ascontiguousarray(level)
 
     @ti.kernel
     def _clear(self):
-        # Over bricks: a loop over the words themselves passes some by (Taichi 1.7.4).
+        # Loop over bricks, since a struct-for over the words skips some of them (Taichi 1.7.4).
         for i, j, k in self._bricks:
             for word in range(WORDS):
                 self.words[i, j, k, word] = ti.u64(0)
@@ -252,7 +304,7 @@ class OccupancyVoxels:
         for i in range(level.shape[0]):
             cell = ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]])
             depth = self._reached(cell, level[i])
-            # A place that no level reaches is never free.
+            # A cell that no level covers counts as occupied.
             occupied = 1
             if depth < self.levels:
                 word, bit, _ = self._at(cell, depth)
@@ -261,7 +313,8 @@ class OccupancyVoxels:
 
     @ti.kernel
     def _admit(self, cells: CELLS, level: LEVELS, out: FLAGS):
-        # A point is answered by those before it, but only by those in its brick of the coarsest levels.
+        # A point depends only on earlier points in its brick of the coarsest levels. Groups of bricks therefore run in
+        # parallel, and each group goes through the batch in order.
         for spread in range(SHARES * HANDED_OUT):
             if spread % HANDED_OUT == 0:
                 for i in range(level.shape[0]):
@@ -276,7 +329,7 @@ class OccupancyVoxels:
 
     @ti.func
     def _share(self, cell):
-        """Which share a cell belongs to: the same for all in a brick of the coarsest levels."""
+        """Group of a cell, the same for all cells in a brick of the coarsest levels."""
         brick = cell >> ti.static(BRICK_LEVELS * -(-self.levels // BRICK_LEVELS))
         return (brick[0] + 3 * brick[1] + 5 * brick[2]) & (SHARES - 1)
 
@@ -286,22 +339,22 @@ class OccupancyVoxels:
         depth = asked
         while depth < self.levels:
             word, bit, siblings = self._at(cell, depth)
-            # Atomic only to walk down the tree once for reading and writing.
+            # An atomic, so that one walk down the tree both reads and writes the word.
             marked = ti.atomic_or(self.words[word], bit)
             if marked & bit:
                 break
             depth += 1
-            # A sibling has marked the parent.
+            # If a sibling is marked, so are the parent and all coarser cells.
             if marked & siblings:
                 break
         return ti.cast(depth > asked, ti.u8)
 
     @ti.func
     def _reached(self, cell, level):
-        """Depth, in levels above the finest, of the first from `level` up that reaches the cell; L where none does."""
+        """Depth, in levels above the finest, of the first level from `level` up that covers a cell; L if none does."""
         depth = self.levels - 1 - level
         reach = ti.max(cell, -1 - cell).max()
-        # The four levels of a brick reach equally far.
+        # The four levels of a brick cover the same range.
         while depth < self.levels and (reach >> (depth & -BRICK_LEVELS)) >= SIDE // 2:
             depth = (depth & -BRICK_LEVELS) + BRICK_LEVELS
         return depth
@@ -309,7 +362,7 @@ class OccupancyVoxels:
     @ti.func
     def _at(self, cell, depth):
         """Index of the word of a cell at a depth, its bit there, and the bits of all eight cells of its parent."""
-        # Shifts: the floor division of signed numbers is many instructions.
+        # Shifts, since floor division of signed integers takes many instructions.
         stack = depth >> 2
         within = depth & (BRICK_LEVELS - 1)
         brick = (cell >> ((stack + 1) * BRICK_LEVELS)) + BRICKS // 2
@@ -317,7 +370,7 @@ class OccupancyVoxels:
         first = 0
         for k in ti.static(range(1, BRICK_LEVELS)):
             first = ti.select(within == k, FIRST_WORD[k], first)
-        words = ti.max(BRICK_LEVELS - 2 - within, 0)  # log2 of the words a side
+        words = ti.max(BRICK_LEVELS - 2 - within, 0)  # log2 of the words per axis
         word = ((inside[0] >> 2) << (2 * words)) + ((inside[1] >> 2) << words) + (inside[2] >> 2)
         bit = ((inside[0] & 3) << 4) + ((inside[1] & 3) << 2) + (inside[2] & 3)
         place = ti.Vector([brick[0] + stack * BRICKS, brick[1], brick[2], first + word])

@@ -1,4 +1,4 @@
-"""The median of values that arrive one after the other."""
+"""The median of a stream of values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["RunningMedian"]
 
 
 class RunningMedian:
-    """Keeps its values sorted: one more costs the search for its place, not another look at all of them."""
+    """Median of the values added so far, kept in a sorted list."""
 
     def __init__(self) -> None:
         self._sorted: list[float] = []
@@ -17,11 +17,16 @@ class RunningMedian:
         return len(self._sorted)
 
     def add(self, value: float) -> None:
+        """Add a value."""
         insort(self._sorted, value)
 
     @property
     def value(self) -> float:
-        """The median so far, the mean of the middle two of an even number. Raises IndexError where there is none."""
+        """Median of the values; the mean of the middle two if their number is even.
+
+        Raises:
+            IndexError: If no value has been added.
+        """
         middle = len(self._sorted) // 2
         if len(self._sorted) % 2:
             return self._sorted[middle]

@@ -1,1 +1,1 @@
-"""Taichi itself: how it starts, compiles, launches and reads back. All private use of it is here."""
+"""The Taichi runtime: start, compilation, launches and readback. All use of Taichi's private API is in this package."""

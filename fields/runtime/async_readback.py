@@ -1,4 +1,4 @@
-"""`AsyncReadback`: numbers on their way from the device to the host, which does not wait for them."""
+"""`AsyncReadback`: an asynchronous copy of a small tensor from the device to the host."""
 
 import numpy as np
 import torch
@@ -7,9 +7,13 @@ __all__ = ["AsyncReadback"]
 
 
 class AsyncReadback:
-    """A small tensor as it is now, read later: what is written into it afterwards is not seen.
+    """A snapshot of a small tensor that is read later.
 
-    The copy into pinned memory is queued behind the kernels so far.
+    The copy into pinned memory is queued behind the kernels launched so far. Later writes to the tensor do not affect
+    it.
+
+    Args:
+        tensor: Tensor to copy.
     """
 
     def __init__(self, tensor: torch.Tensor) -> None:
@@ -23,7 +27,7 @@ class AsyncReadback:
             self._host = tensor.clone()
 
     def numpy(self) -> np.ndarray:
-        """The numbers; waits where they have not arrived."""
+        """Return the values. Waits for the copy if it has not finished."""
         if self._event is not None:
             self._event.synchronize()
             self._event = None

@@ -1,4 +1,4 @@
-"""Starting Taichi: the one place where the compute device is chosen, and with it the form of storage and kernels."""
+"""Start of Taichi and choice of the compute device, which determines the storage layout and the kernels."""
 
 from __future__ import annotations
 
@@ -24,24 +24,31 @@ __all__ = [
     "without_waiting",
 ]
 
-# Arrays of Taichi's runtime have this many entries, and it does not look.
+# Size of the arrays in Taichi's runtime, which does not check their bounds.
 MAX_SNODES = 1024
-# Taichi's own pool on a CUDA device, for the nodes of sparse fields: the occupancy voxels alone [GB]. Dense fields and
-# PyTorch take what they need of the rest.
+# Taichi's own memory pool on a CUDA device, for the nodes of sparse fields [GB]. Only the voxels use it; dense fields
+# and PyTorch use the remaining memory.
 SPARSE_POOL = 1.0
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
-    """Start Taichi on `device` and return the backend that was taken ("cpu", "cuda" or "vulkan").
+    """Start Taichi on a device.
 
-    device: "cpu", "cuda" (fails where there is none) or "auto" (CUDA where it works). Kernels are kept in
-    Taichi's offline cache, so that only the first process on a machine compiles them. "vulkan" is for the tests, which
-    run the GPU's kernels on a software driver where there is no CUDA; it has no sparse fields, hence no voxels.
+    Kernels are stored in Taichi's offline cache, so that only the first process on a machine compiles them. PyTorch is
+    limited to one thread: its problems here are small, and its waiting threads take the cores from Taichi's (a depth
+    estimate took 1.9 s instead of 0.05 s).
 
-    PyTorch is held to one thread: its problems here are small, and its waiting threads take the cores from Taichi's
-    (a depth estimate took 1.9 s instead of 0.05 s).
+    Args:
+        device: "cpu", "cuda", or "auto" for CUDA if it is available and the CPU otherwise. "vulkan" is for the tests,
+            which run the GPU kernels on a software driver; it has no sparse fields and hence no voxels.
+        threads: Number of CPU threads; None for all.
+        seed: Seed of Taichi's random numbers.
 
-    Raises RuntimeError where "cuda" or "vulkan" was asked for and does not start.
+    Returns:
+        Name of the backend in use, which is "cpu", "cuda" or "vulkan".
+
+    Raises:
+        RuntimeError: If "cuda" or "vulkan" was requested and does not start.
     """
     options = {"offline_cache": True, "log_level": ti.ERROR, "random_seed": seed, "default_fp": ti.f32}
     torch.set_num_threads(1)
@@ -68,7 +75,7 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
 
 
 def _has_cuda_driver() -> bool:
-    # Asked of the system and not of Taichi, which complains on the terminal where there is none.
+    # Load the driver directly, since Taichi prints a warning if there is none.
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -82,7 +89,11 @@ def _start(arch: object, options: dict) -> None:
 
 
 def describe(backend: str) -> str:
-    """What a run says of the backend that it took: the device's name, or why a GPU was left alone."""
+    """Describe a backend for the log of a run: the device's name, or why an existing GPU is not used.
+
+    Args:
+        backend: Result of `initialise`.
+    """
     if backend == "cuda":
         return f"CUDA ({torch.cuda.get_device_name()})"
     if backend == "cpu" and _has_cuda_driver() and not torch.cuda.is_available():
@@ -91,9 +102,12 @@ def describe(backend: str) -> str:
 
 
 def program() -> object:
-    """What owns all fields at present; `initialise` puts another in its place, and fields made before are gone.
+    """Return the Taichi program that owns all current fields.
 
-    Raises RuntimeError before the first.
+    `initialise` replaces the program and invalidates all fields created before.
+
+    Raises:
+        RuntimeError: If `initialise` has not been called.
     """
     running = ti.lang.impl.get_runtime().prog
     if running is None:
@@ -102,20 +116,26 @@ def program() -> object:
 
 
 def on_gpu() -> bool:
-    """Whether Taichi runs on a GPU, or on what stands in for one: dense storage, and the kernels of `render/gpu`."""
+    """Whether dense storage and the kernels of `render/gpu` are in use: on CUDA and Vulkan."""
     return ti.lang.impl.current_cfg().arch in (ti.cuda, ti.vulkan)
 
 
 def torch_device() -> torch.device:
-    """Where tensors must lie to be read and written by kernels without a copy."""
+    """Device on which kernels can read and write tensors without a copy."""
     return torch.device("cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu")
 
 
 def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
-    """A small array as an argument of a kernel that only reads it, and that the host does not wait for.
+    """Prepare a small array as a read-only kernel argument, so that the launch does not wait for the device.
 
-    Taichi itself copies NumPy's arrays to a CUDA device and back, and waits for both; passing vectors by value takes it
-    eight microseconds a number.
+    On CUDA, Taichi copies NumPy arrays to the device and back and waits for both. Passing the values as scalars takes
+    eight microseconds each.
+
+    Args:
+        array: The array.
+
+    Returns:
+        A tensor on a CUDA device; otherwise the array itself.
     """
     if ti.lang.impl.current_cfg().arch != ti.cuda:
         return array
@@ -123,16 +143,23 @@ def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
 
 
 def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:
-    """A node of `blocks` blocks of entries, for dense children.
+    """Create an SNode of `blocks` blocks, for dense children.
 
-    Sparse on the CPU, where memory follows what is written. Dense on a GPU: its allocator would run inside the kernels
-    of a step, and Vulkan has none.
+    On the CPU, the node is sparse, so that memory follows what is written. On a GPU it is dense, because the allocator
+    of sparse nodes would run inside the kernels of a step, and Vulkan has none.
     """
     return builder.dense(ti.i, blocks) if on_gpu() else builder.pointer(ti.i, blocks)
 
 
 def refuse_too_many_fields(last_placed: object) -> None:
-    """Raise RuntimeError where this scalar field, the last one placed, is beyond what a Taichi process holds."""
+    """Check that the fields placed so far fit into Taichi's runtime.
+
+    Args:
+        last_placed: The scalar field that was placed last.
+
+    Raises:
+        RuntimeError: If there are more SNodes than a Taichi process supports.
+    """
     if last_placed.snode.ptr.id >= MAX_SNODES:
         raise RuntimeError(
             "more maps and renderers than one Taichi process holds; call initialise() before making another, "

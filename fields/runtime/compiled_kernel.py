@@ -1,4 +1,4 @@
-"""Kernels that a step calls again and again: without Taichi's checks in Python, on as many threads as pay."""
+"""Fast launches of the kernels of a step: no repeated checks in Python, and one thread for small loops."""
 
 from __future__ import annotations
 
@@ -12,21 +12,28 @@ from fields.runtime.backend import on_gpu
 
 __all__ = ["CompiledKernel", "CompiledLoop"]
 
-# Work [ns] that the calling thread does alone in about the time that it takes to have it done by two. To wake a thread
-# and to be woken took 50 us on one machine and 180 us on another, a virtual one.
+# Below this much work [ns], waking a second thread costs more than it saves. Waking a thread took 50 us on one machine
+# and 180 us on another, a virtual one.
 ALONE_BELOW = 300_000.0
 
 
 class CompiledKernel:
-    """A kernel of a data-oriented object. The first call compiles it, and settles the types of its arguments.
+    """A kernel of a data-oriented object, launched without Taichi's argument checks.
 
-    Taichi 1.7.4 takes some 50 microseconds of Python for a launch, and a step has twenty of them a view: more than
-    many of these kernels take on a GPU. Later calls here only hand over integers, floats and contiguous arrays (NumPy's
-    on the CPU, tensors that lie where kernels run), which must have the types of the first call's.
+    A launch in Taichi 1.7.4 takes about 50 microseconds of Python, and a step has twenty launches per view. That is
+    more than many of these kernels take on a GPU. The first call compiles the kernel and fixes the types of its
+    arguments. Later calls only pass integers, floats and contiguous arrays of the same types: NumPy arrays on the CPU,
+    or tensors on the kernels' device.
     """
 
     def __init__(self, kernel: Any, reverse: bool = False, constants: tuple = ()) -> None:
-        """reverse: launch its gradient kernel. constants: values of its leading arguments, which are templates."""
+        """Wrap a kernel.
+
+        Args:
+            kernel: Bound `ti.kernel` method of a data-oriented object.
+            reverse: Launch its gradient kernel.
+            constants: Values of its leading arguments, which are templates.
+        """
         self._first = kernel.grad if reverse else kernel
         self._kernel = kernel._adjoint if reverse else kernel._primal
         self._constants = constants
@@ -59,7 +66,7 @@ class CompiledKernel:
         self._program.launch_kernel(self._compiled, context)
 
     def compile(self, *arguments: int | float | np.ndarray | torch.Tensor) -> None:
-        """Compile the kernel for arguments of these types, which are not checked."""
+        """Compile the kernel for arguments of these types, without launching it."""
         program = ti.lang.impl.get_runtime().prog
         compiled = self._kernel.compiled_kernels[
             self._kernel.ensure_compiled(self._owner, *self._constants, *arguments)
@@ -70,14 +77,21 @@ class CompiledKernel:
 
 
 class CompiledLoop:
-    """A kernel of one parallel loop, run by the calling thread alone where waking the others would take longer.
+    """A kernel of one parallel loop that runs on the calling thread alone if the loop is short.
 
-    The kernel's first argument is a template `alone`, which it hands to `ti.loop_config(serialize=alone)`. Which of the
-    two is run does not depend on the number of threads: their last bits differ.
+    The first argument of the kernel is a template `alone`, which it passes to `ti.loop_config(serialize=alone)`. The
+    choice between the two variants does not depend on the number of threads, because their results differ in the last
+    bits.
     """
 
     def __init__(self, kernel: Any, nanoseconds: float, reverse: bool = False) -> None:
-        """nanoseconds: what an item takes one thread, roughly."""
+        """Wrap a kernel.
+
+        Args:
+            kernel: Bound `ti.kernel` method of a data-oriented object.
+            nanoseconds: Approximate time of one item on one thread [ns].
+            reverse: Launch its gradient kernel.
+        """
         self._alone, self._together = (CompiledKernel(kernel, reverse, (alone,)) for alone in (True, False))
         self._most_alone = -1.0 if on_gpu() else ALONE_BELOW / nanoseconds
         self._compiled = False
@@ -87,6 +101,6 @@ class CompiledLoop:
         chosen = self._alone if items <= self._most_alone else self._together
         chosen(*arguments)
         if not self._compiled and self._most_alone >= 0.0:
-            # Both at once: a run must not stop to compile when the map outgrows one thread.
+            # Compile both variants now, so that a run does not stop to compile when the map outgrows one thread.
             (self._together if chosen is self._alone else self._alone).compile(*arguments)
         self._compiled = True

@@ -1,8 +1,8 @@
-"""What Taichi asks Python about a kernel's source, asked once and answered without delay.
+"""Faster access to the source of kernels while Taichi compiles them.
 
-Taichi 1.7.4 turns a kernel's Python into its own form at every start of a process, and takes half of that time to fold
-each expression's line for messages that nobody may ever read, and to look up a function's lines at every call of it.
-Here the answers are the same; a run starts a second earlier.
+Taichi 1.7.4 parses all kernels at every start of a process. Half of that time goes into wrapping the source line of
+every expression for error messages, and into looking up a function's source at every call of it. The replacements here
+give the same results, and a run starts one second earlier.
 """
 
 import functools
@@ -15,10 +15,14 @@ __all__ = ["QuickWrapper", "answer_quickly"]
 
 
 class QuickWrapper(textwrap.TextWrapper):
-    """Folds a text as its parent does, and sees at once where there is nothing to fold."""
+    """A `TextWrapper` with a fast path for text that fits on one line."""
 
     def wrap(self, text: str) -> list[str]:
-        """The lines of at most `width` characters that the text is folded to."""
+        """Wrap the text into lines of at most `width` characters.
+
+        Args:
+            text: Text to wrap.
+        """
         if len(text) > self.width or not text.isprintable():
             return super().wrap(text)
         text = text.rstrip()
@@ -27,7 +31,7 @@ class QuickWrapper(textwrap.TextWrapper):
 
 @functools.cache
 def answer_quickly() -> None:
-    """Have Taichi ask here. For the life of the process."""
+    """Install the replacements in Taichi, for the lifetime of the process."""
     ast_transformer_utils.TextWrapper = QuickWrapper
     kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
     kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)

@@ -1,13 +1,13 @@
-"""How CPU loops reach all threads.
+"""Scheduling of parallel CPU loops.
 
-Taichi 1.7.4 hands out the iterations of a parallel CPU loop 512 at a time, whatever `block_dim` says: a loop over fewer
-runs on one thread. A loop over n heavy tasks is therefore written as
+Taichi 1.7.4 assigns the iterations of a parallel CPU loop to threads in chunks of 512, whatever `block_dim` says, so
+that a shorter loop runs on one thread. A loop over n heavy tasks is therefore written as
 
     for i in range(n * SPREAD):
         if i % SPREAD == 0:
             self._task(i // SPREAD)
 
-with SPREAD = HANDED_OUT // (tasks that a thread takes at a time). The empty iterations cost below a nanosecond each.
+with SPREAD = HANDED_OUT // (number of tasks per chunk). The empty iterations cost less than a nanosecond each.
 """
 
 __all__ = ["HANDED_OUT"]

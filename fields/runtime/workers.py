@@ -1,4 +1,4 @@
-"""The threads of Taichi's CPU backend, each kept on a processor of its own."""
+"""Thread affinity of Taichi's CPU backend."""
 
 from __future__ import annotations
 
@@ -11,22 +11,26 @@ TASKS = Path("/proc/self/task")
 
 
 def threads_of_process() -> set[int]:
-    """Numbers of this process's threads; empty where the system does not tell."""
+    """Ids of this process's threads; empty on systems without /proc."""
     return {int(task.name) for task in TASKS.iterdir()} if TASKS.is_dir() else set()
 
 
 def pin_workers(before: set[int], workers: int) -> None:
-    """Keep each of Taichi's workers on its own processor, where it has as many workers as there are processors.
+    """Pin each of Taichi's workers to its own processor, if there are as many workers as processors.
 
-    before: the threads that there were before Taichi started. Its workers sleep between kernels, and Linux wakes two of
-    them on one processor again and again: a kernel of 1 ms then takes two threads as long as one, a step a quarter
-    longer. With fewer workers than processors they go where there is room.
+    The workers sleep between kernels, and Linux often wakes two of them on the same processor. A kernel of 1 ms then
+    takes as long on two threads as on one, and a step takes a quarter longer. With fewer workers than processors, the
+    scheduler has free processors to choose from.
+
+    Args:
+        before: Ids of the threads that existed before Taichi started.
+        workers: Number of Taichi's worker threads.
     """
     if not hasattr(os, "sched_setaffinity"):
         return
     processors = sorted(os.sched_getaffinity(0))
     if workers != len(processors):
         return
-    # Its compiling threads are older than its workers.
+    # Taichi starts its compiler threads before its workers, so the workers have the highest ids.
     for thread, processor in zip(sorted(threads_of_process() - before)[-workers:], processors, strict=False):
         os.sched_setaffinity(thread, {processor})

@@ -1,1 +1,1 @@
-"""Which Gaussians come and which go, and how deep in the image new ones lie."""
+"""Densification and pruning of Gaussians, and the depth estimates for new ones."""

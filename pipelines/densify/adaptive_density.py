@@ -13,12 +13,12 @@ from pipelines.settings import OfflineSettings
 
 __all__ = ["Adaptation", "AdaptiveDensity", "GradientStatistics"]
 
-# A split makes two Gaussians, each smaller by this.
+# A split divides the scales of a Gaussian by this factor.
 SPLIT_SHRINK = 1.6
 
 
 class Adaptation(NamedTuple):
-    """How many Gaussians one round cloned, split in two and removed for their opacity or size."""
+    """Numbers of Gaussians that one round cloned, split in two, and pruned by opacity or size."""
 
     cloned: int
     split: int
@@ -27,9 +27,10 @@ class Adaptation(NamedTuple):
 
 @ti.data_oriented
 class GradientStatistics:
-    """Per Gaussian, the sum over views of |d loss / d mean| in the image, and the number of views that saw it.
+    """Per Gaussian, the sum over views of the 2D positional gradient's norm, and the number of views that saw it.
 
-    The gradient is by the mean in half images (NDC), so that its threshold holds for any image size.
+    The gradient is taken with respect to the projected mean in half images (NDC), so that its threshold does not depend
+    on the image size.
     """
 
     def __init__(self, capacity: int, real=ti.f32) -> None:
@@ -38,17 +39,24 @@ class GradientStatistics:
         self.views = ti.field(ti.i32, capacity)
 
     def observe(self, projected: ProjectedGaussians, view: ViewField) -> None:
-        """Take in the view whose gradients are in `projected`: after compositing's backward, before projection's."""
+        """Add the gradients of one view.
+
+        Call it after compositing's backward pass and before projection's.
+
+        Args:
+            projected: Projected Gaussians of the view, with their gradients.
+            view: The view that was rendered.
+        """
         if projected.count:
             self._observe(projected.seen, projected.gaussian, projected.mean.grad, 0.5 * view.width, 0.5 * view.height)
 
     def mean(self, count: int) -> NDArray[np.float64]:
-        """Mean norm of the first `count` Gaussians (count,); 0 where no view saw one."""
+        """Mean gradient norm (count,) of the first `count` Gaussians; 0 for a Gaussian that no view saw."""
         views = self.views.to_numpy()[:count]
         return self.gradient.to_numpy()[:count].astype(np.float64) / np.maximum(views, 1)
 
     def clear(self) -> None:
-        """Forget all views."""
+        """Reset the statistics to zero."""
         self.gradient.fill(0)
         self.views.fill(0)
 
@@ -64,14 +72,14 @@ class GradientStatistics:
         for s in range(seen[None]):
             i = gaussian[s]
             x, y = gradient[s][0] * half_width, gradient[s][1] * half_height
-            # A Gaussian has one slot a view: no other thread writes here.
+            # A Gaussian has one slot per view, so that no other thread writes here.
             self.gradient[i] = self.gradient[i] + ti.sqrt(x * x + y * y)
             self.views[i] = self.views[i] + 1
 
 
 @ti.data_oriented
 class AdaptiveDensity:
-    """Grows and thins a `GaussianField` by the statistics of the views since the last round."""
+    """Clones, splits and prunes the Gaussians of a `GaussianField`, by gradients gathered since the last round."""
 
     def __init__(self, gaussians: GaussianField, settings: OfflineSettings, rng: np.random.Generator) -> None:
         self.gaussians = gaussians
@@ -80,13 +88,18 @@ class AdaptiveDensity:
         self._rng = rng
 
     def adapt(self, extent: float, prune_large: bool) -> Adaptation:
-        """One round: clone, split, prune; the statistics then start anew.
+        """Run one round of cloning, splitting and pruning, and clear the statistics.
 
-        Of the Gaussians whose mean gradient reaches the threshold, a small one gets a copy in the same place, a large
-        one is replaced by two smaller ones drawn from it. Then transparent Gaussians go, and with `prune_large` too
-        large ones. New Gaussians have no history. Where the pool is too small, the largest gradients come first.
+        A Gaussian grows if its mean gradient reaches the threshold: a small one is cloned in place, a large one is
+        replaced by two smaller ones sampled from it. If the pool is too small for all, those with the largest gradients
+        grow. New Gaussians have zero moments and step counts. Transparent Gaussians are then removed.
 
-        extent: of the scene [scene units], which the settings' sizes are relative to.
+        Args:
+            extent: Extent of the scene [scene units], the unit of the sizes in the settings.
+            prune_large: Also remove Gaussians longer than `prune_size` extents.
+
+        Returns:
+            Numbers of Gaussians cloned, split and pruned.
         """
         s = self.settings
         state = self.gaussians.to_numpy()
@@ -109,13 +122,13 @@ class AdaptiveDensity:
         return Adaptation(int(clone.sum()), int(split.sum()), pruned)
 
     def reset_opacities(self) -> None:
-        """Lower all opacities to `reset_opacity` at most and forget their moments: what is needed comes back."""
+        """Clamp all opacities to `reset_opacity` and zero their moments. Gaussians that are needed recover."""
         ceiling = self.settings.reset_opacity
         if self.gaussians.count:
             self._reset(self.gaussians.count, float(np.log(ceiling / (1.0 - ceiling))))
 
     def _within_the_pool(self, gradient: NDArray, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Of the Gaussians that want to grow, those that there is room for: each adds one."""
+        """Restrict `wanted` to as many Gaussians as the pool has room for. Each growing Gaussian adds one."""
         room = self.gaussians.capacity - self.gaussians.count
         if np.count_nonzero(wanted) <= room:
             return wanted
@@ -123,7 +136,7 @@ class AdaptiveDensity:
         return np.isin(np.arange(len(wanted)), chosen)
 
     def _child(self, parents: dict[str, NDArray]) -> dict[str, NDArray]:
-        """Place and size of a Gaussian drawn from each parent; the rest it inherits."""
+        """Sample a position from each parent and shrink its scale. The other values are inherited."""
         offset = np.exp(parents["log_scale"]) * self._rng.standard_normal(parents["position"].shape)
         q = parents["quaternion"] / np.linalg.norm(parents["quaternion"], axis=1, keepdims=True)
         turned = np.cross(q[:, 1:], offset)

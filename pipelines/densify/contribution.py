@@ -1,4 +1,4 @@
-"""How much every Gaussian shows in a set of views, so that those that show nothing can go."""
+"""The contribution of each Gaussian to a set of views, for the removal of invisible Gaussians."""
 
 from collections.abc import Iterable
 
@@ -16,10 +16,11 @@ __all__ = ["Contribution"]
 
 @ti.data_oriented
 class Contribution:
-    """The pixels that a Gaussian covers in the view that shows most of it.
+    """Measures how many pixels each Gaussian covers in the view that shows most of it.
 
-    That is the largest sum, over the views, of its weight alpha T at their valid pixels. Compositing's backward pass
-    gives it: the derivative of the sum of all red values by the Gaussian's own.
+    The coverage in one view is the sum of the Gaussian's compositing weight alpha T over the valid pixels. It is
+    computed by compositing's backward pass, as the derivative of the sum of all red values with respect to the
+    Gaussian's red value.
     """
 
     def __init__(self, gaussians: GaussianField, renderer: Renderer) -> None:
@@ -28,7 +29,15 @@ class Contribution:
         self.images, self.projected = renderer.images, renderer.projected
 
     def measure(self, views: Iterable[Keyframe], near: float) -> NDArray:
-        """Pixels (N,) of every Gaussian. near: depth [scene units] below which nothing is drawn."""
+        """Render all views and return the largest coverage of each Gaussian.
+
+        Args:
+            views: Views to render.
+            near: Depth below which nothing is drawn [scene units].
+
+        Returns:
+            Coverage (N,) float32 [px].
+        """
         renderer, images = self.renderer, self.images
         largest = torch.zeros(self.gaussians.count, dtype=torch.float32, device=torch_device())
         for view in views:

@@ -1,4 +1,4 @@
-"""Densification: where new Gaussians go, and how they begin (Section 3.2)."""
+"""Densification: positions and initial values of new Gaussians (Section 3.2)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,13 @@ __all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "tracked_seeds"]
 
 @dataclass(frozen=True)
 class Seeds:
-    """Places of new Gaussians: xyz (N, 3) world, size (N,) of their pixel out there, colour (N, 3) in [0, 1]."""
+    """Positions and colours of new Gaussians.
+
+    Attributes:
+        xyz: Positions (N, 3) in the world frame.
+        size: Width (N,) of a pixel at the depth of each seed, d / f of Eq. 1 [scene units].
+        colour: Scene colours (N, 3) [1 = white]; clipped to [0, 2] under an exposure or vignette.
+    """
 
     xyz: NDArray[np.float64]
     size: NDArray[np.float64]
@@ -37,23 +43,28 @@ class Seeds:
 
 
 def _at_pixels(view: Keyframe, pixels: NDArray[np.float64], xyz: NDArray, depth: NDArray) -> Seeds:
-    """Seeds at pixels (N, 2) of a view, without those on masked pixels. Size is d / f of Eq. 1."""
+    """Seeds at pixels (N, 2) of a view, except those on masked pixels. Their size is d / f of Eq. 1."""
     places = np.floor(pixels).astype(int)
     valid = view.rgba[places[:, 1], places[:, 0], 3] > 0
     return Seeds(xyz, depth / view.camera.focal, scene_colours(view, places))[valid]
 
 
 def tracked_seeds(view: Keyframe) -> Seeds:
-    """Geometry and texture complex regions: the tracked points of the view that lie in its image (P_i)."""
+    """Seeds at the tracked points in the view's image: geometry and texture complex regions (P_i of Section 3.2.2)."""
     depth = view.points.depths(view.T_camera_world)
     keep = (depth > 0) & view.camera.contains(view.points.pixels)
     return _at_pixels(view, view.points.pixels[keep], view.points.xyz[keep], depth[keep])
 
 
 def dissimilarity(render: NDArray[np.floating], rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """1 - SSIM (H, W) of a render (H, W, 3) and an image (H, W, 4) in grey, after a slight blur against noise.
+    """1 - SSIM in grey between a render and an image, after a slight blur that suppresses noise.
 
-    0 where the image is masked.
+    Args:
+        render: Rendered colour (H, W, 3).
+        rgba: Image (H, W, 4) with its mask in the last channel.
+
+    Returns:
+        Dissimilarity (H, W); 0 at masked pixels.
     """
 
     def smooth(image: NDArray, side: int, sigma: float) -> NDArray[np.float32]:
@@ -75,9 +86,16 @@ def error_pixels(
     settings: DensifySettings,
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """High error regions: pixel centres (N, 2), drawn where 1 - SSIM is high and no point is tracked.
+    """Sample pixels of high error regions: 1 - SSIM is high, and there is no tracked point (Section 3.2.2).
 
-    error: (H, W) 1 - SSIM of the map's render; None draws from all valid pixels (the warm-up).
+    Args:
+        view: The view to sample.
+        error: 1 - SSIM (H, W) of the map's render; None samples from all valid pixels, as in the warm-up.
+        settings: Threshold and number of pixels.
+        rng: Random generator.
+
+    Returns:
+        Pixel centres (N, 2) as (x, y).
     """
     height, width = view.rgba.shape[:2]
     candidate = view.rgba[..., 3] > 0
@@ -98,7 +116,15 @@ def pixel_seeds(
     estimator: DepthEstimator,
     max_deviation: float | NDArray[np.float64],
 ) -> Seeds:
-    """Seeds at pixels (N, 2) whose depth the estimator knows well enough: to `max_deviation`, one or (N,)."""
+    """Seeds at the pixels whose estimated depth is certain enough.
+
+    Args:
+        view: The view of the pixels.
+        neighbours: Keyframes that the estimator may use.
+        pixels: Pixels (N, 2) as (x, y).
+        estimator: Depth estimator.
+        max_deviation: Upper bound on the standard deviation of log depth, a scalar or (N,).
+    """
     estimate = estimator.estimate(view, neighbours, pixels)
     sure = estimate.deviation < max_deviation
     camera_points = view.camera.unproject(pixels[sure], estimate.depth[sure])
@@ -116,13 +142,25 @@ def grow(
     budget: MemoryBudget,
     anchor: int = NO_ANCHOR,
 ) -> int:
-    """Add isotropic Gaussians at the seeds that the voxels admit at spacing `target` [scene units]; return how many.
+    """Add isotropic Gaussians at the seeds that the voxels admit.
 
-    If the budget has no room for all of them, the first ones are taken. anchor: of the new ones, see `GaussianField`.
+    If the budget has no room for all seeds, only the first ones are added.
+
+    Args:
+        gaussians: The map.
+        seeds: Candidates for new Gaussians.
+        voxels: Occupancy voxels; None adds every seed.
+        target: Target voxel size [scene units].
+        settings: Initial scale and opacity.
+        budget: Memory budget of the map.
+        anchor: Anchor of the new Gaussians, see `GaussianField`.
+
+    Returns:
+        Number of Gaussians added.
     """
     if voxels is not None:
         seeds = seeds[~voxels.query(seeds.xyz, target)]
-    # A cell that is marked and stays empty would refuse every later Gaussian: only what has room is marked.
+    # Cut to the budget before marking: a cell that is marked but empty would reject all later Gaussians.
     seeds = seeds[: budget.take_gaussians(seeds.xyz, target)]
     if voxels is not None:
         seeds = seeds[voxels.admit(seeds.xyz, target)]

@@ -1,4 +1,4 @@
-"""Gaussians from the tracked points of a whole sequence, as 3DGS starts [Kerbl 2023, Section 5.1]."""
+"""Initial Gaussians from the tracked points of a whole sequence, as in 3DGS [Kerbl 2023, Section 5.1]."""
 
 from __future__ import annotations
 
@@ -16,13 +16,18 @@ from pipelines.optimise.exposure import scene_colours
 __all__ = ["PointCloud", "initialise", "spacing", "union_of_points"]
 
 NEIGHBOURS = 3
-# FLANN's name for one k-d tree, whose answers are exact.
+# FLANN's identifier of a single k-d tree, whose search is exact.
 KDTREE_SINGLE = 4
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points of the world: xyz (N, 3), colour (N, 3) in [0, 1]."""
+    """Coloured points.
+
+    Attributes:
+        xyz: Positions (N, 3) in the world frame.
+        colour: Scene colours (N, 3) [1 = white].
+    """
 
     xyz: NDArray[np.float64]
     colour: NDArray[np.float64]
@@ -32,10 +37,10 @@ class PointCloud:
 
 
 def union_of_points(views: Iterable[Keyframe]) -> PointCloud:
-    """Every tracked point once, in the order of their ids.
+    """Collect every tracked point once, ordered by id.
 
-    Position and colour are those of the last view that has the point on a valid pixel: trackers that refine
-    their points know them best at the end.
+    Position and colour are taken from the last view that has the point on a valid pixel, since trackers refine their
+    points over time.
     """
     ids, xyz, colour = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))], [np.zeros((0, 3))]
     for view in views:
@@ -53,21 +58,41 @@ def union_of_points(views: Iterable[Keyframe]) -> PointCloud:
 
 
 def spacing(xyz: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> NDArray[np.float64]:
-    """Mean distance (N,) of every point (N, 3) to its nearest neighbours. Raises ValueError for too few points."""
+    """Mean distance of each point to its nearest neighbours.
+
+    Args:
+        xyz: Points (N, 3).
+        neighbours: Number of neighbours.
+
+    Returns:
+        Mean distances (N,).
+
+    Raises:
+        ValueError: If there are at most `neighbours` points.
+    """
     if len(xyz) <= neighbours:
         raise ValueError(f"{len(xyz)} points have no {neighbours} neighbours each")
-    # float32 inside FLANN: centred, so that digits go to the distances and not to where the world's origin is.
+    # FLANN works in float32. Centring keeps its precision independent of the world's origin.
     centred = np.ascontiguousarray(xyz - np.median(xyz, axis=0), dtype=np.float32)
     tree = cv2.flann_Index(centred, {"algorithm": KDTREE_SINGLE})
     _, squares = tree.knnSearch(centred, neighbours + 1)
-    # The nearest of all is the point itself.
+    # The first neighbour is the point itself.
     return np.sqrt(squares[:, 1:].astype(np.float64)).mean(axis=1)
 
 
 def initialise(gaussians: GaussianField, points: PointCloud, opacity: float, smallest: float) -> None:
-    """Add an isotropic Gaussian a point, as wide as its neighbours are far; an even choice where the pool is smaller.
+    """Add one isotropic Gaussian per point, with the mean distance to its neighbours as its standard deviation.
 
-    smallest: least size [scene units], for points that coincide. Raises ValueError for too few points.
+    If the pool is too small for all points, evenly spaced ones are used.
+
+    Args:
+        gaussians: Field to add to.
+        points: The points.
+        opacity: Initial opacity.
+        smallest: Lower bound on the standard deviation [scene units], for coincident points.
+
+    Raises:
+        ValueError: If there are too few points for `spacing`.
     """
     n = min(len(points), gaussians.capacity - gaussians.count)
     chosen = np.arange(n) * len(points) // max(n, 1)

@@ -1,1 +1,1 @@
-"""How the map, its poses and its exposures are fitted to the images: losses, gradients, steps, safeguards."""
+"""Optimisation of Gaussians, poses and exposures: losses, gradients, Adam steps, safeguards."""

@@ -1,4 +1,4 @@
-"""Adam over the Gaussians that the last batch of views touched."""
+"""Adam over the Gaussians that the last batch of views saw."""
 
 from dataclasses import dataclass
 
@@ -10,16 +10,24 @@ from fields.runtime.compiled_kernel import CompiledLoop
 
 __all__ = ["Adam", "LearningRates"]
 
-# Bits of 1e18 in float32: its square, a second moment, is finite still.
+# Bits of 1e18 in float32, whose square (a second moment) is still finite.
 BOUND = int(np.float32(1e18).view(np.int32))
 LARGEST_LOG = 80.0
-# Logit of an opacity below that of any pruning.
+# Logit of an opacity below every pruning threshold.
 TRANSPARENT = -20.0
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Step sizes; position in scene units, the others per stored parameter."""
+    """Step sizes of Adam.
+
+    Attributes:
+        position: Step of positions [scene units].
+        log_scale: Step of log-scales.
+        quaternion: Step of quaternions.
+        opacity_logit: Step of opacity logits.
+        colour: Step of the constant harmonic; the others use a twentieth of it.
+    """
 
     position: float
     log_scale: float
@@ -30,31 +38,30 @@ class LearningRates:
 
 @ti.func
 def _bits(x):
-    """The bits of |x| as float32, which are in the order of the numbers, infinity and NaN above all.
+    """The bits of |x| as float32, which order like the values, with infinity and NaN above all.
 
-    A comparison of the numbers would be left to a compiler that is told that there is no NaN.
+    A comparison of floats would not detect NaN, since the compiler may assume that there is none (fast math).
     """
     return ti.bit_cast(ti.cast(x, ti.f32), ti.i32) & 0x7FFFFFFF
 
 
 @ti.func
 def _one_over_complement(x):
-    """1 / (1 - exp(x)) for x < 0, by the series where the difference would be all rounding."""
+    """1 / (1 - exp(x)) for x < 0, by a series near 0, where the difference would lose all precision."""
     series = -x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0))))
     return 1.0 / ti.select(x > -0.05, series, 1.0 - ti.exp(x))
 
 
 @ti.data_oriented
 class Adam:
-    """Adam [Kingma 2015] with every Gaussian's own step count for the bias correction.
+    """Adam [Kingma 2015] with a separate step count per Gaussian for the bias correction.
 
-    With a batch of B views the rates follow the square-root rule of the paper's settings: lr * sqrt(B), betas
-    1 - 0.1 B and 1 - 0.001 B, eps / sqrt(B). A Gaussian that no view saw keeps its value, moments and count, so that
-    looking elsewhere does not move it.
+    For a batch of B views, the rates follow the square-root rule of the paper's settings: lr * sqrt(B), betas 1 - 0.1 B
+    and 1 - 0.001 B, eps / sqrt(B). A Gaussian that no view saw keeps its values, moments and step count.
 
-    Two safeguards look at every Gaussian on the way. One whose gradient has a component that is no number, or whose
-    components sum to more than 1e18, keeps value, moments and count as well. One that comes out larger than it may be
-    is made transparent, so that the next pruning removes it. Both are counted, see `GaussianField.take_caught`.
+    Two safeguards check every Gaussian. If its gradient contains NaN or Inf, or its components sum to more than 1e18 in
+    magnitude, the step is skipped. If a Gaussian becomes larger than allowed, it is made transparent, so that the next
+    pruning removes it. Both are counted, see `GaussianField.take_caught`.
     """
 
     def __init__(self, gaussians: GaussianField) -> None:
@@ -63,10 +70,13 @@ class Adam:
         self._update_all = CompiledLoop(self._step, 60)
 
     def step(self, rates: LearningRates, batch: int = 1, sh_degree: int | None = None, largest: float = np.inf) -> None:
-        """Update and clear the gradients of every touched Gaussian.
+        """Update every Gaussian that has gradients, and clear the gradients.
 
-        sh_degree: harmonics above it keep value and moments; None for all that the Gaussians have. largest: standard
-        deviation that one may reach [scene units].
+        Args:
+            rates: Step sizes for a batch of one view.
+            batch: Number of views whose gradients were accumulated.
+            sh_degree: Highest degree of the harmonics that are updated; None for all.
+            largest: Largest standard deviation of a Gaussian [scene units].
         """
         if self.gaussians.count == 0:
             return
@@ -75,7 +85,8 @@ class Adam:
         beta1, beta2 = max(1.0 - 0.1 * batch, 0.0), 1.0 - 0.001 * batch
         values = [rates.position, rates.log_scale, rates.quaternion, rates.opacity_logit, rates.colour]
         steps = (float(root * v) for v in values)
-        # beta^t is exp(t log beta), cheaper than a power. A beta of 0 counts as 1e-30, whose powers vanish too.
+        # beta^t is computed as exp(t log beta), which is cheaper than a power. A beta of 0 is replaced by 1e-30, whose
+        # powers vanish as well.
         logs = (float(np.log(max(beta, 1e-30))) for beta in (beta1, beta2))
         n = self.gaussians.count
         limit = float(min(np.log(largest), LARGEST_LOG))
@@ -119,7 +130,7 @@ class Adam:
                 t = ti.cast(self.gaussians.steps[i], ti.f32)
                 betas = ti.Vector([beta1, beta2])
                 corrections = ti.Vector([_one_over_complement(t * log_beta1), _one_over_complement(t * log_beta2)])
-                # Whole vectors: Taichi takes its time with every line that it unrolls.
+                # Vectors, and not components, since unrolled code compiles slowly in Taichi.
                 g = self.gaussians
                 g.position[i] = self._update(
                     g.position[i],
@@ -162,7 +173,7 @@ class Adam:
                     eps,
                 )
                 for k in range(active):
-                    # The directional part moves twenty times slower, as in 3DGS.
+                    # The view-dependent part has a twentieth of the rate, as in 3DGS.
                     lr = ti.select(k == 0, lr_colour, lr_colour / 20.0)
                     g.sh[i, k] = self._update(
                         g.sh[i, k], g.sh.grad[i, k], g.sh_m[i, k], g.sh_v[i, k], lr, betas, corrections, eps
@@ -175,7 +186,7 @@ class Adam:
 
     @ti.func
     def _magnitude(self, i, active):
-        """The sum of the magnitudes of a Gaussian's gradient, as bits: see `_bits`."""
+        """Sum of the magnitudes of a Gaussian's gradient, as bits (see `_bits`)."""
         g = self.gaussians
         total = ti.abs(g.opacity_logit.grad[i]) + ti.abs(g.position.grad[i]).sum() + ti.abs(g.log_scale.grad[i]).sum()
         total += ti.abs(g.quaternion.grad[i]).sum()

@@ -1,7 +1,7 @@
-"""Exposure: an affine colour transform (A, b) of each keyframe, estimated with the map.
+"""Exposure: an affine colour transform (A, b) of each keyframe, estimated together with the map.
 
-image = (A colour + b) * vignette. The first keyframe is the identity, which fixes what the transforms and the map's
-colours could otherwise share; the others are drawn to it.
+image = (A colour + b) * vignette. The transform of the first keyframe is fixed to the identity, which removes the
+ambiguity between the transforms and the colours of the map. The others are regularised towards the identity.
 """
 
 from __future__ import annotations
@@ -18,17 +18,25 @@ from pipelines.settings import ExposureSettings
 
 __all__ = ["ExposureRefinement", "fitted_exposure", "scene_colours"]
 
-# A pixel of the map that is thinner than this says nothing about exposure.
+# Pixels whose rendered opacity is at most this are not used to fit an exposure.
 MIN_OPACITY = 0.9
 MIN_PIXELS = 100
-# Colours of the scene may be brighter than a photograph's white, but not by more than a short exposure explains.
+# Scene colours may exceed the white of a photograph (1), but not by more than a short exposure explains.
 BRIGHTEST = 2.0
 FIT_ROUNDS = 5
 LEAST_RESIDUAL = 0.01
 
 
 def scene_colours(view: Keyframe, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Colours (N, 3) of the scene at pixels (N, 2) as (column, row) of a view: its image, not yet developed."""
+    """Colours of the scene at pixels of a view: its image with vignette and exposure removed.
+
+    Args:
+        view: The view.
+        pixels: Integer pixels (N, 2) as (column, row).
+
+    Returns:
+        Colours (N, 3), clipped to [0, 2] if the view has a vignette or an exposure.
+    """
     column, row = pixels.T
     colours = view.rgba[row, column, :3] / 255.0
     if view.vignette is not None:
@@ -51,10 +59,18 @@ def _vignette_at(view: Keyframe) -> NDArray[np.float32]:
 def fitted_exposure(
     colours: NDArray[np.floating], image: NDArray[np.floating], prior: NDArray[np.float64], prior_weight: float
 ) -> NDArray[np.float64]:
-    """(A, b) (3, 4) with image = A colours + b for colours and image (N, 3), drawn to `prior` (3, 4).
+    """Fit an exposure (A, b) with image = A colours + b, regularised towards a prior.
 
-    The least sum of absolute residuals [per pixel], by reweighted least squares: what the map shows wrongly are
-    outliers. prior_weight: of the squared distance to the prior.
+    Minimises the absolute residuals by iteratively reweighted least squares, so that errors of the map act as outliers.
+
+    Args:
+        colours: Rendered colours (N, 3).
+        image: Observed colours (N, 3).
+        prior: Prior (A, b) (3, 4).
+        prior_weight: Weight of the squared distance to the prior.
+
+    Returns:
+        Exposure (A, b) (3, 4).
     """
     homogeneous = np.concatenate([colours, np.ones((len(colours), 1))], axis=1).astype(np.float64)
     weights = np.ones(len(colours))
@@ -70,19 +86,30 @@ def fitted_exposure(
 
 
 class ExposureRefinement:
-    """Adam on a keyframe's (A, b); the moments live in the keyframe. New keyframes start from a fit to the map."""
+    """Adam on the exposure (A, b) of keyframes, which store its moments. New keyframes start from a fit to the map."""
 
     BETAS = (0.9, 0.999)
 
     def __init__(self, settings: ExposureSettings, safeguards: Safeguards | None = None) -> None:
-        """safeguards: where steps that are left out are counted."""
+        """Create the optimiser of exposures.
+
+        Args:
+            settings: Settings of the exposure.
+            safeguards: Counter of skipped steps; None for a new one.
+        """
         self.settings = settings
         self.safeguards = Safeguards() if safeguards is None else safeguards
 
     def begin(self, view: Keyframe, renderer: Renderer, near: float) -> None:
-        """Give a new keyframe its exposure, before the map changes for it: fitted to what the map shows there.
+        """Initialise the exposure of a new keyframe by a fit to the current render. Does nothing if disabled.
 
-        view.exposure is the last keyframe's, None for the first one.
+        `view.exposure` must hold the exposure of the last keyframe, which is the prior of the fit, or None for the
+        first keyframe, whose exposure becomes the identity.
+
+        Args:
+            view: The new keyframe.
+            renderer: Renderer of the map. Its images are overwritten.
+            near: Depth below which nothing is drawn [scene units].
         """
         if not self.settings.enabled:
             return
@@ -100,9 +127,14 @@ class ExposureRefinement:
         view.exposure = fitted_exposure(colours, image, view.exposure, self.settings.prior)
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], weight: float = 1.0) -> None:
-        """Move `view` against d loss / d (A, b) (3, 4), and towards the identity. weight: that of the view's loss.
+        """Make one Adam step on the exposure of a keyframe, with the regularisation towards the identity.
 
-        A gradient that is not finite moves nothing.
+        A step with a gradient that is not finite is skipped.
+
+        Args:
+            view: The keyframe.
+            gradient: d loss / d (A, b) (3, 4).
+            weight: Weight of the view in the loss, which also scales the regularisation.
         """
         if not np.isfinite(gradient).all():
             self.safeguards.exposure_steps += 1

@@ -1,7 +1,7 @@
-"""The photometric loss on a GPU: a block a tile and channel, both windows of SSIM through shared memory.
+"""The photometric loss on a GPU: one block per tile and channel, with both SSIM windows in shared memory.
 
-The formulas are those of `pipelines/optimise/losses.py`. Sums stay on the device: the gradient reads the number of
-valid pixels there, and the host gets the values late.
+The formulas are those of `pipelines/optimise/losses.py`. The sums stay on the device, where the backward pass reads the
+number of valid pixels. The host reads the values later.
 """
 
 import numpy as np
@@ -18,12 +18,12 @@ from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum
 
 __all__ = ["AsyncLossValues", "DevicePhotometricLoss", "photometric_loss"]
 
-# A tile with the border that its windows reach into.
+# Side of a tile with the border that its windows reach.
 SIDE = TILE_WIDTH + 2 * RADIUS
 HALO = SIDE * SIDE
 BAND = SIDE * TILE_WIDTH
 ROW_BITS = TILE_WIDTH.bit_length() - 1
-# Evaluations whose values lie in one tensor and come to the host together.
+# Number of evaluations whose values share one tensor and are copied to the host together.
 ROWS = 64
 
 NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -31,7 +31,7 @@ assert THREADS == TILE_PIXELS == TILE_WIDTH * TILE_HEIGHT
 
 
 class _Values:
-    """The sums of `ROWS` evaluations on the device, and what of them is on its way to the host."""
+    """The sums of `ROWS` evaluations on the device, and their copy to the host."""
 
     def __init__(self) -> None:
         self.sums = torch.zeros((ROWS, 4), dtype=torch.float32, device=torch_device())
@@ -40,28 +40,28 @@ class _Values:
         self._late: AsyncReadback | None = None
 
     def send(self) -> None:
-        """Start the copy to the host where there is anything new."""
+        """Start the copy to the host if there are new values."""
         if self._sent < self.written:
             self._late, self._sent = AsyncReadback(self.sums), self.written
 
     def row(self, i: int) -> np.ndarray:
-        """The sums (4,) of evaluation i. Waits where they have not arrived."""
+        """The sums (4,) of evaluation i. Waits for the copy if it has not finished."""
         if i >= self._sent:
             self.send()
         return self._late.numpy()[i].astype(np.float64)
 
 
 class AsyncLossValues(LossValues):
-    """Values that come to the host when they are first read, or before where `DevicePhotometricLoss.send` was called.
+    """Loss values that are copied to the host on first access, or earlier if `DevicePhotometricLoss.send` was called.
 
-    Reading waits for the device until they have come.
+    Access waits for the device.
     """
 
     def __init__(self, values: _Values, row: int) -> None:
         object.__setattr__(self, "_source", (values, row))
 
     def __getattr__(self, name: str) -> float:
-        # Only for what is not there yet: the three fields of LossValues.
+        # Called only for attributes that are not set yet: the three fields of LossValues.
         if name not in ("l1", "ssim", "squared_error"):
             raise AttributeError(name)
         values, row = self._source
@@ -74,7 +74,7 @@ class AsyncLossValues(LossValues):
 
 @ti.data_oriented
 class DevicePhotometricLoss(PhotometricLoss):
-    """Compares `images.colour` with `images.reference` where `images.valid`, and fills `images.colour_grad`."""
+    """`PhotometricLoss` on a GPU. Its values are read asynchronously."""
 
     lag = 1
 
@@ -91,9 +91,12 @@ class DevicePhotometricLoss(PhotometricLoss):
         self._values = _Values()
 
     def forward(self) -> LossValues:
-        """Evaluate the loss, leaving the SSIM map in `images.ssim`; its values come when they are read.
+        """Evaluate the loss, and write the SSIM map to `images.ssim`.
 
-        Masked pixels of the render are replaced by the reference, so that they add nothing to any window.
+        Masked pixels of the render are replaced by the reference, so that they do not affect any window.
+
+        Returns:
+            Values that wait for the device when they are read.
         """
         if self._values.written == ROWS:
             self._values = _Values()
@@ -115,7 +118,7 @@ class DevicePhotometricLoss(PhotometricLoss):
 
     @ti.func
     def _at(self, buffer: ti.template(), start, x, y, width, height):
-        """Value of a plane at a pixel; 0 beyond the image."""
+        """Value of a plane at a pixel; 0 outside the image."""
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         value = 0.0
         if inside:
@@ -139,13 +142,13 @@ class DevicePhotometricLoss(PhotometricLoss):
         for i in range(3 * tiles * THREADS):
             a = ti.simt.block.SharedArray((HALO,), ti.f32)
             b = ti.simt.block.SharedArray((HALO,), ti.f32)
-            # The four moments after the horizontal window; then the four sums.
+            # First the four moments after the horizontal window, then the four sums.
             band = ti.simt.block.SharedArray((4 * BAND,), ti.f32)
             unit, thread = i >> THREAD_BITS, i & (THREADS - 1)
             channel, tile = unit // tiles, unit % tiles
             start = channel * plane
             left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
-            # The block may come from another tile, whose threads are not all done with shared memory.
+            # Threads of the block may still use shared memory for the previous tile.
             ti.simt.block.sync()
             for k in range((HALO - thread + THREADS - 1) >> THREAD_BITS):
                 at = thread + k * THREADS
@@ -251,5 +254,5 @@ class DevicePhotometricLoss(PhotometricLoss):
 
 
 def photometric_loss(images: ImageBuffers) -> PhotometricLoss:
-    """The loss in the form of the device that Taichi runs on."""
+    """Create the photometric loss for the device that Taichi runs on."""
     return DevicePhotometricLoss(images) if on_gpu() else PhotometricLoss(images)

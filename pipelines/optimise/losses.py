@@ -1,10 +1,10 @@
-"""Photometric loss (1 - w) L1 + w (1 - SSIM) with its gradient by the render, and the penalty on elongated Gaussians.
+"""Photometric loss (1 - w) L1 + w (1 - SSIM) with its image gradient, and the penalty on elongated Gaussians.
 
-SSIM [Wang 2004] with an 11x11 Gaussian window (sigma 1.5), zeros beyond the border, as in 3DGS. With the local moments
+SSIM [Wang 2004] uses an 11x11 Gaussian window (sigma 1.5) with zero padding, as in 3DGS. With the local moments
 mu = G*x, e_xx = G*xx, e_xy = G*xy, the gradient is
     d S / d x = G*(dS/dmu) + 2 x (G*(dS/de_xx)) + y (G*(dS/de_xy)).
-Both convolutions are separable and work on strips of rows whose scratch stays in the cache. S needs the sum of e_xx and
-e_yy alone: one moment less to smooth.
+Both convolutions are separable and work on strips of rows whose scratch memory stays in the cache. S depends on e_xx
+and e_yy only through their sum, which saves one convolution.
 """
 
 from dataclasses import dataclass
@@ -22,35 +22,41 @@ __all__ = ["AspectPenalty", "LossValues", "PhotometricLoss", "window_weights"]
 RADIUS = 5
 C1 = 0.01**2
 C2 = 0.03**2
-# A thread takes four strips of a channel at a time, or rows.
+# Four strips of a channel, or four rows, per chunk (see `fields.runtime.parallel`).
 SPREAD = HANDED_OUT // 4
 
 
 @ti.func
 def place(index):
-    """An index into a field, said to lie in [0, 2^30).
+    """Mask a field index to [0, 2^30).
 
-    With that and `extent` LLVM knows that 32 bits do not overflow, and has the constant offsets of a window added by
-    the loads themselves. Else it computes each of their addresses with two instructions.
+    With this and `extent`, LLVM knows that 32-bit indices do not overflow, and folds the constant offsets of a window
+    into the loads. Otherwise it computes each address with two instructions.
     """
     return index & 0x3FFFFFFF
 
 
 @ti.func
 def extent(pixels):
-    """The length of a row, said to be below 2^16."""
+    """Mask the length of a row to less than 2^16, see `place`."""
     return pixels & 0xFFFF
 
 
 def window_weights() -> tuple[float, ...]:
-    """The 11 weights of the Gaussian window of sigma 1.5, summing to 1."""
+    """The 11 weights of the Gaussian window with sigma 1.5; they sum to 1."""
     w = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
     return tuple(float(v) for v in w / w.sum())
 
 
 @dataclass(frozen=True)
 class LossValues:
-    """Means over the valid pixels and channels of one view."""
+    """Means over the valid pixels and channels of one view.
+
+    Attributes:
+        l1: Mean absolute error.
+        ssim: Mean SSIM.
+        squared_error: Mean squared error.
+    """
 
     l1: float
     ssim: float
@@ -58,14 +64,17 @@ class LossValues:
 
     @property
     def psnr(self) -> float:
+        """Peak signal-to-noise ratio [dB]."""
         return float(-10.0 * np.log10(max(self.squared_error, 1e-12)))
 
 
 @ti.data_oriented
 class PhotometricLoss:
-    """Compares `images.colour` with `images.reference` where `images.valid`, and fills `images.colour_grad`.
+    """Compares `images.colour` with `images.reference` at the pixels of `images.valid`, and fills `images.colour_grad`.
 
-    lag: evaluations by which it is worth to read values late; here they are there at once.
+    Attributes:
+        lag: Number of steps after which the values should be read, so that the host does not wait. 0 on the CPU, where
+            they are available immediately.
     """
 
     lag = 0
@@ -79,9 +88,9 @@ class PhotometricLoss:
         self._differentiate = CompiledKernel(self._differentiate_strips)
 
     def forward(self) -> LossValues:
-        """Evaluate the loss, leaving the SSIM map in `images.ssim`.
+        """Evaluate the loss, and write the SSIM map to `images.ssim`.
 
-        Masked pixels of the render are replaced by the reference, so that they add nothing to any window.
+        Masked pixels of the render are replaced by the reference, so that they do not affect any window.
         """
         width, height = self.images.width, self.images.height
         if self.images.masked:
@@ -93,10 +102,15 @@ class PhotometricLoss:
         return LossValues(l1 / count, ssim / count, square / count)
 
     def send(self) -> None:
-        """Let the values of the evaluations so far come to the host while it goes on."""
+        """Start the asynchronous copy of the values so far to the host. Does nothing on the CPU."""
 
     def backward(self, ssim_weight: float, scale: float = 1.0) -> None:
-        """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM)."""
+        """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM).
+
+        Args:
+            ssim_weight: Weight w of 1 - SSIM.
+            scale: Factor on the gradient.
+        """
         count = max(float(self._sums[:, 3].sum()), 1.0)
         self._differentiate(
             self.images.width,
@@ -120,9 +134,9 @@ class PhotometricLoss:
 
     @ti.func
     def _smooth_rows(self, first, smooth, rows, width):
-        """Horizontal window over the `rows` scratch rows from `first` on, into those from `smooth` on.
+        """Convolve the `rows` scratch rows from `first` on horizontally, into those from `smooth` on.
 
-        One row at a time: beyond some 25 addresses in a loop LLVM no longer vectorises it.
+        One row at a time, since LLVM does not vectorise loops with more than about 25 addresses.
         """
         for q in range(rows):
             source = place(first + q * self.images.stride + PAD - RADIUS)
@@ -135,8 +149,8 @@ class PhotometricLoss:
 
     @ti.kernel
     def _compare_strips(self, width: ti.i32, height: ti.i32, moments: ti.i32, sums: ti.types.ndarray()):
-        # moments is 4, but not a constant: LLVM would unroll the loop over them, and compile longer at every start of
-        # a process for a kernel that is no faster.
+        # moments is always 4, but is passed as an argument. As a constant, LLVM would unroll the loop over it, which
+        # lengthens the compilation at every start of a process without making the kernel faster.
         for i in range((3 * STRIPS) * SPREAD):
             if i % SPREAD == 0:
                 self._compare_unit(i // SPREAD, width, height, moments, sums)
@@ -148,7 +162,7 @@ class PhotometricLoss:
         partial = unit // STRIPS * 3 * plane
         strip = unit % STRIPS
         scratch = unit * SCRATCH_ROWS * stride
-        # A first access out here makes Taichi fetch the tree's root once, not at every pixel.
+        # A first access outside the loop makes Taichi fetch the tree's root once, and not at every pixel.
         self.images.rows[scratch] = 0.0
         zero = ti.cast(0.0, self.real)
         l1, ssim, square, count = zero, zero, zero, zero
@@ -185,7 +199,7 @@ class PhotometricLoss:
 
     @ti.func
     def _moments_of_row(self, first, scratch, width):
-        """Vertical window of x, y, xx + yy and xy over the rows from `first` on."""
+        """Convolve x, y, xx + yy and xy vertically over the rows from `first` on."""
         stride = ti.static(self.images.stride)
         top, target = place(first), place(scratch)
         for x in range(extent(width + 2 * PAD)):
@@ -202,7 +216,7 @@ class PhotometricLoss:
     def _differentiate_strips(
         self, width: ti.i32, height: ti.i32, l1_scale: ti.f64, ssim_scale: ti.f64, partials: ti.i32
     ):
-        # partials is 3, but not a constant, as above.
+        # partials is always 3, but not a constant, for the reason given in `_compare_strips`.
         for i in range((3 * STRIPS) * SPREAD):
             if i % SPREAD == 0:
                 self._differentiate_unit(i // SPREAD, width, height, l1_scale, ssim_scale, partials)
@@ -241,9 +255,10 @@ class PhotometricLoss:
 
 @ti.data_oriented
 class AspectPenalty:
-    """weight / N * sum over the touched Gaussians of max(0, s_max - 10 s_min)^2, s in units of the scene's depth.
+    """Penalty on Gaussians with an aspect ratio above 10:1 (the paper's supplementary settings).
 
-    Pulls back Gaussians longer than 10:1 (paper's supplementary settings).
+    The penalty is weight / N * sum over the touched Gaussians of max(0, s_max - 10 s_min)^2, with scales s in scene
+    depths.
     """
 
     def __init__(self, gaussians: GaussianField, max_ratio: float = 10.0) -> None:
@@ -252,7 +267,12 @@ class AspectPenalty:
         self._add = CompiledLoop(self._backward, 20)
 
     def backward(self, weight: float, scene_depth: float) -> None:
-        """Add the gradient of the penalty to that of the log-scales."""
+        """Add the gradient of the penalty to the gradients of the log-scales.
+
+        Args:
+            weight: Weight of the penalty.
+            scene_depth: Depth of the scene [scene units].
+        """
         count = self.gaussians.count
         if count:
             self._add(count, count, weight / count, 1.0 / float(scene_depth))

@@ -1,4 +1,4 @@
-"""One optimisation step: a batch of views rendered, compared, differentiated; Gaussians and poses updated."""
+"""Optimisation steps of the map: render a batch of views, compare, differentiate, and update Gaussians and poses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["MapOptimiser"]
 
 
 class MapOptimiser:
-    """Renders with `renderer`, and keeps Gaussians and keyframes in step with their images."""
+    """Optimises Gaussians, and the poses and exposures of keyframes, on the images of keyframes."""
 
     def __init__(self, gaussians: GaussianField, renderer: Renderer, settings: MappingSettings) -> None:
         self.gaussians = gaussians
@@ -36,14 +36,20 @@ class MapOptimiser:
         self.safeguards = Safeguards()
         self.poses = PoseRefinement(self.safeguards)
         self.exposure = ExposureRefinement(settings.exposure, self.safeguards)
-        # What steps have found that has not been taken in: values of their views, and by index of the keyframe how it
-        # is to move. On the CPU empty between steps.
+        # Results of steps that have not been applied yet: loss values of the views, and updates of pose and exposure by
+        # frame index. Both are empty between steps on the CPU.
         self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
         self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
 
     def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
-        """The settings' learning rates, positions in scene units."""
+        """Return the learning rates of the settings, with positions in scene units.
+
+        Args:
+            scene_depth: Depth of the scene [scene units].
+            position_factor: Factor on the position rate.
+            scale_factor: Factor on the scale rate.
+        """
         o = self.settings.optimise
         return LearningRates(
             position=o.position_rate * scene_depth * position_factor,
@@ -54,9 +60,16 @@ class MapOptimiser:
         )
 
     def compare(self, view: Keyframe, scene_depth: float, level: int = 0, exact: bool = True) -> LossValues:
-        """Render a keyframe, develop it, and evaluate the loss against its image of a pyramid level.
+        """Render a keyframe, apply exposure and vignette, and evaluate the loss against its image.
 
-        exact: see `Renderer.forward`.
+        Args:
+            view: The keyframe.
+            scene_depth: Depth of the scene [scene units].
+            level: Pyramid level of the image.
+            exact: See `Renderer.forward`.
+
+        Returns:
+            Values of the loss.
         """
         image = view.image(level)
         self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth, exact)
@@ -67,11 +80,22 @@ class MapOptimiser:
     def step(
         self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int = 0
     ) -> float:
-        """Adam steps on the mean loss of the views (indices into `store`), in batches; return their mean PSNR.
+        """Make Adam steps on the views, one for each batch.
 
-        The keyframes' errors are brought up to date, and their poses but the first are stepped at `pose_rate` [px];
-        so are their exposures where they are estimated. On a GPU, which is not waited for, errors and PSNR are those of
-        the step before (NaN at first), and a keyframe moves before it is rendered next; `settle` brings all up to date.
+        Updates the Gaussians, the errors of the keyframes, their poses and, where estimated, their exposures. Pose and
+        exposure of the first keyframe are fixed. On a GPU, the host does not wait for the device: errors and PSNR lag
+        by one step (NaN at first), and a pose is updated before its keyframe is rendered again. `settle` applies all
+        pending results.
+
+        Args:
+            store: The keyframes.
+            views: Indices into `store`.
+            rates: Learning rates of the Gaussians.
+            pose_rate: Step of the poses [px]; 0 to keep them.
+            level: Pyramid level of the images.
+
+        Returns:
+            Mean PSNR of the views.
         """
         size = self.settings.optimise.batch
         seen: list[tuple[Keyframe, LossValues]] = []
@@ -84,21 +108,25 @@ class MapOptimiser:
         return self._psnr
 
     def settle(self) -> float:
-        """Take in all that the steps so far have found; return the mean PSNR of the last one's views."""
+        """Apply all pending results of the steps so far. Waits for the device.
+
+        Returns:
+            Mean PSNR of the last step's views.
+        """
         while self._unread:
             self._read(self._unread.popleft())
         self._move()
         return self._psnr
 
     def caught(self) -> Safeguards:
-        """What the safeguards have caught so far. Waits for the device."""
+        """Return the safeguards' counts so far. Waits for the device."""
         steps, exploded = self.gaussians.take_caught()
         self.safeguards.gaussian_steps += steps
         self.safeguards.exploded_gaussians += exploded
         return self.safeguards
 
     def _read(self, seen: list[tuple[Keyframe, LossValues]]) -> None:
-        """Take in the values of a step's views."""
+        """Apply the loss values of a step's views."""
         sound = [(view, values) for view, values in seen if np.isfinite(values.l1)]
         self.safeguards.views += len(seen) - len(sound)
         for view, values in sound:
@@ -107,7 +135,7 @@ class MapOptimiser:
             self._psnr = float(np.mean([values.psnr for _, values in sound]))
 
     def _move(self, view: Keyframe | None = None) -> None:
-        """Step pose and exposure of a keyframe by the gradients of the last batch that it was in; None for all."""
+        """Apply the pending pose and exposure steps of a keyframe, or of all keyframes if None."""
         for key in list(self._moves) if view is None else [view.index]:
             for move in self._moves.pop(key, ()):
                 move()

@@ -1,4 +1,4 @@
-"""Camera refinement on SE(3): by the tracked points and by the gradient of the rendering loss (Section 3.3.3)."""
+"""Pose refinement on SE(3), from tracked points and from the gradient of the rendering loss (Section 3.3.3)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,22 @@ from pipelines.optimise.safeguards import Safeguards
 
 __all__ = ["PoseRefinement", "pixel_jacobian", "pixel_metric", "reprojection"]
 
-# Depths that the metric takes to be in a view [its median depth].
+# Depths at which the metric samples a view [median depths].
 NEAR_AND_FAR = (0.6, 1.6)
-# Reprojection errors beyond this [px] count as outliers and pull no harder (Huber).
+# Threshold of the Huber loss on reprojection errors [px].
 OUTLIER = 2.0
 
 
 def pixel_jacobian(camera: PinholeCamera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """d pixel / d xi (N, 2, 6) of camera-frame points (N, 3), z > 0, under exp(xi) at xi = 0."""
+    """Jacobian of pixel positions with respect to a pose increment exp(xi) at xi = 0.
+
+    Args:
+        camera: Intrinsics.
+        points: Points (N, 3) in the camera frame, with z > 0.
+
+    Returns:
+        d pixel / d xi (N, 2, 6).
+    """
     x, y, z = points.T
     fx, fy, zero = camera.fx / z, camera.fy / z, np.zeros(len(points))
     by_point = np.stack([fx, zero, -fx * x / z, zero, fy, -fy * y / z], axis=1).reshape(-1, 2, 3)
@@ -31,10 +39,17 @@ def pixel_jacobian(camera: PinholeCamera, points: NDArray[np.float64]) -> NDArra
 
 
 def pixel_metric(view: Keyframe) -> NDArray[np.float64]:
-    """W (6, 6) of coordinates u of a pose's tangent, xi = W u, in which a step of |u| moves the image by |u| pixels.
+    """Coordinates of a pose's tangent in which step lengths are in pixels.
 
-    The root mean square over a grid of pixels at two depths. In these coordinates a small turn and a small shift, which
-    look alike, no longer stand in one another's way, and the scale of the scene cancels.
+    With xi = W u, a step u moves the image by |u| px: the root mean square over a grid of pixels at two depths. This
+    decorrelates small rotations and translations, which move the image in similar ways, and cancels the scale of the
+    scene.
+
+    Args:
+        view: The keyframe.
+
+    Returns:
+        W (6, 6).
     """
     return _pixel_metric(view.camera, view.median_depth)
 
@@ -51,9 +66,16 @@ def _pixel_metric(camera: PinholeCamera, median_depth: float) -> NDArray[np.floa
 
 
 def reprojection(view: Keyframe, W: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gradient (6,) and Gauss-Newton Hessian (6, 6) by u of half the mean squared reprojection error [px^2], Huber's.
+    """Derivatives of half the mean reprojection error [px^2] with respect to u, xi = W u, under a Huber loss.
 
-    Over the view's tracked points that lie before its camera; xi = W u.
+    The mean is over the view's tracked points in front of its camera.
+
+    Args:
+        view: The keyframe.
+        W: Metric (6, 6) from `pixel_metric`.
+
+    Returns:
+        Gradient (6,) and Gauss-Newton Hessian (6, 6); zeros if no point is in front of the camera.
     """
     p = view.points.xyz @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
     before = p[:, 2] > 0.05 * view.median_depth
@@ -67,27 +89,33 @@ def reprojection(view: Keyframe, W: NDArray[np.float64]) -> tuple[NDArray[np.flo
 
 
 class PoseRefinement:
-    """Moves a keyframe's T_camera_world, T <- exp(xi) T, in the coordinates of `pixel_metric`.
+    """Refines T_camera_world of keyframes, T <- exp(xi) T, in the coordinates of `pixel_metric`.
 
-    Adam's moments live in the keyframe and are expressed in its own camera frame, which an increment hardly turns.
+    The keyframe stores Adam's moments. They are expressed in its camera frame and are not transformed after a step,
+    since a step rotates that frame only slightly.
     """
 
     BETAS = (0.9, 0.999)
-    # Gauss-Newton steps of an alignment, and its weight of half the squared movement from the tracked pose [px^2].
+    # Gauss-Newton steps of an alignment, and the weight of half the squared distance to the tracked pose [px^2].
     ITERATIONS = 5
     PRIOR = 0.01
-    # Share of the image's diagonal by which refinement may move it: beyond, the camera shows something else.
+    # Largest image motion by refinement, as a fraction of the image's diagonal. Beyond it, the pose is wrong.
     FARTHEST = 0.5
 
     def __init__(self, safeguards: Safeguards | None = None) -> None:
-        """safeguards: where steps that are undone are counted."""
+        """Create the refinement.
+
+        Args:
+            safeguards: Counter of rejected steps; None for a new one.
+        """
         self.safeguards = Safeguards() if safeguards is None else safeguards
 
     def align(self, view: Keyframe) -> None:
-        """Move `view` to where its tracked points project to where they were tracked, by Gauss-Newton.
+        """Minimise the reprojection error of the view's tracked points by Gauss-Newton.
 
-        A tracker's poses and points agree; where they do not, the points, of which there are many, know better. The
-        prior holds what they leave open. Where it runs away the view stays where it was.
+        If a tracker's poses and points disagree, the points are more reliable, since there are many of them. A prior on
+        the tracked pose constrains the directions that the points leave undetermined. If the optimisation diverges, the
+        view keeps its pose.
         """
         W, before = pixel_metric(view), view.T_camera_world
         try:
@@ -104,15 +132,20 @@ class PoseRefinement:
             view.T_camera_world = before
 
     def _runs_away(self, view: Keyframe, W: NDArray[np.float64]) -> bool:
-        """Whether the view stands nowhere, or so far from its tracked pose that it must see something else."""
+        """Whether the pose is not finite, or farther than `FARTHEST` from the tracked pose."""
         moved = np.linalg.norm(np.linalg.solve(W, log_se3(view.correction)))
         return not moved <= self.FARTHEST * np.hypot(view.camera.width, view.camera.height)
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], rate: float) -> None:
-        """Move `view` by about `rate` px against d loss / d xi (6,).
+        """Make one Adam step on the pose of a keyframe.
 
-        A gradient that is not finite moves nothing. A step that carries the view away is undone, and what had gathered
-        for it is forgotten.
+        A step with a gradient that is not finite is skipped. A step that diverges from the tracked pose is undone, and
+        Adam's moments are reset.
+
+        Args:
+            view: The keyframe.
+            gradient: d loss / d xi (6,).
+            rate: Step size [px].
         """
         if not np.isfinite(gradient).all():
             self.safeguards.camera_steps += 1

@@ -1,4 +1,4 @@
-"""Safeguards: what went wrong in a step and was undone, counted, so that a run can say so."""
+"""Safeguards: counts of failures that were caught, so that a run can report them."""
 
 from __future__ import annotations
 
@@ -6,20 +6,24 @@ from dataclasses import asdict, dataclass, fields
 
 __all__ = ["EXPLODED", "Safeguards"]
 
-# Standard deviation [scene depths] beyond which a Gaussian shows nothing of the scene any more.
+# Standard deviation [scene depths] beyond which a Gaussian no longer represents any part of the scene.
 EXPLODED = 100.0
 
 
 @dataclass
 class Safeguards:
-    """How often each guard has caught something.
+    """Counts of what each safeguard has caught.
 
-    gaussian_steps: steps of a Gaussian whose gradient was no number or beyond all bounds; it kept value and moments.
-    exploded_gaussians: those that had grown beyond `EXPLODED`, made transparent, so that the next pruning takes them.
-    camera_steps: steps of a keyframe's pose, or its alignment, that were no number or would have carried it away.
-    exposure_steps: steps of an exposure that were no number. views: views of a step whose loss was no number.
-    gaussians_without_room, keyframes_without_room, observations_without_room: those that were left out for want of
-    memory (`MemoryBudget`).
+    Attributes:
+        gaussian_steps: Skipped steps of Gaussians whose gradient was not finite or too large.
+        exploded_gaussians: Gaussians that grew beyond `EXPLODED`. They are made transparent, so that the next pruning
+            removes them.
+        camera_steps: Steps and alignments of a pose that were not finite or diverged.
+        exposure_steps: Steps of an exposure whose gradient was not finite.
+        views: Views of a step whose loss was not finite.
+        gaussians_without_room: Gaussians that were not added for lack of memory (`MemoryBudget`).
+        keyframes_without_room: Keyframes that were not added for lack of memory.
+        observations_without_room: Observations of tracked points that were not kept for lack of memory.
     """
 
     gaussian_steps: int = 0
@@ -32,16 +36,16 @@ class Safeguards:
     observations_without_room: int = 0
 
     def counts(self) -> dict[str, int]:
-        """The counts by their names."""
+        """Return the counts by name."""
         return asdict(self)
 
     def restore(self, counts: dict[str, int]) -> None:
-        """Go on from former counts."""
+        """Restore the result of `counts`."""
         for field in fields(self):
             setattr(self, field.name, int(counts[field.name]))
 
     def warning(self) -> str | None:
-        """One line about what was caught; None where nothing was."""
+        """Return one line about what was caught; None if nothing was."""
         meanings = {
             "gaussian_steps": "steps of Gaussians with gradients that are no numbers were left out",
             "exploded_gaussians": "Gaussians that had grown beyond all bounds were removed",

@@ -1,1 +1,1 @@
-"""The renderer: a view of the map as colour, depth and opacity, and its gradients."""
+"""The differentiable renderer: colour, depth and opacity of a view of the map, and their gradients."""

@@ -1,7 +1,7 @@
-"""Compositing in the form that GPUs use, one pixel a task over the Gaussians of its tile: the plain twin.
+"""Reference implementation of compositing: one task per pixel, over the Gaussians of its tile.
 
-Slower by far on a CPU (each pixel's loop is scalar), and so direct that it can be read against the equations of
-`compositing.py`. The tests compare the two; `scripts/benchmark` prints the ratio of their times.
+It follows the equations of `compositing.py` directly. It is much slower on a CPU, since each pixel's loop is scalar.
+The tests compare the two implementations, and `scripts/benchmark` prints the ratio of their times.
 """
 
 import taichi as ti
@@ -16,20 +16,20 @@ __all__ = ["ReferenceCompositing"]
 
 @ti.data_oriented
 class ReferenceCompositing(Compositing):
-    """Drop-in for `Compositing`, without the gradient of depth."""
+    """Drop-in replacement for `Compositing`, without the gradient of depth."""
 
     def forward(self) -> None:
         """Fill `images.colour`, `.depth` and `.opacity`."""
         self._forward_pixels(self.view.width, self.view.height)
 
     def backward(self) -> None:
-        """From `images.colour_grad` and `.opacity_grad` to the gradients in `projected`."""
+        """Propagate `images.colour_grad` and `.opacity_grad` to the gradients in `projected`."""
         self._clear(self.projected.count)
         self._backward_pixels(self.view.width, self.view.height)
 
     @ti.func
     def _alpha(self, s, x, y):
-        """(alpha, d power / d mean x, d power / d mean y) of slot s at a pixel centre; alpha 0 where not drawn."""
+        """Alpha of slot s at a pixel centre (0 where it is not drawn), and the pixel's offset (2) from its mean."""
         d = ti.Vector([x, y]) - self.projected.mean[s]
         conic = self.projected.conic[s]
         power = -0.5 * (conic[0] * d[0] * d[0] + conic[2] * d[1] * d[1]) - conic[1] * d[0] * d[1]

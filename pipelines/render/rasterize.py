@@ -1,4 +1,4 @@
-"""`rasterize`: the renderer as a differentiable function of PyTorch tensors."""
+"""`rasterize`: the renderer as a differentiable PyTorch function."""
 
 from __future__ import annotations
 
@@ -20,16 +20,23 @@ from pipelines.render.renderer import Renderer
 __all__ = ["RasterizedView", "rasterize"]
 
 REAL = {torch.float32: ti.f32, torch.float64: ti.f64}
-# What Taichi's allocator is good for (docs/method.md); on the CPU memory follows what is used.
+# Limit of Taichi's allocator (docs/method.md). On the CPU, memory follows the Gaussians in use.
 MAX_GAUSSIANS = 1_500_000
-# Fields that Taichi 1.7.4 holds without writing beyond its memory; a third on the CPU has ended the process.
+# Number of sets of fields that Taichi 1.7.4 holds without writing beyond its memory. A third set crashed the process on
+# the CPU.
 MAX_KEPT = 2
-# Entries by which a pose may miss being rigid: rounding and drift, but no scale and no shear.
+# Largest deviation of a pose's entries from a rigid motion. This tolerates rounding and drift, but no scale or shear.
 MAX_DRIFT = 1e-3
 
 
 class RasterizedView(NamedTuple):
-    """image (H, W, 3) not clipped, depth (H, W) as the weighted sum of z, opacity (H, W)."""
+    """Result of `rasterize`.
+
+    Attributes:
+        image: Colour (H, W, 3), not clipped.
+        depth: Depth (H, W) as the weighted sum of z, not divided by opacity.
+        opacity: Opacity (H, W).
+    """
 
     image: Tensor
     depth: Tensor
@@ -49,26 +56,38 @@ def rasterize(
     background: Tensor | None = None,
     near: float = 0.01,
 ) -> RasterizedView:
-    """The picture of N Gaussians, differentiable by every tensor. `initialise` must have been called.
+    """Render N Gaussians, differentiably with respect to every tensor. Call `initialise` first.
 
-    position (N, 3); log_scale (N, 3); quaternion (N, 4) as w, x, y, z of any length but zero; opacity_logit (N,);
-    sh (N, K, 3) with K of 1, 4, 9 or 16: the stored form of 3DGS files, as `read_splats` gives it. Or, instead of sh,
-    colour (N, 3), the same from everywhere; what is below 0 is drawn as 0. All float32, or all float64 (CPU only), on
-    the device that `initialise` took.
+    All tensors except `T_camera_world` must have the same type, float32 or float64 (CPU only), and be on the device
+    that `initialise` chose. The values are those of 3DGS files, as `read_splats` returns them.
 
-    T_camera_world (4, 4), world to camera, OpenCV axes, of either type, on any device: taken as the rigid motion
-    nearest to it. Its gradient is therefore tangent to SE(3): right for whatever pose it was computed from, such as
-    `torch_exp_se3(xi) @ T`, and with no part along which T would stop being rigid. A plain gradient step on T itself
-    leaves SE(3) to the second order.
+    The pose is replaced by the rigid motion nearest to it. Its gradient is therefore tangent to SE(3): it is correct
+    for any parametrisation of the pose, such as `torch_exp_se3(xi) @ T`, and has no component along which T would stop
+    being rigid. A plain gradient step on T itself leaves SE(3) to second order.
 
-    background (3,): seen where nothing is, black by default. near: depth [scene units] below which nothing is drawn.
+    The function keeps its fields between calls, one set for each type, number of harmonics, and doubling of the largest
+    image size. There is room for two sets, so start with the largest image. `backward` renders again if another image
+    has been rendered in between. It is not differentiable itself. On CUDA, everything runs on the default stream.
 
-    The fields behind it are kept between calls, a set for each type, number of harmonics, and doubling of the largest
-    image: there is room for two, so begin with the largest. `backward` renders anew where another picture has been
-    drawn since; it cannot itself be differentiated. On CUDA all happens on the default stream.
+    Args:
+        position: Means (N, 3) in the world frame.
+        log_scale: Logarithms of the standard deviations (N, 3).
+        quaternion: Rotations (N, 4) as (w, x, y, z), of any length but zero.
+        opacity_logit: Logits (N,) of the opacities.
+        sh: Coefficients (N, K, 3) of the spherical harmonics, with K of 1, 4, 9 or 16.
+        T_camera_world: Pose (4, 4), world to camera, OpenCV axes; float32 or float64, on any device.
+        camera: Intrinsics and image size.
+        colour: View-independent colours (N, 3), instead of `sh`. Values below 0 are drawn as 0.
+        background: Colour (3,) where no Gaussian is drawn; None for black.
+        near: Depth below which nothing is drawn [scene units].
 
-    Raises TypeError or ValueError, in one line, for types, shapes, devices and values that do not fit, and RuntimeError
-    before `initialise` and where there is no room.
+    Returns:
+        Image, depth and opacity.
+
+    Raises:
+        TypeError: If types do not fit, or not exactly one of `sh` and `colour` is given. The message is one line.
+        ValueError: If shapes, devices or values do not fit. The message is one line.
+        RuntimeError: If `initialise` has not been called, or there is no room for another set of fields.
     """
     program()
     if (sh is None) == (colour is None):
@@ -87,7 +106,7 @@ def rasterize(
 
 
 def _check(tensors: dict[str, Tensor], T_camera_world: Tensor, background: Tensor | None) -> None:
-    """Raise for the first tensor that does not fit the others or the device."""
+    """Raise TypeError or ValueError for the first tensor that does not fit the others or the device."""
     given = tensors | {"T_camera_world": T_camera_world}
     given |= {} if background is None else {"background": background}
     for name, tensor in given.items():
@@ -131,7 +150,7 @@ def _kind(tensor: Tensor) -> str:
 
 
 def _rigid(T_camera_world: Tensor) -> NDArray[np.float64]:
-    """The rigid motion (4, 4) nearest to a pose. Raises ValueError where that is far."""
+    """Rigid motion (4, 4) nearest to a pose. Raises ValueError if it deviates by more than `MAX_DRIFT`."""
     T = T_camera_world.detach().cpu().numpy().astype(np.float64)
     rigid = orthonormalised(T)
     rigid[3] = 0.0, 0.0, 0.0, 1.0
@@ -144,9 +163,11 @@ def _rigid(T_camera_world: Tensor) -> NDArray[np.float64]:
 
 
 class _Rasterizer:
-    """The fields of one type and SH degree, of images up to a size.
+    """The fields for one type, SH degree and maximum image size.
 
-    owner: the program that they are fields of. drawn: counts the pictures, of which the last one stands.
+    Attributes:
+        owner: Taichi program that owns the fields.
+        drawn: Number of images rendered so far. Only the last one is stored.
     """
 
     def __init__(self, degree: int, kind: torch.dtype, width: int, height: int) -> None:
@@ -170,7 +191,7 @@ _rasterizers: list[_Rasterizer] = []
 
 
 def _rasterizer(kind: torch.dtype, sh_count: int, camera: PinholeCamera) -> _Rasterizer:
-    """The one that is there for this, or a new one, of the sizes that image buffers have in any case."""
+    """Return an existing rasterizer that fits, or a new one with the size rounded up as `ImageBuffers` does."""
     if any(rasterizer.owner is not program() for rasterizer in _rasterizers):
         _rasterizers.clear()
     degree = int(np.sqrt(sh_count)) - 1
@@ -209,7 +230,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         rasterizer = ctx.rasterizer
-        # Another picture may have been drawn since, or Taichi been started anew.
+        # Another image may have been rendered since, or Taichi restarted.
         if rasterizer.owner is not program() or rasterizer.drawn != ctx.drawn:
             rasterizer = _draw(ctx, inputs)
         with_depth = gradients[1] is not None
@@ -235,10 +256,10 @@ def _draw(ctx, inputs: list[Tensor]) -> _Rasterizer:
 
 
 def _pose_gradient(tangent: NDArray[np.float64], T: NDArray[np.float64], like: Tensor) -> Tensor:
-    """d loss / d T (4, 4) from that by the tangent (6,) on the left of T.
+    """d loss / d T (4, 4) from the gradient (6,) with respect to the tangent on the left of T.
 
-    T enters by its nearest rigid motion, whose derivative projects dR onto the tangents [omega]x R. G is the one
-    tangent itself with <G, d(exp(xi) T)> = tangent . xi for every xi.
+    T is replaced by its nearest rigid motion, whose derivative projects dR onto the tangents [omega]x R. G is the
+    unique tangent with <G, d(exp(xi) T)> = tangent . xi for every xi.
     """
     G = np.zeros((4, 4))
     G[:3, 3] = tangent[:3]

@@ -1,4 +1,4 @@
-"""`Renderer`: a view of the map as colour, depth and opacity, and the way back to gradients."""
+"""`Renderer`: differentiable rendering of colour, depth and opacity."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,32 +33,46 @@ DEVICE_STAGES = (DeviceProjection, DeviceBinning, DeviceCompositing, DevicePhoto
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A picture on the host: colour (H, W, 3) not clipped, depth (H, W) as the weighted sum of z, opacity (H, W)."""
+    """A rendered view on the host.
+
+    Attributes:
+        colour: Colour (H, W, 3), not clipped.
+        depth: Depth (H, W) as the weighted sum of z, not divided by opacity.
+        opacity: Opacity (H, W).
+    """
 
     colour: np.ndarray
     depth: np.ndarray
     opacity: np.ndarray
 
     def expected_depth(self, min_opacity: float = 0.5) -> np.ndarray:
-        """Depth (H, W) divided by opacity; 0 where the map is thinner than `min_opacity`."""
+        """Return the depth (H, W) divided by opacity; 0 where the opacity is below `min_opacity`."""
         return np.where(self.opacity >= min_opacity, self.depth / np.maximum(self.opacity, 1e-6), 0.0)
 
 
 class Renderer:
-    """Differentiable renderer of one `GaussianField`.
+    """Differentiable renderer of one `GaussianField`, for images of any size up to a maximum.
 
-    `forward` leaves the picture in `images`; after a loss has filled `images.colour_grad`, `backward` adds the
-    gradients of the Gaussians to their fields and returns the camera's. Images of any size up to the given one.
+    `forward` renders into `images`. After a loss has filled `images.colour_grad`, `backward` adds the gradients of the
+    Gaussians to their fields; `camera_gradient` then returns the gradient of the pose.
 
-    image_cache_gb: device memory for copies of the images compared with, on a GPU.
-    view_renders: views rendered and differentiated so far, the measure of work that the modes are compared at.
+    Args:
+        gaussians: The Gaussians.
+        max_width: Largest image width [px].
+        max_height: Largest image height [px].
+        image_cache_gb: Device memory for copies of reference images, on a GPU [GiB].
+
+    Attributes:
+        images: Image buffers.
+        view_renders: Number of views rendered and differentiated so far, the measure of work in comparisons of the
+            online and offline modes.
     """
 
     def __init__(self, gaussians: GaussianField, max_width: int, max_height: int, image_cache_gb: float = 2.0) -> None:
         real = gaussians.real
         self.gaussians = gaussians
-        # One SNode tree for all that compositing reads and writes: with two, Taichi fetches the trees' roots at every
-        # pixel and LLVM cannot vectorise the inner loop (measured: six times slower).
+        # One SNode tree for everything that compositing reads and writes. With two, Taichi fetches the trees' roots at
+        # every pixel, and LLVM cannot vectorise the inner loop (measured: six times slower).
         builder = ti.FieldsBuilder()
         self.view = ViewField(builder, real)
         self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
@@ -77,10 +91,14 @@ class Renderer:
         self.view_renders = 0
 
     def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float, exact: bool = True) -> None:
-        """Render into `images`. near: depth [scene units] below which nothing is drawn.
+        """Render a view into `images`.
 
-        exact: on a GPU, wait until it is known how much is drawn. Steps of an optimisation do not; where a view has far
-        more to draw than those before it, it loses the farthest once.
+        Args:
+            camera: Intrinsics and image size.
+            T_camera_world: Pose (4, 4).
+            near: Depth below which nothing is drawn [scene units].
+            exact: On a GPU, wait for the number of tile pairs. Optimisation steps do not wait; if a view has far more
+                pairs than the views before it, its farthest pairs are dropped once.
         """
         self.images.resize(camera.width, camera.height)
         self.view.set(camera, T_camera_world, near)
@@ -90,18 +108,23 @@ class Renderer:
         self.develop(None, None)
 
     def develop(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
-        """Develop the rendered picture into a photograph with this exposure (3, 4) and vignette (H, W, 3).
+        """Apply exposure and vignette to the rendered image.
 
-        None stands for the identity.
+        Args:
+            exposure: Exposure (A, b) (3, 4); None for the identity.
+            vignette: Vignette (H, W, 3); None for no vignetting.
         """
         self.photometric_model.forward(exposure, vignette)
 
     def backward(
         self, with_depth: bool = False, observe: Callable[[ProjectedGaussians, ViewField], None] | None = None
     ) -> None:
-        """Add d loss / d Gaussian to the gradients of the Gaussians, for the view that was rendered last.
+        """Add d loss / d Gaussian to the gradients of the Gaussians, for the last rendered view.
 
-        observe: called while the gradients in the image stand; projection's backward uses them up.
+        Args:
+            with_depth: Also propagate `images.depth_grad`.
+            observe: Called with the gradients of the projected Gaussians, before projection's backward pass overwrites
+                them.
         """
         self.photometric_model.backward()
         self.compositing.backward(with_depth)
@@ -111,19 +134,19 @@ class Renderer:
         self.view_renders += 1
 
     def camera_gradient(self) -> np.ndarray:
-        """d loss / d xi (6,) of the T_camera_world that was rendered last, after `backward`."""
+        """Return d loss / d xi (6,) of the last rendered T_camera_world. Call it after `backward`."""
         return self.projection.camera_gradient()
 
     def async_camera_gradient(self) -> AsyncReadback:
-        """The same, on its way to the host, which need not wait."""
+        """Return `camera_gradient` as an asynchronous copy, without waiting for the device."""
         return self.projection.async_camera_gradient()
 
     def exposure_gradient(self) -> np.ndarray:
-        """d loss / d exposure (3, 4) of the picture that was developed last, after `backward`."""
+        """Return d loss / d exposure (3, 4) of the last rendered image. Call it after `backward`."""
         return self.photometric_model.exposure_gradient()
 
     def async_exposure_gradient(self) -> AsyncReadback:
-        """The same, on its way to the host, which need not wait."""
+        """Return `exposure_gradient` as an asynchronous copy, without waiting for the device."""
         return self.photometric_model.async_exposure_gradient()
 
     def render(
@@ -133,7 +156,17 @@ class Renderer:
         near: float,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> RenderedView:
-        """Render and bring the picture to the host."""
+        """Render a view and copy it to the host.
+
+        Args:
+            camera: Intrinsics and image size.
+            T_camera_world: Pose (4, 4).
+            near: Depth below which nothing is drawn [scene units].
+            background: Colour where no Gaussian is drawn.
+
+        Returns:
+            Colour, depth and opacity.
+        """
         self.images.background[None] = ti.Vector(background)
         self.forward(camera, T_camera_world, near)
         self.images.background[None] = ti.Vector((0.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS files."""
+"""Real spherical harmonics up to degree 3, with the order and signs of 3DGS files."""
 
 from functools import lru_cache
 
@@ -10,7 +10,7 @@ from fields.map.gaussians import SH_C0
 
 __all__ = ["evaluate_sh", "sh_basis", "sh_rotation"]
 
-# Directions by which the effect of a rotation is told; more than the 16 harmonics.
+# Number of directions in the fit of a rotation matrix, more than the 16 harmonics.
 DIRECTIONS = 64
 
 
@@ -45,10 +45,10 @@ def _band3(sh: ti.template(), i, x, y, z):
 def evaluate_sh(degree: ti.template(), sh: ti.template(), i, d):
     """Sum of coefficients sh[i, k] (3) times the basis in the unit direction d (3,), without the offset of 0.5.
 
-    One expression a degree: a colour summed step by step would cost the reverse kernel a stack.
+    Each degree is a single expression, since an accumulated colour would need a stack in the reverse kernel.
     """
     x, y, z = d[0], d[1], d[2]
-    # Of the type of sh: a literal zero would make the bands float32 in a float64 render.
+    # A zero of the type of sh, since a literal would make the bands float32 in a float64 render.
     none = 0.0 * sh[i, 0]
     band1, band2, band3 = none, none, none
     if ti.static(degree >= 1):
@@ -61,7 +61,15 @@ def evaluate_sh(degree: ti.template(), sh: ti.template(), i, d):
 
 
 def sh_basis(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The harmonics (N, K) in unit directions (N, 3): the NumPy twin of `evaluate_sh`."""
+    """Evaluate the harmonics in NumPy, see `evaluate_sh`.
+
+    Args:
+        degree: Highest degree.
+        directions: Unit directions (N, 3).
+
+    Returns:
+        Basis functions (N, K), K = (degree + 1)^2.
+    """
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     bands = [
@@ -88,9 +96,17 @@ def sh_basis(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def sh_rotation(degree: int, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """M (K, K): coefficients M c show in the direction R d what c show in d, R (3, 3) the rotation.
+    """Matrix that rotates coefficients of the harmonics.
 
-    The bands are closed under rotation, so that a least-squares fit over enough directions is exact.
+    The coefficients M c have the same value in direction R d as c in direction d. Since the bands are closed under
+    rotation, a least-squares fit over enough directions is exact.
+
+    Args:
+        degree: Highest degree.
+        rotation: Rotation R (3, 3).
+
+    Returns:
+        M (K, K), K = (degree + 1)^2.
     """
     directions, inverse = _fit(degree)
     M = inverse @ sh_basis(degree, directions @ rotation)
@@ -100,7 +116,7 @@ def sh_rotation(degree: int, rotation: NDArray[np.float64]) -> NDArray[np.float6
 
 @lru_cache(maxsize=4)
 def _fit(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions (N, 3) all around, and the pseudo-inverse (K, N) of the harmonics in them."""
+    """Directions (N, 3) that cover the sphere, and the pseudo-inverse (K, N) of the harmonics in them."""
     i = np.arange(DIRECTIONS) + 0.5
     z, angle = 1.0 - 2.0 * i / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * i
     radius = np.sqrt(1.0 - z * z)

@@ -1,1 +1,1 @@
-"""Which frames become keyframes, which of those a step looks at, and which frames must not touch the map."""
+"""Selection: which frames reach the map, which become keyframes, and which keyframes a step optimises."""

@@ -1,4 +1,4 @@
-"""The gate: frames that must not touch the map, because their image or their pose cannot be right."""
+"""The frame gate: rejects frames whose image or pose is implausible before they reach the map."""
 
 from __future__ import annotations
 
@@ -19,22 +19,27 @@ from pipelines.settings import GateSettings
 
 __all__ = ["FrameGate"]
 
-# Every how many pixels an image is looked at: a lens cap and a repeated picture are seen anywhere.
+# Pixel stride of the checks on the image. A covered lens or a repeated image shows at any resolution.
 STRIDE = 4
-# Frames whose motion tells what is usual, and how many there must be.
+# The usual motion is the median over the last `REMEMBERED` frames, once there are `LEAST`.
 REMEMBERED, LEAST = 15, 5
-# Shorter side [px] of the pyramid level on which the map is asked.
+# Minimum shorter side [px] of the pyramid level that is compared with the map.
 ASKED_SIDE = 60
 
 
 class FrameGate:
-    """Refuses single frames in the midst of a stream.
+    """Rejects single implausible frames of a stream.
 
-    `blank`: the image shows nothing. `repeated`: it is that of the frame before, to the bit. `jumped`: the camera is
-    said to have moved far more than usual since both the last frame and the last accepted one, and the map looks less
-    like the image from there than from where the camera was. A camera that does go elsewhere loses one frame at most.
+    A frame is rejected for one of three reasons:
 
-    refused: how many, by reason.
+    - `blank`: the valid pixels have almost no contrast.
+    - `repeated`: the image equals that of the previous frame, while the pose differs.
+    - `jumped`: the camera moved far more than usual since both the previous and the last accepted frame, and the
+      render of the map at the new pose matches the image less well than the render at the last accepted pose. A
+      camera that does move elsewhere loses at most one frame.
+
+    Attributes:
+        refused: Number of rejected frames by reason.
     """
 
     def __init__(self, settings: GateSettings) -> None:
@@ -46,9 +51,16 @@ class FrameGate:
         self._motions: deque[float] = deque(maxlen=REMEMBERED)
 
     def refuses(self, frame: TrackedFrame, last: Keyframe | None, renderer: Renderer, near: float) -> str | None:
-        """Why `frame` must not touch the map; None where it may.
+        """Return why `frame` is rejected. Overwrites the renderer's images.
 
-        last: the latest keyframe. near: depth below which nothing is drawn. Overwrites the renderer's images.
+        Args:
+            frame: The frame to check.
+            last: The latest keyframe; None if there is none.
+            renderer: Renderer of the map.
+            near: Depth below which nothing is drawn [scene units].
+
+        Returns:
+            `"blank"`, `"repeated"` or `"jumped"`; None if the frame is accepted.
         """
         if not self.settings.enabled:
             return None
@@ -82,18 +94,18 @@ class FrameGate:
         return None
 
     def _map_disagrees(self, frame: TrackedFrame, last: Keyframe, renderer: Renderer, near: float) -> bool:
-        """Whether the image looks more like the map from the last accepted pose than from where it is said to be."""
+        """Whether the image matches the map better from the last accepted pose than from the frame's own pose."""
         level = next((image for image in frame.pyramid[::-1] if _side(image.camera) >= ASKED_SIDE), frame.pyramid[0])
         image, valid = level.rgba[..., :3] / 255.0, level.rgba[..., 3] > 0
         errors = []
-        # Refinement has moved the last keyframe's pose against the tracker's; the frame's would be moved alike.
+        # The last keyframe's refinement is applied to both tracked poses, as it would be to a new keyframe.
         for T in (self._accepted[1], frame.T_camera_world):
             renderer.forward(level.camera, last.correction @ T, near)
             errors.append(float(np.abs(renderer.images.colour_to_numpy() - image)[valid].mean()))
         return errors[0] < errors[1]
 
     def correct(self, motion: WorldMotion) -> None:
-        """The tracker has revised its poses: those of the frames before as well."""
+        """Apply a tracker's correction to the poses of the previous and the last accepted frame."""
         self._seen, self._accepted = (
             None if before is None else (before[0], motion.of(*before)[0]) for before in (self._seen, self._accepted)
         )
@@ -101,7 +113,7 @@ class FrameGate:
     # ---- snapshots -------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """What JSON can hold of it, for `restore`."""
+        """Return the state as JSON-compatible values, for `restore`."""
         before = [None if b is None else [b[0], b[1].tolist()] for b in (self._seen, self._accepted)]
         return {
             "refused": dict(self.refused),
@@ -111,7 +123,7 @@ class FrameGate:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Become what `state` was taken of."""
+        """Restore the result of `state`."""
         self.refused |= {name: int(count) for name, count in state["refused"].items()}
         self._picture = int(state["picture"])
         self._seen, self._accepted = (None if b is None else (int(b[0]), np.array(b[1])) for b in state["before"])
@@ -119,7 +131,7 @@ class FrameGate:
 
 
 def _motion(W: NDArray[np.float64], before: tuple[int, NDArray[np.float64]], frame: TrackedFrame) -> float:
-    """By how many pixels a frame the image has moved since then."""
+    """Image motion [px per frame] from the earlier pose `before` = (index, T_camera_world) to `frame`."""
     moved = np.linalg.solve(W, log_se3(frame.T_camera_world @ inverse_se3(before[1])))
     return float(np.linalg.norm(moved)) / max(frame.index - before[0], 1)
 

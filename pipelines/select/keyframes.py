@@ -20,7 +20,13 @@ __all__ = ["KeyframeSelector", "SeenPoints", "covisibility"]
 
 @dataclass(frozen=True)
 class SeenPoints:
-    """A view reduced to what covisibility needs: its camera, T_camera_world (4, 4) and tracked points (N, 3)."""
+    """The part of a view that covisibility depends on.
+
+    Attributes:
+        camera: Camera of the view.
+        T_camera_world: Pose (4, 4).
+        xyz: Tracked points (N, 3) in the world frame.
+    """
 
     camera: PinholeCamera
     T_camera_world: NDArray[np.float64]
@@ -28,24 +34,29 @@ class SeenPoints:
 
     @classmethod
     def of(cls, view: TrackedFrame | Keyframe) -> SeenPoints:
+        """Take the camera, pose and points of a frame or keyframe."""
         return cls(view.camera, view.T_camera_world, view.points.xyz)
 
     @property
     def farthest(self) -> float:
-        """Depth of the farthest tracked point."""
+        """Depth of the farthest tracked point [scene units]."""
         return float((self.xyz @ self.T_camera_world[2, :3]).max() + self.T_camera_world[2, 3])
 
     def count(self, xyz: NDArray[np.float64]) -> int:
-        """How many of the world points (N, 3) lie inside the view and no farther than its own farthest one."""
+        """Count the world points (N, 3) that lie in the image and no deeper than `farthest`."""
         p = xyz @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
         p = p[(p[:, 2] > 0) & (p[:, 2] <= self.farthest)]
         return int(np.count_nonzero(self.camera.contains(self.camera.project(p))))
 
 
 def covisibility(a: SeenPoints, b: SeenPoints) -> float:
-    """Overlap of two views in [0, 1]: m / (m + only in a + only in b), m the mean count of points seen in both.
+    """Overlap of two views in [0, 1] (Section 3.3.1).
 
-    0.1 where either has no points.
+    The overlap is m / (m + only_a + only_b). m is the mean of the number of a's points that b sees and the number of
+    b's points that a sees; only_a and only_b count the points that the other view does not see.
+
+    Returns:
+        The overlap; 0.1 if either view has no points.
     """
     if len(a.xyz) == 0 or len(b.xyz) == 0:
         return 0.1
@@ -56,19 +67,20 @@ def covisibility(a: SeenPoints, b: SeenPoints) -> float:
 
 
 class KeyframeSelector:
-    """Decides frame by frame.
+    """Decides for each frame whether it becomes a keyframe.
 
-    The paper takes a frame that turned more than 10 degrees since the one before for blurred. Here it must look so as
-    well: a collection of photographs turns as it likes, and what only a rejected one shows would be missing.
+    The paper rejects every frame that turned by more than 10 degrees since the previous one, as blurred. Here such a
+    frame is rejected only if its image is blurred as well. In a collection of photographs, large rotations between
+    sharp images are common, and rejecting them would leave parts of the scene unmapped.
     """
 
     def __init__(self, settings: KeyframeSettings) -> None:
         self.settings = settings
-        # Index and tracked T_camera_world of the frame before.
+        # Index and tracked T_camera_world of the previous frame.
         self.previous: tuple[int, NDArray[np.float64]] | None = None
 
     def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
-        """Whether `frame` becomes a keyframe, `last` being the latest one."""
+        """Whether `frame` becomes a keyframe, given the latest keyframe `last`. Call it once per frame, in order."""
         previous, self.previous = self.previous, (frame.index, frame.T_camera_world)
         if len(frame.points) < self.settings.min_points:
             return False
@@ -84,7 +96,7 @@ class KeyframeSelector:
         return covisibility(SeenPoints.of(frame), SeenPoints.of(last)) < self.settings.covisibility
 
     def correct(self, motion: WorldMotion) -> None:
-        """The tracker has revised its poses: that of the latest frame as well."""
+        """Apply a tracker's correction to the pose of the previous frame."""
         if self.previous is not None:
             index, T = self.previous
             self.previous = index, motion.of(index, T)[0]
@@ -94,12 +106,12 @@ class KeyframeSelector:
 
 
 def rotation_per_frame(index: int, T_camera_world: NDArray[np.float64], frame: TrackedFrame) -> float:
-    """Degrees that the camera turned from frame `index`, taken there, to a later `frame`, per frame between them."""
+    """Rotation [degrees per frame] from frame `index` at `T_camera_world` (4, 4) to a later `frame`."""
     R = frame.T_camera_world[:3, :3] @ T_camera_world[:3, :3].T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0)))
     return float(angle) / max(frame.index - index, 1)
 
 
 def camera_centre(T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Position (3,) of a camera in the world."""
+    """Camera centre (3,) in the world frame."""
     return inverse_se3(T_camera_world)[:3, 3]

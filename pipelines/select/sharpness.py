@@ -1,4 +1,4 @@
-"""How sharp a picture is, whatever it shows: tells motion blur from mere motion."""
+"""Image sharpness, independent of the image content, for the detection of motion blur."""
 
 from __future__ import annotations
 
@@ -10,11 +10,17 @@ __all__ = ["sharpness"]
 
 
 def sharpness(rgb: NDArray[np.uint8]) -> float:
-    """Detail of the picture (H, W, 3 or more) relative to that of itself at half the size, where it is least.
+    """Ratio of the detail of an image to the detail of its half-size version.
 
-    Detail is the mean absolute second difference along rows, columns or a diagonal, and the least of the four counts:
-    motion blurs along one line only. Some 0.5 to 0.7 for a photograph, a quarter less for one that is smeared over two
-    pixels. 0 for a picture without any detail, or of less than 6 pixels a side.
+    Detail is the mean absolute second difference along rows, columns and both diagonals. The smallest of the four
+    ratios is used, because motion blurs along one direction only.
+
+    Args:
+        rgb: Image (H, W, 3 or more channels).
+
+    Returns:
+        About 0.5 to 0.7 for a photograph, and a quarter less after a blur over two pixels. 0 for an image without any
+        detail or with a side shorter than 6 pixels.
     """
     if min(rgb.shape[:2]) < 6:
         return 0.0

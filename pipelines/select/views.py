@@ -1,4 +1,4 @@
-"""Which keyframes an optimisation step looks at: the current one, local ones and global ones (Section 3.3.2)."""
+"""View selection: the current, local and global keyframes of an optimisation step (Section 3.3.2)."""
 
 from __future__ import annotations
 
@@ -14,27 +14,31 @@ __all__ = ["LocalGlobalViews", "ViewSelection", "global_probabilities"]
 
 
 class ViewSelection(Protocol):
-    """A policy that names the views of a step."""
+    """Protocol of a policy that selects the views of an optimisation step."""
 
     def begin(self, store: KeyframeStore) -> None:
-        """A new keyframe, the last of `store`, is about to be optimised."""
+        """Called before the steps on a new keyframe, which is the last of `store`."""
 
     def select(self, store: KeyframeStore) -> list[int]:
-        """Indices into `store` of the views of the next step, the current keyframe first."""
+        """Return the indices into `store` of the views of the next step, the current keyframe first."""
 
 
 def global_probabilities(store: KeyframeStore, error_weight: float, recency_weight: float) -> np.ndarray:
-    """Eq. 2: p(j) ~ exp(error_weight err(j)) exp(recency_weight (j - last)) over all keyframes (N,)."""
+    """Probabilities (N,) of all keyframes in the draw of global views (Eq. 2).
+
+    p(j) is proportional to exp(error_weight err(j)) exp(recency_weight (j - last)).
+    """
     exponent = error_weight * store.errors() + recency_weight * (np.arange(len(store)) - (len(store) - 1))
     p = np.exp(exponent - exponent.max())
     return p / p.sum()
 
 
 class LocalGlobalViews:
-    """1 current + `local_views` from the bank of latest keyframes + `global_views` from all of them.
+    """Selects the current keyframe, up to `local_views` recent ones and `global_views` from all keyframes.
 
-    The bank holds the latest keyframes before the current one; its draw is in proportion to their covisibility with
-    the current view. Global views are drawn by Eq. 2, anew at every step.
+    Local views come from a bank of the latest keyframes before the current one. They are drawn without replacement,
+    in proportion to their covisibility with the current view. Global views are drawn by Eq. 2. Both draws are repeated
+    at every step.
     """
 
     def __init__(self, settings: ViewSettings, rng: np.random.Generator) -> None:

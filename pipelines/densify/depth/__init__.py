@@ -1,4 +1,4 @@
-"""Depth of pixels that no tracked point covers: one Protocol, several sources, and their fusion."""
+"""Depth estimation at pixels without a tracked point: a protocol, several sources, and their fusion."""
 
 from pipelines.densify.depth.depthcov import DepthCov
 from pipelines.densify.depth.depthcov_checkpoint import load_depthcov

@@ -1,4 +1,4 @@
-"""Kernels of Gaussian processes over the image plane, in torch."""
+"""Covariance functions of Gaussian processes over the image plane, in PyTorch."""
 
 from __future__ import annotations
 
@@ -11,17 +11,26 @@ EPSILON = 1e-8
 
 
 def matern32(distance: torch.Tensor) -> torch.Tensor:
-    """Matern 3/2 correlation of distances in units of the length scale."""
+    """Matern 3/2 correlation at `distance`, in units of the length scale."""
     r = np.sqrt(3.0) * distance
     return (1.0 + r) * torch.exp(-r)
 
 
 def nonstationary_matern32(p: torch.Tensor, E: torch.Tensor, q: torch.Tensor, F: torch.Tensor) -> torch.Tensor:
-    """Correlation (N, M) of places p (N, 2) and q (M, 2) with covariances E (N, 3), F (M, 3) as (xx, xy, yy).
+    """Correlation of a non-stationary Matern 3/2 process [Paciorek 2003; Dexheimer 2023].
 
-    C (1 + r) exp(-r) with S = E + F, Q = d' S^-1 d / 2, r = sqrt(3 (Q + eps)), C = 2 (|E| |F|)^(1/4) / sqrt(|S| + eps)
-    and eps = 1e-8 [Paciorek 2003; Dexheimer 2023]: where the covariances change little it is the Matern process that
-    they describe. The covariances must be positive definite, with their axes in the order of the places'.
+    The correlation is C (1 + r) exp(-r) with d = p - q, S = E + F, Q = d' S^-1 d / 2, r = sqrt(3 (Q + eps)),
+    C = 2 (|E| |F|)^(1/4) / sqrt(|S| + eps) and eps = 1e-8. Where the covariances vary slowly, it approaches the
+    stationary Matern process that they describe.
+
+    Args:
+        p: Points (N, 2).
+        E: Covariances (N, 3) at p as (xx, xy, yy), positive definite, with the axes of p.
+        q: Points (M, 2).
+        F: Covariances (M, 3) at q, likewise.
+
+    Returns:
+        Correlation (N, M).
     """
     d = p[:, None] - q[None]
     S = E[:, None] + F[None]
@@ -32,7 +41,7 @@ def nonstationary_matern32(p: torch.Tensor, E: torch.Tensor, q: torch.Tensor, F:
 
 
 def nonstationary_variance(E: torch.Tensor) -> torch.Tensor:
-    """The diagonal (N,) of `nonstationary_matern32`(p, E, p, E), which is 1 but for eps."""
+    """Diagonal (N,) of `nonstationary_matern32`(p, E, p, E), which is 1 except for eps."""
     det = _determinant(E)
     C = 2.0 * torch.sqrt(det) / torch.sqrt(4.0 * det + EPSILON)
     return C * matern32(torch.full_like(det, EPSILON).sqrt())

@@ -1,4 +1,4 @@
-"""DepthCov: a Gaussian process on log depth whose kernel a network reads off the image [Dexheimer 2023]."""
+"""DepthCov: a Gaussian process on log depth with a covariance predicted from the image [Dexheimer 2023]."""
 
 from __future__ import annotations
 
@@ -24,11 +24,16 @@ BASE_NOISE = 1e-2
 
 
 class DepthCov:
-    """The paper's depth of high-error pixels (Section 3.2.2): `load_depthcov` gives the weights.
+    """The paper's depth estimator for high-error pixels (Section 3.2.2).
 
-    The network runs once a call and sees the whole image, resized to the nearest multiples of 32: the process lives in
-    coordinates from -1 to 1 along each side, which resizing leaves alone and padding would not. The network's noise and
-    scale are as published, so that the deviations mean what they mean in the paper.
+    The network runs once per call on the whole image, resized to the nearest multiples of 32. The process is defined in
+    coordinates from -1 to 1 along each side, which resizing preserves and padding would not. Noise and scale are those
+    of the published weights, so that deviations are comparable with the paper's.
+
+    Args:
+        settings: Settings of the depth estimation.
+        weights: Result of `load_depthcov`.
+        rng: Random generator that selects the conditioning points.
     """
 
     def __init__(self, settings: DepthSettings, weights: DepthCovWeights, rng: np.random.Generator) -> None:
@@ -39,7 +44,7 @@ class DepthCov:
         self._rng = rng
 
     def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
-        """See `DepthEstimator`. Fewer than MIN_POINTS tracked points leave every pixel unknown."""
+        """See `DepthEstimator`. With fewer than `MIN_POINTS` tracked points, all depths are unknown."""
         places, z = conditioning_points(view, self.settings.max_points, self._rng)
         if len(z) < MIN_POINTS or len(pixels) == 0:
             return unknown_depth(len(pixels))
@@ -53,7 +58,14 @@ class DepthCov:
 
     @torch.inference_mode()
     def covariances(self, rgba: NDArray[np.uint8]) -> torch.Tensor:
-        """Covariances (1, 3, h, w) over (row, column) in [-1, 1]^2 of an image (H, W, 4); h, w multiples of 32."""
+        """Run the network on an image.
+
+        Args:
+            rgba: Image (H, W, 4).
+
+        Returns:
+            Covariances (1, 3, h, w) over (row, column) in [-1, 1]^2, with h and w multiples of 32.
+        """
         image = torch.from_numpy(rgba[..., :3] / np.float32(255.0)).permute(2, 0, 1)[None]
         size = [max(round(side / STRIDE), 1) * STRIDE for side in image.shape[2:]]
         image = functional.interpolate(image, size, mode="bilinear", align_corners=False)
@@ -61,7 +73,7 @@ class DepthCov:
 
 
 def _sampled(covariances: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Covariances (N, 3) float64 at places (N, 2) as (row, column) in [-1, 1], bilinear, reflected at the border."""
+    """Covariances (N, 3) float64 at points (N, 2) as (row, column) in [-1, 1]: bilinear, reflected at the border."""
     grid = places.flip(1)[None, None].to(covariances.dtype)  # (x, y)
     sampled = functional.grid_sample(covariances, grid, mode="bilinear", padding_mode="reflection", align_corners=False)
     return sampled[0, :, 0].T.double()

@@ -1,4 +1,4 @@
-"""The published checkpoint of DepthCov, which the user brings: every name and shape of it is checked."""
+"""Reading of the published DepthCov checkpoint, which the user provides. All names and shapes are checked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,13 @@ FINEST = FEATURE_LEVELS - 1
 
 @dataclass(frozen=True)
 class DepthCovWeights:
-    """The network with its weights, and the finest level's two numbers: logs of the process's scale and noise."""
+    """Weights of DepthCov.
+
+    Attributes:
+        network: Network with its weights.
+        log_scale: Logarithm of the scale of the process at the finest level.
+        log_noise: Logarithm of the noise of the process at the finest level.
+    """
 
     network: DepthCovNetwork
     log_scale: float
@@ -27,10 +33,17 @@ class DepthCovWeights:
 
 
 def load_depthcov(path: Path) -> DepthCovWeights:
-    """Read a checkpoint with the published 122 entries under `state_dict`, without running code of it.
+    """Read a checkpoint with the published 122 entries under `state_dict`, without running pickled code.
 
-    Raises ValueError (one line) that names the entry which is missing, unexpected or of another shape, and where the
-    three copies of a level's scale disagree.
+    Args:
+        path: The checkpoint.
+
+    Returns:
+        The weights.
+
+    Raises:
+        ValueError: If an entry is missing, unexpected or of another shape (the message names it), or if the three
+            copies of a level's scale disagree. The message is one line.
     """
     entries = read_checkpoint(path, "state_dict")
     network = DepthCovNetwork()
@@ -38,7 +51,7 @@ def load_depthcov(path: Path) -> DepthCovWeights:
     for level in range(FEATURE_LEVELS):
         for name in (_noise(level), *_scales(level)):
             shapes[name] = ()
-            # One number, written with or without an axis.
+            # A scalar may be stored with shape () or (1,).
             if name in entries and entries[name].shape == (1,):
                 entries[name] = entries[name][0]
     require_entries(path, entries, shapes)
@@ -52,7 +65,7 @@ def load_depthcov(path: Path) -> DepthCovWeights:
                 )
     network.load_state_dict({name.removeprefix(NETWORK): v for name, v in entries.items() if name.startswith(NETWORK)})
     network.requires_grad_(False).eval()
-    # Pixels with their channels side by side are a quarter quicker on a CPU.
+    # The channels-last layout is a quarter faster on a CPU.
     network.to(memory_format=torch.channels_last)
     return DepthCovWeights(network, float(entries[_scales(FINEST)[0]]), float(entries[_noise(FINEST)]))
 

@@ -1,4 +1,4 @@
-"""The network of DepthCov: from an image to the shape of the depth covariance around each of its pixels."""
+"""The network of DepthCov, which predicts the covariance parameters at each pixel of an image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import nn
 __all__ = ["DepthCovNetwork", "pixel_covariances"]
 
 LEVELS = 5
-# Image sides must be multiples of this: one halving a level.
+# Image sides must be multiples of this, since each level halves the size.
 STRIDE = 2**LEVELS
 FEATURE_LEVELS = 4
 BASE_CHANNELS = 16
@@ -22,10 +22,11 @@ MAX_CORRELATION = 0.99
 
 
 class DepthCovNetwork(nn.Module):
-    """U-Net of residual blocks; 106 tensors, 9,003,020 parameters, named as in the published state dict.
+    """U-Net of residual blocks with 106 tensors and 9,003,020 parameters, named as in the published state dict.
 
-    Takes RGB in [0, 1] (B, 3, H, W) with sides that are multiples of 32 and gives the three raw outputs (B, 3, H, W) of
-    the finest level, the one that the paper uses. The other levels' outputs have weights, but are not computed.
+    Takes RGB images (B, 3, H, W) in [0, 1] with sides that are multiples of 32. Returns the three raw outputs
+    (B, 3, H, W) of the finest level, which the paper uses. The outputs of the other levels have weights but are not
+    computed.
     """
 
     def __init__(self) -> None:
@@ -50,7 +51,7 @@ class DepthCovNetwork(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside a 1x1 one; both share one normalisation."""
+    """Two 3x3 convolutions with a 1x1 convolution as the shortcut. Both 3x3 convolutions share one normalisation."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
@@ -67,7 +68,7 @@ class ResidualBlock(nn.Module):
 
 
 class Down(nn.Module):
-    """Half the size, from `channels` to twice as many."""
+    """Halves the size and doubles the number of channels from `channels`."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -79,7 +80,7 @@ class Down(nn.Module):
 
 
 class Up(nn.Module):
-    """Twice the size, from twice `channels` to `channels`, with what the way down had there."""
+    """Doubles the size and halves the number of channels to `channels`, with a skip connection."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -94,9 +95,16 @@ class Up(nn.Module):
 
 
 def pixel_covariances(raw: torch.Tensor) -> torch.Tensor:
-    """Covariances (B, 3, H, W) as (rr, rc, cc) over (row, column) from the network's outputs (B, 3, H, W).
+    """Convert the network's outputs to covariances over (row, column).
 
-    Of the outputs a, b, c: rr = exp(a) and cc = exp(b), each within [1e-3, 1e4], rc = 0.99 tanh(c) sqrt(rr cc - 1e-8).
+    With the outputs (a, b, c): rr = exp(a) and cc = exp(b), each clamped to [1e-3, 1e4], and
+    rc = 0.99 tanh(c) sqrt(rr cc - 1e-8).
+
+    Args:
+        raw: Outputs of the network (B, 3, H, W).
+
+    Returns:
+        Covariances (B, 3, H, W) as (rr, rc, cc).
     """
     low, high = math.log(MIN_VARIANCE), math.log(MAX_VARIANCE)
     rr = torch.exp(raw[:, 0].clamp(low, high))

@@ -1,4 +1,4 @@
-"""Depth by search along epipolar lines in posed neighbour keyframes."""
+"""Depth from a search along epipolar lines in neighbouring keyframes."""
 
 from collections.abc import Sequence
 
@@ -16,40 +16,43 @@ from pipelines.settings import EpipolarSettings
 
 __all__ = ["EpipolarDepth"]
 
-# Of the compared patches [px].
+# Radius of the compared patches [px].
 RADIUS = 3
 SIDE = 2 * RADIUS + 1
 PATCH = SIDE * SIDE
-# A patch with less contrast (standard deviation of grey in [0, 1]) has nothing to match.
+# Minimum contrast of a patch that can be matched: standard deviation of grey in [0, 1].
 MIN_CONTRAST = 0.012
-# A thread takes eight pixels at a time.
+# Eight pixels per chunk, see `fields.runtime.parallel`.
 SPREAD = HANDED_OUT // 8
-# Score where a patch leaves an image.
+# Score of a patch that leaves the image.
 OUTSIDE = -2.0
 
 
 @ti.data_oriented
 class EpipolarDepth:
-    """Zero-mean normalised cross correlation (ZNCC) over samples of inverse depth, averaged over the neighbours.
+    """Depth by zero-mean normalised cross-correlation (ZNCC) over inverse depth, averaged over the neighbours.
 
-    A patch is carried over at one depth, to first order, so that turned and scaled views match. A sample is given up
-    as soon as the neighbours to come cannot make a match of it. The best is refined by a parabola; matches that are
-    weak, at the end of the range, or nearly as good elsewhere are given up. The deviation follows from how sharp the
-    peak is, in pixels of the neighbours.
+    Patches are warped at constant depth, to first order, so that rotated and scaled views match. The evaluation of a
+    sample stops early once the remaining neighbours cannot make it a match. The best sample is refined by a parabola.
+    Matches that are weak, at an end of the range, or ambiguous are rejected. The deviation is computed from the
+    sharpness of the peak and from `pixel_noise` in the neighbours.
+
+    Args:
+        settings: Settings of the search.
     """
 
     def __init__(self, settings: EpipolarSettings) -> None:
         self.settings = settings
 
     def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
-        """See `DepthEstimator`. The range searched is that of the view's tracked points, with a margin."""
+        """See `DepthEstimator`. Searches the depth range of the view's tracked points, with a margin."""
         _, z = point_depths(view)
         chosen = self._choose(view, neighbours)
         if len(z) < 3 or not chosen or len(pixels) == 0:
             return unknown_depth(len(pixels))
         near, far = np.percentile(z, [2, 98]) * [1 / 1.5, 1.5]
         warps = np.stack([self._warp(view, other) for other in chosen]).astype(np.float32)
-        # One sample a pixel along the longest epipolar line.
+        # One sample per pixel along the longest epipolar line.
         reach = max(np.linalg.norm(w[:2, 3]) for w in warps)
         samples = int(np.clip(np.ceil(reach * (1 / near - 1 / far)), 8, self.settings.max_samples))
         inverse = np.linspace(1 / far, 1 / near, samples)
@@ -64,14 +67,14 @@ class EpipolarDepth:
         scores = np.empty((len(pixels), samples), dtype=np.float32)
         everywhere = np.zeros(len(pixels), dtype=np.int32)
         self._score(*images, everywhere, self.settings.min_score - self.settings.min_lead, scores)
-        # What was left off as hopeless may lie beside a peak, whose form it is part of.
+        # Samples next to a peak may have been stopped early, but its shape depends on their exact scores.
         best = np.clip(scores.argmax(axis=1), 1, samples - 2)
         peak = np.empty((len(pixels), 3), dtype=np.float32)
         self._score(*images, (best - 1).astype(np.int32), OUTSIDE, peak)
         return self._peaks(scores, peak, inverse, reach)
 
     def _choose(self, view: Keyframe, neighbours: Sequence[Keyframe]) -> list[Keyframe]:
-        """The neighbours whose parallax is nearest to the wanted one, of those that look the same way."""
+        """Neighbours with a similar viewing direction, by the closeness of their parallax to the preferred one."""
         T_world_view = inverse_se3(view.T_camera_world)
         rated = []
         for k in neighbours:
@@ -83,7 +86,7 @@ class EpipolarDepth:
 
     @staticmethod
     def _warp(view: Keyframe, other: Keyframe) -> NDArray[np.float64]:
-        """(3, 4) [A b]: pixel (x, y) at inverse depth w is seen at A (x, y, 1) + w b, homogeneous, in `other`."""
+        """[A b] (3, 4): pixel (x, y) at inverse depth w is seen in `other` at A (x, y, 1) + w b, homogeneous."""
         T = other.T_camera_world @ inverse_se3(view.T_camera_world)
         K, K_other = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1.0]]) for c in (view.camera, other.camera))
         return np.concatenate([K_other @ T[:3, :3] @ np.linalg.inv(K), (K_other @ T[:3, 3])[:, None]], axis=1)
@@ -91,7 +94,7 @@ class EpipolarDepth:
     def _peaks(
         self, scores: NDArray[np.float32], peak: NDArray[np.float32], inverse: NDArray[np.float64], reach: float
     ) -> DepthEstimate:
-        """scores: (N, samples), too low where there is no match. peak: (N, 3) around the best of the inner samples."""
+        """Depths at the peaks of `scores` (N, samples). `peak` (N, 3): exact scores around the best inner sample."""
         samples = len(inverse)
         best = scores.argmax(axis=1)
         inner = np.clip(best, 1, samples - 2)
@@ -109,7 +112,7 @@ class EpipolarDepth:
         )
         step = inverse[1] - inverse[0]
         at = inverse[inner] + offset * step
-        # Half a height of noise (1 - score) moves the peak of a parabola by sqrt(noise / curvature) samples.
+        # A noise of (1 - score) / 2 moves the peak of a parabola by sqrt((1 - score) / curvature) samples.
         spread = step * np.sqrt((1.01 - np.minimum(top, 1.0)) / curvature) + self.settings.pixel_noise / reach
         return DepthEstimate(1 / at, np.where(good, spread / at, np.inf))
 
@@ -126,9 +129,10 @@ class EpipolarDepth:
         floor: ti.f32,
         scores: ti.types.ndarray(dtype=ti.f32, ndim=2),
     ):
-        """Scores of consecutive samples of each pixel, from its `first`; below `floor` an upper bound will do."""
+        """Scores of consecutive samples of each pixel, from its `first`; below `floor`, upper bounds of them."""
         if ti.static(on_gpu()):
-            # A thread a sample, which sums the patch anew: a quarter more work, in a hundred times as many threads.
+            # One thread per sample, which recomputes the patch sums: a quarter more work for a hundred times the
+            # threads.
             samples = scores.shape[1]
             for i in range(pixels.shape[0] * samples):
                 n, s = i // samples, i % samples
@@ -176,7 +180,7 @@ class EpipolarDepth:
                     if score > OUTSIDE:
                         total += score
                         seen += 1
-                    # The neighbours to come may agree wholly, but not more.
+                    # Upper bound on the mean score: the remaining neighbours score at most 1 each.
                     more = warps.shape[0] - 1 - j
                     bound = ti.select(seen + more > 0, (total + more) / ti.max(seen + more, 1), OUTSIDE)
             scores[n, place] = bound
@@ -197,13 +201,13 @@ class EpipolarDepth:
         warps: ti.template(),
         pixels: ti.template(),
     ):
-        """ZNCC of a pixel's patch with neighbour j at inverse depth w; OUTSIDE where it leaves that image."""
+        """ZNCC of a pixel's patch with neighbour j at inverse depth w; OUTSIDE if it leaves that image."""
         right, bottom = grey.shape[1] - 1, grey.shape[0] - 1
         q = ti.Vector([0.0, 0.0, 0.0])
         for c in ti.static(range(3)):
             q[c] = warps[j, c, 0] * pixels[n, 0] + warps[j, c, 1] * pixels[n, 1] + warps[j, c, 2] + w * warps[j, c, 3]
         x, y = q[0] / q[2], q[1] / q[2]
-        # How the patch is turned and scaled, to first order: over three pixels the next is thousandths of one.
+        # First-order warp of the patch. Over three pixels, the second-order term is thousandths of a pixel.
         xx, xy = (warps[j, 0, 0] - x * warps[j, 2, 0]) / q[2], (warps[j, 0, 1] - x * warps[j, 2, 1]) / q[2]
         yx, yy = (warps[j, 1, 0] - y * warps[j, 2, 0]) / q[2], (warps[j, 1, 1] - y * warps[j, 2, 1]) / q[2]
         x, y = x - 0.5, y - 0.5
@@ -220,8 +224,8 @@ class EpipolarDepth:
                 u, v = px - x0, py - y0
                 above = others[j, y0, x0] * (1.0 - u) + others[j, y0, x0 + 1] * u
                 below = others[j, y0 + 1, x0] * (1.0 - u) + others[j, y0 + 1, x0 + 1] * u
-                # From the mean of the other patch: sums of squares of the values themselves would leave four digits of
-                # the variance, and a flat peak's parabola to rounding.
+                # Subtract the mean of the reference patch first. Sums of squares of the raw values would leave only
+                # four digits of the variance, and the parabola of a flat peak would be determined by rounding.
                 there = above * (1.0 - v) + below * v - mean
                 sum_ += there
                 square_ += there * there

@@ -1,4 +1,4 @@
-"""What every depth estimator takes and gives."""
+"""The interface of depth estimators."""
 
 from __future__ import annotations
 
@@ -16,26 +16,40 @@ __all__ = ["DepthEstimate", "DepthEstimator", "point_depths", "unknown_depth"]
 
 @dataclass(frozen=True)
 class DepthEstimate:
-    """depth (N,) [scene units] and the standard deviation of its logarithm (N,), of N pixels; inf where unknown."""
+    """Estimated depth of N pixels.
+
+    Attributes:
+        depth: Depth (N,) [scene units].
+        deviation: Standard deviation (N,) of log depth; inf where the depth is unknown.
+    """
 
     depth: NDArray[np.float64]
     deviation: NDArray[np.float64]
 
 
 class DepthEstimator(Protocol):
-    """Estimates depth where it is asked for (Section 3.2.2, high error regions)."""
+    """Protocol of a depth estimator for high-error pixels (Section 3.2.2)."""
 
     def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
-        """Depth of the pixels (N, 2) as (x, y) of `view`, which may be seen in the posed `neighbours` too."""
+        """Estimate the depth of pixels.
+
+        Args:
+            view: View of the pixels.
+            neighbours: Other keyframes with poses, which may show the same places.
+            pixels: Pixels (N, 2) of `view` as (x, y).
+
+        Returns:
+            Depth and deviation of each pixel.
+        """
 
 
 def unknown_depth(count: int) -> DepthEstimate:
-    """An estimate of `count` pixels that knows nothing."""
+    """Estimate in which the depth of all `count` pixels is unknown."""
     return DepthEstimate(np.ones(count), np.full(count, np.inf))
 
 
 def point_depths(view: Keyframe) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels (N, 2) and depths (N,) of the tracked points that lie before the camera and in the image."""
+    """Pixels (N, 2) and depths (N,) of the tracked points in front of the camera and inside the image."""
     z = view.points.depths(view.T_camera_world)
     usable = (z > 0) & view.camera.contains(view.points.pixels)
     return view.points.pixels[usable], z[usable]

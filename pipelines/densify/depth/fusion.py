@@ -14,10 +14,13 @@ __all__ = ["FusedDepth"]
 
 
 class FusedDepth:
-    """Mean of log depth over several estimators, each weighted by its inverse variance.
+    """Mean of log depth over several estimators, weighted by inverse variance.
 
-    Estimators that contradict one another by more than their deviations allow widen the fused one by the Birge ratio
-    [Birge 1932], so that a pixel on which they disagree stays uncertain.
+    If the estimators contradict one another by more than their deviations allow, the Birge ratio [Birge 1932] increases
+    the fused deviation, so that the pixel stays uncertain.
+
+    Args:
+        estimators: Estimators to fuse.
     """
 
     def __init__(self, estimators: Sequence[DepthEstimator]) -> None:
@@ -29,7 +32,7 @@ class FusedDepth:
         if not estimates:
             return unknown_depth(len(pixels))
         log_depth = np.log([e.depth for e in estimates])
-        # No source is so sure that another could not be heard.
+        # The floor on the deviation keeps one source from overruling all others.
         weight = 1.0 / np.square(np.maximum([e.deviation for e in estimates], 1e-4))
         total = weight.sum(axis=0)
         known = total > 0

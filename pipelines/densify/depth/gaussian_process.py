@@ -1,4 +1,4 @@
-"""Gaussian processes on the log depths of a view's tracked points: over the image plane, and following the image."""
+"""Gaussian processes on the log depths of a view's tracked points, over the image plane and guided by colour."""
 
 from __future__ import annotations
 
@@ -20,20 +20,24 @@ __all__ = ["GaussianProcessDepth", "ImageGuidedDepth"]
 
 
 class GaussianProcessDepth:
-    """Gaussian process on the log depths of a view's tracked points, with a constant (stationary) kernel.
+    """Gaussian process on the log depths of a view's tracked points, with a stationary kernel.
 
-    Matern 3/2 over the image plane in units of the larger image side. Length scale, signal and noise are those of
-    greatest marginal likelihood on the view's own points, over a small grid, so that the deviations mean something
-    in rooms and in landscapes alike.
+    The kernel is Matern 3/2 over the image plane, in units of the larger image side. Length scale and noise maximise
+    the marginal likelihood of the view's own points over a small grid, with the signal variance in closed form. The
+    deviations thus adapt to the scene, whether it is a room or a landscape.
+
+    Args:
+        settings: Settings of the depth estimation.
+        rng: Random generator that selects the conditioning points.
     """
 
     LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
-    # Difference of colour that weighs as much as a length scale of distance; infinite: colour does not count.
+    # Colour difference that is equivalent to one length scale of distance; with infinity, colour is ignored.
     COLOURS: tuple[float, ...] = (np.inf,)
     NOISE_RATIOS = (1e-3, 1e-2, 1e-1)
-    # Four numbers need no more points than this.
+    # Maximum number of points, approximately, in the fit of the four parameters.
     FIT_POINTS = 150
-    # What the process's deviation is multiplied by.
+    # Factor on the deviation of the process.
     CAUTION = 1.0
 
     def __init__(self, settings: DepthSettings, rng: np.random.Generator) -> None:
@@ -41,7 +45,7 @@ class GaussianProcessDepth:
         self._rng = rng
 
     def estimate(self, view: Keyframe, neighbours: Sequence[Keyframe], pixels: NDArray[np.float64]) -> DepthEstimate:
-        """See `DepthEstimator`. Fewer than MIN_POINTS tracked points leave every pixel unknown."""
+        """See `DepthEstimator`. With fewer than `MIN_POINTS` tracked points, all depths are unknown."""
         places, z = conditioning_points(view, self.settings.max_points, self._rng)
         if len(z) < MIN_POINTS or len(pixels) == 0:
             return unknown_depth(len(pixels))
@@ -55,7 +59,7 @@ class GaussianProcessDepth:
         return replace(estimate, deviation=self.CAUTION * estimate.deviation)
 
     def _features(self, view: Keyframe, pixels: NDArray[np.float64]) -> torch.Tensor:
-        """What the correlation of pixels (N, 2) depends on (N, 2 + c): place in larger image sides, then colour."""
+        """Features (N, 2 + c) of pixels (N, 2): position in units of the larger image side, then colour."""
         return torch.from_numpy(np.asarray(pixels, dtype=np.float64) / max(view.camera.width, view.camera.height))
 
     @staticmethod
@@ -63,7 +67,7 @@ class GaussianProcessDepth:
         return matern32(torch.cdist(*(torch.cat([f[:, :2] / length, f[:, 2:] / colour], dim=1) for f in (a, b))))
 
     def _fit(self, known: torch.Tensor, y: torch.Tensor) -> tuple[float, float, float, float]:
-        """(length, colour scale, noise / signal, signal variance) of greatest likelihood; the last in closed form."""
+        """(length, colour scale, noise / signal, signal variance) of maximum likelihood; the last in closed form."""
         n = len(y)
         best = (-np.inf, 0.0, 0.0, 0.0, 0.0)
         for length in self.LENGTHS:
@@ -80,17 +84,17 @@ class GaussianProcessDepth:
 
 
 class ImageGuidedDepth(GaussianProcessDepth):
-    """The same process over place and colour together: correlation is shorter across colour edges.
+    """Gaussian process over position and colour, whose correlation is shorter across colour edges.
 
-    Colours are those of the slightly blurred image, so that texture finer than a surface does not count. How much
-    they count is chosen by likelihood with the rest, down to not at all.
+    Colours are taken from a slightly blurred image, which suppresses fine texture. Their weight, which may be zero, is
+    chosen by likelihood together with the other parameters.
     """
 
     COLOURS = (np.inf, 0.5, 0.25, 0.125)
     # Standard deviation [px] of the blur.
     BLUR = 2.0
-    # A process is continuous and surfaces are not: against a depth sensor, 47 percent of the errors were within one
-    # deviation as it comes, 66 percent within twice that (a normal distribution: 68).
+    # The process is continuous, but surfaces are not. Against a depth sensor, 47 percent of the errors were within one
+    # deviation of the process, and 66 percent within two (a normal distribution has 68 percent within one).
     CAUTION = 2.0
 
     def _features(self, view: Keyframe, pixels: NDArray[np.float64]) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Regression of log depth on tracked points: what every Gaussian process of this package shares but its kernel."""
+"""Gaussian process regression of log depth on tracked points, for any kernel."""
 
 from __future__ import annotations
 
@@ -11,14 +11,23 @@ from pipelines.densify.depth.estimate import DepthEstimate, point_depths
 
 __all__ = ["MIN_POINTS", "conditioning_points", "regress_log_depth"]
 
-# The least that a process is conditioned on: fewer say nothing of the scene's shape.
+# Minimum number of points to condition a process on. Fewer contain no information about the shape of the scene.
 MIN_POINTS = 3
 
 
 def conditioning_points(
     view: Keyframe, max_points: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels (M, 2) and depths (M,) of the tracked points of `view`, of more than `max_points` a random choice."""
+    """Select tracked points to condition a process on.
+
+    Args:
+        view: The view.
+        max_points: Maximum number of points. If there are more, a random subset is used.
+        rng: Random generator.
+
+    Returns:
+        Pixels (M, 2) and depths (M,) of the points.
+    """
     places, z = point_depths(view)
     if len(z) > max_points:
         some = np.sort(rng.choice(len(z), max_points, replace=False))
@@ -33,11 +42,20 @@ def regress_log_depth(
     k: torch.Tensor,
     prior: torch.Tensor | float,
 ) -> DepthEstimate:
-    """Depth at N places from `depth` (M,) > 0 at M others, by the covariances of a process on log depth [float64].
+    """Predict depth at N points from M known depths, by the covariances of a process on log depth (float64).
 
-    K: (M, M) among the known places. noise: variance on its diagonal. k: (N, M) from asked to known. prior: variance
-    (N,) of the asked ones. With y the log depths and mu their mean (Section 3.2.2; Dexheimer 2023):
+    With y the known log depths and mu their mean (Section 3.2.2; Dexheimer 2023):
     mean = mu + k (K + noise I)^-1 (y - mu), variance = prior - diag(k (K + noise I)^-1 k'), depth = exp(mean).
+
+    Args:
+        depth: Known depths (M,), positive.
+        K: Covariance (M, M) of the known points.
+        noise: Noise variance of the known log depths.
+        k: Covariance (N, M) between the predicted and the known points.
+        prior: Prior variance of the predicted points, (N,) or a scalar.
+
+    Returns:
+        Depth (N,) and deviation (N,).
     """
     y = torch.from_numpy(np.log(depth))
     mu = y.mean()

@@ -1,4 +1,4 @@
-"""The depth estimators that the configuration names."""
+"""Construction of the depth estimators from the settings."""
 
 from __future__ import annotations
 
@@ -18,9 +18,16 @@ __all__ = ["build_depth"]
 
 
 def build_depth(settings: DepthSettings, renderer: Renderer, near: float, rng: np.random.Generator) -> DepthEstimator:
-    """The one estimator of `settings.sources`, or the fusion of several. near: as of `MapDepth`.
+    """Build the estimator of `settings.sources`, or the fusion of several.
 
-    Raises ValueError where DepthCov's checkpoint cannot be used.
+    Args:
+        settings: Settings of the depth estimation.
+        renderer: Renderer of the map.
+        near: Depth below which nothing is drawn [median depths of the view].
+        rng: Random generator.
+
+    Raises:
+        ValueError: If DepthCov's checkpoint cannot be used.
     """
     makers = {
         "constant": lambda: GaussianProcessDepth(settings, rng),

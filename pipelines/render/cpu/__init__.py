@@ -1,1 +1,1 @@
-"""The renderer's kernels for a CPU, which are also the reference for those in `pipelines/render/gpu`."""
+"""The renderer's CPU kernels, which are also the reference for those in `pipelines/render/gpu`."""

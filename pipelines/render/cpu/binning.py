@@ -1,7 +1,7 @@
-"""Binning: the tiles that every projected ellipse reaches, as lists sorted by tile and then by depth.
+"""Binning: lists of the (tile, Gaussian) pairs that overlap, sorted by tile and then by depth.
 
-A counting sort over (tile, chunk of slots): linear in the number of pairs, stable because chunks and the slots in
-them are taken in depth order, and the same for any number of threads.
+This is a counting sort over (tile, chunk of slots). It is linear in the number of pairs, stable because chunks and the
+slots in them are processed in depth order, and independent of the number of threads.
 """
 
 import numpy as np
@@ -17,22 +17,23 @@ from pipelines.render.cpu.projection import ALPHA_MIN
 __all__ = ["CHUNKS", "Binning", "ellipse_span"]
 
 CHUNKS = 16
-# A thread takes one chunk at a time.
+# One of these chunks per scheduling chunk, see `fields.runtime.parallel`.
 SPREAD = HANDED_OUT
-# Slack [px] around an ellipse, far above rounding and far below a pixel.
+# Margin around an ellipse [px], far above rounding errors and far below a pixel.
 SLACK = 0.01
 
 
 @ti.func
 def ellipse_span(b, c, per_c, det, limit, reach, top_at, low, high):
-    """Lowest and highest v on the ellipse a u^2 + 2 b u v + c v^2 <= limit with u in [low, high]; det = a c - b^2.
+    """Lowest and highest v on the ellipse a u^2 + 2 b u v + c v^2 <= limit with u in [low, high].
 
-    per_c: 1 / c. reach: the largest u. top_at: the u at which v is largest; it is smallest at its mirror image. They
-    are one Gaussian's, and known to its every tile. An empty range comes back with lowest > highest.
+    The remaining arguments are the same for all tiles of a Gaussian: per_c = 1 / c, det = a c - b^2, reach is the
+    largest u, and top_at is the u at which v is largest (v is smallest at -top_at). If the range is empty, the result
+    has lowest > highest.
     """
     low = ti.max(low, -reach)
     high = ti.min(high, reach)
-    # Where the extreme lies outside the range, the nearer end of the range.
+    # If the extremum lies outside the range, use the nearer end of the range.
     u_top = ti.min(ti.max(top_at, low), high)
     u_bottom = ti.min(ti.max(-top_at, low), high)
     top = (-b * u_top + ti.sqrt(ti.max(limit * c - det * u_top * u_top, 0.0))) * per_c
@@ -42,13 +43,13 @@ def ellipse_span(b, c, per_c, det, limit, reach, top_at, low, high):
 
 @ti.func
 def first_centre(x):
-    """Index of the first pixel whose centre lies at x or behind."""
+    """Index of the first pixel whose centre is at x or after it."""
     return ti.cast(ti.ceil(x - 0.5), ti.i32)
 
 
 @ti.func
 def last_centre(x):
-    """Index of the last pixel whose centre lies at x or before."""
+    """Index of the last pixel whose centre is at x or before it."""
     return ti.cast(ti.floor(x - 0.5), ti.i32)
 
 
@@ -67,7 +68,14 @@ class Binning:
         self._scatter = CompiledLoop(self._scatter_chunks, 50)
 
     def forward(self, exact: bool = True) -> int:
-        """Bin the projected Gaussians of the current view; return the number of pairs. Always exact, on the CPU."""
+        """Bin the projected Gaussians of the current view.
+
+        Args:
+            exact: Ignored on the CPU, where binning is always exact.
+
+        Returns:
+            Number of pairs.
+        """
         tiles_x = -(-self.view.width // self.tile_width)
         tiles_y = -(-self.view.height // self.tile_height)
         slots = self.projected.count
@@ -82,9 +90,9 @@ class Binning:
 
     @ti.func
     def _ellipse(self, s):
-        """Of slot s: a, b, c of its conic, their determinant, squared reach, reach in x and y, 1 / a, 1 / c."""
+        """Ellipse of slot s: a, b, c of its conic, their determinant, squared reach, reach in x and y, 1 / a, 1 / c."""
         conic = self.projected.conic[s]
-        # In float64: a needle's determinant would be all rounding.
+        # In float64, since the determinant of a needle would lose all precision in float32.
         a, b, c = ti.cast(conic[0], ti.f64), ti.cast(conic[1], ti.f64), ti.cast(conic[2], ti.f64)
         det = ti.cast(a * c - b * b, self.projected.real)
         opacity = self.projected.opacity[s]
@@ -94,7 +102,7 @@ class Binning:
 
     @ti.func
     def _tile_rows(self, s, e, tiles_y):
-        """First tile row and the one behind the last that slot s reaches."""
+        """First tile row that slot s reaches, and the row after the last."""
         reach = e[6] + SLACK
         y = self.projected.mean[s][1]
         first = ti.max(first_centre(y - reach), 0) // self.tile_height
@@ -103,7 +111,7 @@ class Binning:
 
     @ti.func
     def _tile_columns(self, s, e, tile_y, tiles_x):
-        """First tile column and the one behind the last that slot s reaches in a tile row."""
+        """First tile column that slot s reaches in a tile row, and the column after the last."""
         mean = self.projected.mean[s]
         top = tile_y * self.tile_height + 0.5 - mean[1]
         bottom = top + (self.tile_height - 1)
@@ -118,7 +126,7 @@ class Binning:
 
     @ti.func
     def _pixel_rows(self, s, e, tile_x, tile_y):
-        """Rows of a tile that slot s reaches, packed as first | behind last << 16."""
+        """Rows of a tile that slot s reaches, packed as first | (last + 1) << 16."""
         mean = self.projected.mean[s]
         left = tile_x * self.tile_width + 0.5 - mean[0]
         right = left + (self.tile_width - 1)
@@ -158,7 +166,7 @@ class Binning:
 
     @ti.kernel
     def _scan_counts(self, tiles: ti.i32, total: ti.types.ndarray()):
-        # One pass over tiles x chunks: microseconds, and nothing to synchronise.
+        # A serial pass over tiles x chunks takes microseconds and needs no synchronisation.
         ti.loop_config(serialize=True)
         for _ in range(1):
             place = 0

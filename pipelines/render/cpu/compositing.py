@@ -1,11 +1,12 @@
-"""Compositing: colour, depth and opacity of the sorted ellipses, forward and backward, one tile a task.
+"""Compositing of the sorted ellipses to colour, depth and opacity, forward and backward, with one task per tile.
 
 Front to back, with T the transmittance before a Gaussian (Eq. 3 of 3DGS):
     alpha = min(0.99, opacity * exp(power)),  power = -(a dx^2 + c dy^2) / 2 - b dx dy
     C += alpha T c,   D += alpha T z,   T *= 1 - alpha,   and at the end   C += T background.
 
-The inner loop runs over the consecutive pixels of a tile's rows, branch-free, so that it becomes SIMD code (a
-Gaussian outside, pixels inside: the transpose of the form for GPUs). Only rows that the ellipse reaches are visited.
+The outer loop runs over Gaussians and the inner loop over the consecutive pixels of a tile's rows, the opposite of a
+GPU implementation. The inner loop has no branches, so that it compiles to SIMD code. Only rows that the ellipse reaches
+are visited.
 """
 
 import taichi as ti
@@ -22,18 +23,18 @@ from pipelines.render.cpu.projection import ALPHA_MIN
 __all__ = ["ALPHA_MAX", "OPAQUE", "Compositing"]
 
 ALPHA_MAX = 0.99
-# A tile takes no further Gaussian once less than this passes at all of its pixels: below what 8 bits or the tests see.
+# A tile stops once the transmittance is below this at all of its pixels, which affects neither 8 bits nor the tests.
 OPAQUE = 1e-5
-# Transmittance ends here: far below what counts, and above where numbers are denormal and processors slow.
+# Lower bound of the transmittance: far below what is visible, and above denormal numbers, which are slow.
 LEAST_TRANSMITTANCE = 1e-20
 ROW_BITS = TILE_WIDTH.bit_length() - 1
-# A thread takes eight tiles at a time.
+# Eight tiles per chunk, see `fields.runtime.parallel`.
 SPREAD = HANDED_OUT // 8
 
 
 @ti.data_oriented
 class Compositing:
-    """Composites `projected` by the lists in `pairs` into `images`, and takes gradients the other way."""
+    """Composites `projected` into `images` by the lists in `pairs`, and propagates gradients back."""
 
     def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: TilePairs, images: ImageBuffers) -> None:
         self.view = view
@@ -49,7 +50,11 @@ class Compositing:
         self._composite(self.view.width, self.view.height)
 
     def backward(self, with_depth: bool = False) -> None:
-        """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
+        """Propagate `images.*_grad` to the gradients in `projected`.
+
+        Args:
+            with_depth: Also propagate `images.depth_grad`.
+        """
         self._differentiate[with_depth](self.view.width, self.view.height)
         self._add_up(self.projected.count, self.projected.count)
 
@@ -77,8 +82,8 @@ class Compositing:
         reached = 0
         not_opaque = ti.cast(1.0, self.real)
         for group in range((count + GROUP - 1) // GROUP):
-            # An empty range rather than a `while` or `break`: with those Taichi fetches every field's root anew at
-            # each pixel, and LLVM gives the inner loop up.
+            # An empty range instead of a `while` or `break`, with which Taichi fetches every field's root at each
+            # pixel, and LLVM does not vectorise the inner loop.
             start = first + group * GROUP
             end = ti.select(not_opaque > 0.0, ti.min(start + GROUP, first + count), start)
             self._stage(tile, start, end, left, top)
@@ -103,7 +108,7 @@ class Compositing:
                     T -= weight
                     self.images.transmittance[base + p] = ti.select(T > LEAST_TRANSMITTANCE, T, LEAST_TRANSMITTANCE)
             reached = ti.select(end > start, end - first, reached)
-            # Counted: LLVM makes vector code of a sum, not of a maximum of floats.
+            # Count the pixels, since LLVM vectorises a sum but not a maximum of floats.
             not_opaque = ti.cast(0.0, self.real)
             for p in range(TILE_PIXELS):
                 not_opaque += ti.select(self.images.transmittance[base + p] > OPAQUE, 1.0, 0.0)
@@ -125,10 +130,10 @@ class Compositing:
 
     @ti.func
     def _stage(self, tile, start, end, left, top):
-        """Copy what is needed of the Gaussians of a group of pairs to where it stays in the cache.
+        """Copy the Gaussians of a group of pairs into contiguous memory that stays in the cache.
 
-        Neighbours in a tile's list lie far apart in memory. Here all of a group are waited for together; one after the
-        other, in the loop over pairs, they cost a sixth of the time.
+        Neighbours in a tile's list are far apart in memory. Here, the cache misses of a group overlap. One after the
+        other, in the loop over pairs, they took a sixth of the time.
         """
         for k in range(start, end):
             s = self.pairs.slot[k]
@@ -151,8 +156,8 @@ class Compositing:
 
     @ti.func
     def _backward_tiles(self, width, height, with_depth: ti.template()):
-        # Front to back again, as the forward pass went, so that the same Gaussians are masked and left out. What lies
-        # behind a Gaussian enters as one number a pixel: `behind` = <gradient, all that is still to be composited>.
+        # Front to back, like the forward pass, so that the same Gaussians are masked and skipped. Everything behind a
+        # Gaussian enters as one number per pixel: `behind` = <gradient, all that is still to be composited>.
         tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
         for spread in range(tiles * SPREAD):
             if spread % SPREAD == 0:
@@ -230,7 +235,7 @@ class Compositing:
                     self.images.behind[base + p] = behind
                     T -= weight
                     self.images.transmittance[base + p] = ti.select(T > LEAST_TRANSMITTANCE, T, LEAST_TRANSMITTANCE)
-                    # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
+                    # d loss / d power = alpha * d loss / d alpha, and 0 where alpha is clamped.
                     power_grad = contribution - behind * alpha / (1.0 - alpha)
                     power_grad = ti.select(unclamped > ALPHA_MAX, 0.0, power_grad)
                     g_red += weight * red_grad
@@ -249,7 +254,7 @@ class Compositing:
 
     @ti.kernel
     def _gather(self, alone: ti.template(), slots: ti.i32):
-        """Sum every slot's pairs, in their order, into the gradients of what was composited."""
+        """Sum the pairs of every slot, in order, into the gradients of its composited values."""
         ti.loop_config(serialize=alone)
         for s in range(slots):
             total = ti.Vector.zero(self.real, 10)

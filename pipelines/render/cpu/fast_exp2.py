@@ -1,4 +1,4 @@
-"""A power of two that LLVM can vectorise: a call to libm would make every compositing loop scalar."""
+"""A power of two that LLVM can vectorise. A call to libm would make every compositing loop scalar."""
 
 import taichi as ti
 
@@ -9,11 +9,11 @@ LOG2E = 1.4426950408889634
 
 @ti.func
 def fast_exp2(x, real: ti.template()):
-    """2^x for x <= 0. float32: relative error below 4e-7, below -125 about 2e-38; float64: the library's pow.
+    """2^x for x <= 0. In float32 with a relative error below 4e-7, and about 2e-38 below -125; in float64 by pow.
 
-    2^n by the exponent's bits times the minimax polynomial of 2^f, n the truncation of x and f in (-1, 0]. Conversions
-    to integers and back, since Taichi's fast-math would cancel the tricks that round by adding a large number; `select`
-    in place of `max`, which would care for NaN.
+    The result is 2^n, by its exponent bits, times a minimax polynomial of 2^f, where n is the truncation of x and f is
+    in (-1, 0]. Truncation converts to an integer and back, since Taichi's fast-math would cancel the trick of rounding
+    by adding a large number. `select` replaces `max`, which would handle NaN.
     """
     result = ti.cast(0.0, real)
     if ti.static(real == ti.f32):

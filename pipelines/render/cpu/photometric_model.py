@@ -1,7 +1,7 @@
-"""The photometric model: from the colours of the scene to those of a photograph, (A colour + b) * vignette, and back.
+"""The photometric model: image = (A colour + b) * vignette, and its gradients.
 
-A (3, 3) and b (3,) are a frame's exposure, the vignette is the share of the light that reaches each pixel. With the
-loss's gradient g by the photograph and h = vignette * g, the gradients are
+A (3, 3) and b (3,) are a frame's exposure. The vignette is the fraction of the light that reaches each pixel. With the
+gradient g of the loss with respect to the image and h = vignette * g, the gradients are
     d colour = A^T h,   d A = sum over the pixels of h colour^T,   d b = sum of h.
 """
 
@@ -19,15 +19,15 @@ __all__ = ["IDENTITY", "PhotometricModel"]
 
 IDENTITY = np.eye(3, 4)
 IDENTITY.flags.writeable = False
-# A thread takes eight rows at a time.
+# Eight rows per chunk, see `fields.runtime.parallel`.
 SPREAD = HANDED_OUT // 8
 
 
 @ti.data_oriented
 class PhotometricModel:
-    """Develops `images.colour` in place, and takes `images.colour_grad` the other way.
+    """Applies exposure and vignette to `images.colour` in place, and propagates `images.colour_grad` back.
 
-    Where there is neither exposure nor vignette nothing is done, and no memory taken.
+    Without exposure and vignette, it does nothing and allocates no memory.
     """
 
     def __init__(self, images: ImageBuffers) -> None:
@@ -37,13 +37,16 @@ class PhotometricModel:
         self._made = False
         self._exposure = np.array(IDENTITY)
         self._sums = np.zeros((images.max_height, 12))
-        self._loaded: tuple[int, int, int] | None = None  # which vignette the buffer holds, at which size
+        self._loaded: tuple[int, int, int] | None = None  # the vignette in the buffer: its id and size
         self._resized: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     def forward(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
-        """Develop the picture rendered last. None stands for the identity.
+        """Apply exposure and vignette to the last rendered image.
 
-        exposure: (3, 4), A beside b. vignette: (H, W, 3) of the camera's full size; it is resized to the picture.
+        Args:
+            exposure: Exposure (A, b) (3, 4); None for the identity.
+            vignette: Vignette (H, W, 3) at the camera's full size, which is resized to the image; None for no
+                vignetting.
         """
         self._active = exposure is not None or vignette is not None
         if not self._active:
@@ -54,17 +57,17 @@ class PhotometricModel:
         self._develop()
 
     def backward(self) -> None:
-        """From the gradient by the developed picture to that by the render, which comes back into `images.colour`."""
+        """Propagate `images.colour_grad` back to the render, and restore the render in `images.colour`."""
         if self._active:
             self._undevelop()
 
     def exposure_gradient(self) -> np.ndarray:
-        """d loss / d (A, b) (3, 4) of the picture that was developed last, after `backward`."""
-        # Row by row in a fixed order, so that two runs agree bit for bit.
+        """Return d loss / d (A, b) (3, 4) of the last image. Call it after `backward`."""
+        # Sum the rows in a fixed order, so that two runs agree bit for bit.
         return self._sums[: self.images.height].sum(axis=0).reshape(3, 4)
 
     def async_exposure_gradient(self) -> AsyncReadback:
-        """The same; on the CPU there is nothing to wait for."""
+        """Return `exposure_gradient` with the interface of the GPU. On the CPU, there is nothing to wait for."""
         return AsyncReadback(torch.from_numpy(self.exposure_gradient()))
 
     def _develop(self) -> None:
@@ -84,7 +87,7 @@ class PhotometricModel:
         refuse_too_many_fields(self.vignette)
 
     def _load(self, vignette: np.ndarray | None) -> None:
-        """Have the vignette, at the picture's size, in the buffer."""
+        """Write the vignette to the buffer at the size of the image, unless it is there already."""
         width, height = self.images.width, self.images.height
         key = (id(vignette), width, height)
         if key == self._loaded:
@@ -97,7 +100,7 @@ class PhotometricModel:
             image = np.ascontiguousarray(vignette, dtype=np.float32)
             if image.shape[:2] != (height, width):
                 image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-            # With the original, which must live as long as its id is a key.
+            # Keep the original alive as long as its id is a key.
             self._resized[key] = vignette, image
         self._set_vignette(width, height, self._resized[key][1])
 
@@ -120,7 +123,7 @@ class PhotometricModel:
         plane = ti.static(self.images.plane)
         row = (y + PAD) * self.images.stride + PAD
         E = ti.Matrix([[ti.cast(exposure[i, j], self.real) for j in range(4)] for i in range(3)])
-        # A first access of each tree out here makes Taichi fetch its root once, not at every pixel.
+        # A first access of each tree outside the loop makes Taichi fetch its root once, and not at every pixel.
         self.rendered[row], self.images.colour[row] = self.rendered[row], self.images.colour[row]
         for x in range(row, row + width):
             red, green, blue = self.images.colour[x], self.images.colour[plane + x], self.images.colour[2 * plane + x]

@@ -1,7 +1,7 @@
-"""Projection: which Gaussians a view sees, in which order, and their ellipses and colours in the image.
+"""Projection: visibility, depth order, image-space ellipses and colours of the Gaussians of a view.
 
-EWA splatting [Zwicker 2001] with the opacity compensation of Mip-Splatting [Yu 2024]; the gradient, camera
-tangent included, comes from Taichi's automatic differentiation.
+EWA splatting [Zwicker 2001] with the opacity compensation of Mip-Splatting [Yu 2024]. The gradients, including that of
+the camera tangent, come from Taichi's automatic differentiation.
 """
 
 import numpy as np
@@ -20,20 +20,21 @@ from pipelines.render.spherical_harmonics import evaluate_sh
 
 __all__ = ["ALPHA_MIN", "BLUR", "Projection"]
 
-# Variance of the pixel's own footprint [px^2], added to every ellipse.
+# Variance of the pixel's footprint, added to every ellipse [px^2].
 BLUR = 0.3
-# A contribution below this is not drawn, here and in every other splatting renderer.
+# Contributions below this are not drawn, as in other splatting renderers.
 ALPHA_MIN = 1.0 / 255.0
-# Compensation is floored here: below, a Gaussian is far thinner than a pixel and its gradient would be infinite.
+# Lower bound of the compensation's determinant ratio. Below it, a Gaussian is far thinner than a pixel, and the
+# gradient would be infinite.
 MIN_DETERMINANT_RATIO = 1e-6
 CHUNK = 512
-# A thread takes two chunks at a time.
+# Two of these chunks per scheduling chunk, see `fields.runtime.parallel`.
 SPREAD = HANDED_OUT // 2
 
 
 @ti.data_oriented
 class Projection:
-    """Culls, orders and projects the Gaussians of `gaussians` for the view in `view` into `projected`."""
+    """Culls, sorts and projects `gaussians` into `projected`, for the view in `view`."""
 
     def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
         self.gaussians = gaussians
@@ -53,10 +54,15 @@ class Projection:
         self._clear = CompiledLoop(self._clear_tangent_gradients, 4)
 
     def forward(self) -> int:
-        """Fill `projected` for the current view; return how many Gaussians it sees."""
+        """Fill `projected` for the current view.
+
+        Returns:
+            Number of visible Gaussians.
+        """
         self.projected.count = count = self._visible()
         if count:
-            # Keys are unique (depth above, slot below), so any sort of them is stable in the Gaussians' order.
+            # Keys hold the depth in the upper bits and the slot in the lower. They are unique, so the result does not
+            # depend on the stability of the sort.
             self._keys[:count].sort()
             self._set_order(count, count, self._keys)
             self._project(count)
@@ -66,14 +72,14 @@ class Projection:
         return count
 
     def backward(self) -> None:
-        """From the gradients in `projected` to those of the Gaussians and of the slots' camera tangents."""
+        """Propagate the gradients in `projected` to the Gaussians and to the slots' camera tangents."""
         if self.projected.count:
             self._clear(self.projected.count)
             self._shade_back(self.projected.count)
             self._project_back(self.projected.count)
 
     def camera_gradient(self) -> np.ndarray:
-        """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order."""
+        """Return d loss / d xi (6,) of the view's T_camera_world, summed over the slots in a fixed order."""
         count = self.projected.count
         chunks = -(-count // CHUNK)
         partial = np.zeros((chunks, 6), dtype=np.float64)
@@ -82,13 +88,13 @@ class Projection:
         return partial.sum(axis=0)
 
     def async_camera_gradient(self) -> AsyncReadback:
-        """The same; on the CPU there is nothing to wait for."""
+        """Return `camera_gradient` with the interface of the GPU. On the CPU, there is nothing to wait for."""
         return AsyncReadback(torch.from_numpy(self.camera_gradient()))
 
     # ---- which, and in which order ---------------------------------------------------------------------------
 
     def _visible(self) -> int:
-        """Give every Gaussian that the view may see a slot and a key to sort by; return how many."""
+        """Assign a slot and a sort key to every Gaussian that the view may see; return their number."""
         n = self.gaussians.count
         if n == 0:
             return 0
@@ -124,7 +130,7 @@ class Projection:
 
     @ti.func
     def _camera(self):
-        """The view's T_camera_world (3, 4), and the largest stretch of its linearised projection."""
+        """The view's T_camera_world (3, 4), and an upper bound on the stretch of its linearised projection."""
         rotation, translation = self.view.rotation[None], self.view.translation[None]
         focal, limits = self.view.focal[None], self.view.limits[None]
         camera = ti.Matrix.zero(self.projected.real, 3, 4)
@@ -138,7 +144,7 @@ class Projection:
 
     @ti.func
     def _seen_at(self, i, camera, stretch):
-        """Depth (float32) of Gaussian i where the view may see it, else 0. camera, stretch: from `_camera`."""
+        """Depth (float32) of Gaussian i if the view may see it, else 0. camera, stretch: from `_camera`."""
         focal, centre, size = self.view.focal[None], self.view.centre[None], self.view.size[None]
         position = self.gaussians.position[i]
         p = camera @ ti.Vector([position[0], position[1], position[2], ti.cast(1.0, self.projected.real)])
@@ -173,7 +179,7 @@ class Projection:
         slot = first[chunk]
         for i in range(chunk * CHUNK, ti.min(n, (chunk + 1) * CHUNK)):
             if depths[i] > 0.0:
-                # The bits of a positive float rise with it.
+                # The bits of positive floats order like the values.
                 bits = ti.cast(ti.bit_cast(depths[i], ti.u32), ti.u64)
                 keys[slot] = (bits << 32) | ti.cast(slot, ti.u64)
                 self.projected.gaussian[slot] = i
@@ -191,7 +197,7 @@ class Projection:
 
     @ti.kernel
     def project(self, alone: ti.template()):
-        """Ellipse, depth and compensated opacity of every slot."""
+        """Compute ellipse, depth and compensated opacity of every slot."""
         ti.loop_config(serialize=alone)
         for s in range(self.projected.seen[None]):
             i = self.projected.gaussian[s]
@@ -200,7 +206,7 @@ class Projection:
             W = self.view.rotation[None]
             focal, limits = self.view.focal[None], self.view.limits[None]
 
-            # exp(xi) to first order: exact in value and derivative at xi = 0.
+            # exp(xi) to first order, whose value and derivative are exact at xi = 0.
             tracked = rotate(W, self.gaussians.position[i]) + self.view.translation[None]
             p = tracked + cross(omega, tracked) + rho
             inv_z = 1.0 / p[2]
@@ -218,7 +224,7 @@ class Projection:
 
             sharp_xx, sharp_xy, sharp_yy = dot(u, u), dot(u, v), dot(v, v)
             minors = cross(u, v)
-            # Cauchy-Binet: no cancellation for needles, where xx * yy - xy^2 would leave only rounding.
+            # Cauchy-Binet avoids the cancellation of xx * yy - xy^2, which would leave only rounding for needles.
             sharp_determinant = dot(minors, minors)
             determinant = sharp_determinant + BLUR * (sharp_xx + sharp_yy) + BLUR * BLUR
             compensation = ti.sqrt(ti.max(sharp_determinant / determinant, MIN_DETERMINANT_RATIO))
@@ -230,7 +236,7 @@ class Projection:
 
     @ti.kernel
     def shade(self, alone: ti.template()):
-        """Colour of every slot from its spherical harmonics and the direction it is seen in."""
+        """Compute the colour of every slot from its spherical harmonics and viewing direction."""
         ti.loop_config(serialize=alone)
         for s in range(self.projected.seen[None]):
             i = self.projected.gaussian[s]
@@ -238,7 +244,7 @@ class Projection:
                 self.projected.colour[s] = ti.max(0.5 + SH_C0 * self.gaussians.sh[i, 0], 0.0)
             else:
                 xi = self.projected.tangent[s]
-                # Turning a camera does not move its centre, so that only rho changes the direction: W'(p + rho).
+                # Rotating a camera does not move its centre, so only rho changes the direction: W'(p + rho).
                 tracked = rotate(self.view.rotation[None], self.gaussians.position[i]) + self.view.translation[None]
                 ray = rotate_back(self.view.rotation[None], tracked + ti.Vector([xi[0], xi[1], xi[2]]))
                 direction = ray / ti.sqrt(dot(ray, ray))

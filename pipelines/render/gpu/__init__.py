@@ -1,6 +1,6 @@
-"""The GPU's form of the kernels: a thread a pixel, shared memory, sorts and scans on the device, nothing read back.
+"""The renderer's GPU kernels: one thread per pixel, shared memory, sorts and scans on the device, no readback.
 
-Each class stands in for that of the same place in `pipelines/render/cpu`, which is the form for the CPU and the
-reference. Taichi launches on the default stream of the device's primary context, which is PyTorch's: kernels and tensor
-operations follow one another without further synchronisation.
+Each class replaces the class in the module of the same name in `pipelines/render/cpu`, which is also its reference.
+Taichi launches on the default stream of the device's primary context, which PyTorch uses as well, so that kernels and
+tensor operations are ordered without further synchronisation.
 """

@@ -1,4 +1,4 @@
-"""Binning on a GPU: pairs are emitted slot by slot, nearest first; a stable sort by tile keeps their order."""
+"""Binning on a GPU: pairs are emitted slot by slot, nearest first, and then sorted stably by tile."""
 
 from collections import deque
 
@@ -15,15 +15,16 @@ from pipelines.render.cpu.binning import Binning
 
 __all__ = ["DeviceBinning"]
 
-# Room for pairs: so many times the largest total of so many views before. A view that has more loses its farthest ones.
+# The room for pairs is MARGIN times the largest total of the last MEMORY views. A view with more pairs loses its
+# farthest ones.
 MARGIN, MEMORY = 1.5, 64
-# Views after which a total is looked at: it has arrived by then, and always the same view's makes room.
+# Number of views after which a total is read. The copy has finished by then, and the fixed delay is deterministic.
 PATIENCE = 2
 
 
 @ti.data_oriented
 class DeviceBinning(Binning):
-    """Fills `pairs` from `projected` for the view in `view`."""
+    """Fills `pairs` from `projected` for the view in `view`; see `Binning`."""
 
     tile_width, tile_height = TILE_WIDTH, TILE_HEIGHT
 
@@ -40,8 +41,12 @@ class DeviceBinning(Binning):
     def forward(self, exact: bool = True) -> None:
         """Bin the projected Gaussians of the current view.
 
-        exact: wait for the number of pairs, and make room for all. Otherwise the room follows the views before, and
-        what is beyond it is left out. Raises ValueError where there are more pairs than can ever be held.
+        Args:
+            exact: Wait for the number of pairs, and make room for all of them. Otherwise the room follows from earlier
+                views, and pairs beyond it are dropped.
+
+        Raises:
+            ValueError: If `exact` and there are more than `max_pairs` pairs.
         """
         tiles_x = -(-self.view.width // TILE_WIDTH)
         tiles_y = -(-self.view.height // TILE_HEIGHT)
@@ -63,7 +68,7 @@ class DeviceBinning(Binning):
 
     def _make_room(self, ends: torch.Tensor, exact: bool) -> None:
         self._totals.append(AsyncReadback(ends[-1:]))
-        # The first view has none before it.
+        # There is no earlier total for the first view.
         exact = exact or not self._known
         while self._totals and (exact or len(self._totals) > PATIENCE):
             self._known.append(int(self._totals.popleft().numpy()[0]))
@@ -122,7 +127,7 @@ class DeviceBinning(Binning):
         for pair in range(room):
             if pair >= ends[ends.shape[0] - 1]:
                 key[pair] = no_tile
-        # What fits in 32 bits: at most a step beyond the room.
+        # Clamped to room + 1, so that it fits in 32 bits.
         self.pairs.total[None] = ti.cast(ti.min(ends[ends.shape[0] - 1], ti.cast(room, ti.i64) + 1), ti.i32)
 
     @ti.kernel
@@ -145,7 +150,7 @@ class DeviceBinning(Binning):
             if tile < tiles:
                 s = emitted_slot[origin[k]]
                 slot[k] = s
-                # Here and not where pairs are emitted: every pair is a thread's, however many a Gaussian has.
+                # Computed here and not in `_emit`, since here each pair has its own thread.
                 rows[k] = self._pixel_rows(s, self._ellipse(s), tile % tiles_x, tile // tiles_x)
                 if k == 0 or ti.cast(key[ti.max(k - 1, 0)], ti.i32) != tile:
                     self.pairs.first[tile] = k

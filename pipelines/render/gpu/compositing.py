@@ -1,13 +1,12 @@
-"""Compositing on a GPU: a block of threads a tile, a thread a pixel, the tile's Gaussians through shared memory.
+"""Compositing on a GPU: one block per tile, one thread per pixel, with the tile's Gaussians in shared memory.
 
-The formulas are those of `pipelines/render/cpu/compositing.py`, but a pixel closes by itself once it is opaque, not
-with its tile. The backward pass goes front to back as well, and adds without atomics, in three phases for every 16
-Gaussians:
-    A  a thread a pixel walks them and leaves weight and d loss / d power of each in shared memory,
-    B  a thread a (Gaussian, column of pixels) makes its ten sums over the rows that the ellipse reaches,
-    C  a thread a (Gaussian, sum) adds the columns.
-Against a reduction over the warps for every Gaussian (some fifty shuffles a pixel) this costs about eight accesses to
-shared memory, and the order of the sums is fixed.
+The formulas are those of `pipelines/render/cpu/compositing.py`, but each pixel stops by itself once it is opaque. The
+backward pass also goes front to back. It sums without atomics, in three phases for every 16 Gaussians:
+    A  one thread per pixel writes the weight and d loss / d power of each Gaussian to shared memory,
+    B  one thread per (Gaussian, column of pixels) computes ten sums over the rows that the ellipse reaches,
+    C  one thread per (Gaussian, sum) adds the columns.
+This takes about eight accesses to shared memory per pixel and Gaussian, compared with some fifty shuffles for a
+reduction over the warps, and the order of the sums is fixed.
 """
 
 import taichi as ti
@@ -24,15 +23,15 @@ from pipelines.render.gpu.reductions import THREADS, max_over_block
 
 __all__ = ["DeviceCompositing"]
 
-# Gaussians that pass through shared memory together, forward and backward.
+# Number of Gaussians in shared memory at a time, in the forward and in the backward pass.
 BATCH = TILE_PIXELS
 STEP = 16
-# Numbers of a Gaussian there: mean (2), conic (3), opacity, colour (3), depth.
+# Values of a Gaussian in shared memory: mean (2), conic (3), opacity, colour (3), depth.
 WIDTH = 10
 TILE_BITS = TILE_PIXELS.bit_length() - 1
 ROW_BITS = TILE_WIDTH.bit_length() - 1
-# Places from a Gaussian's pixels to the next one's, and from a sum's columns to the next: the two Gaussians, or the 32
-# sums, of the threads of a warp then meet different banks of shared memory.
+# Strides in shared memory between the pixels of two Gaussians, and between the columns of two sums. They are padded so
+# that the two Gaussians, or the 32 sums, of the threads of a warp use different banks.
 PLANE = TILE_PIXELS + TILE_WIDTH
 COLUMNS = TILE_WIDTH + 1
 SUMS = 10
@@ -44,7 +43,7 @@ INDICES = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
 @ti.data_oriented
 class DeviceCompositing:
-    """Composites `projected` by the lists in `pairs` into `images`, and takes gradients the other way."""
+    """Composites `projected` into `images` by the lists in `pairs`, and propagates gradients back."""
 
     def __init__(
         self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs, images: ImageBuffers
@@ -64,7 +63,11 @@ class DeviceCompositing:
         self._composite(self.view.width, self.view.height, slot, rows)
 
     def backward(self, with_depth: bool = False) -> None:
-        """From `images.*_grad` to the gradients in `projected`; the gradient of depth only where asked for."""
+        """Propagate `images.*_grad` to the gradients in `projected`.
+
+        Args:
+            with_depth: Also propagate `images.depth_grad`.
+        """
         pairs = self.pairs
         if self.projected.count:
             width, height = self.view.width, self.view.height
@@ -74,7 +77,7 @@ class DeviceCompositing:
 
     @ti.func
     def _load(self, store: ti.template(), place, s):
-        """Put what compositing reads of slot s into shared memory."""
+        """Copy the values of slot s that compositing reads into shared memory."""
         mean, conic = self.projected.mean[s], self.projected.conic[s]
         colour = self.projected.colour[s]
         store[place] = mean[0]
@@ -96,7 +99,7 @@ class DeviceCompositing:
         for i in range(tiles * TILE_PIXELS):
             splats = ti.simt.block.SharedArray((BATCH * WIDTH,), ti.f32)
             spans = ti.simt.block.SharedArray((BATCH,), ti.i32)
-            # Whether a pixel of the tile is still open, in turns for the batches.
+            # Whether any pixel of the tile is not opaque yet, alternating between batches.
             open_pixels = ti.simt.block.SharedArray((2,), ti.i32)
             tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
             row = thread >> ROW_BITS
@@ -107,7 +110,7 @@ class DeviceCompositing:
             first, count = self.pairs.first[tile], self.pairs.tile_count[tile]
             T, red, green, blue, z = 1.0, 0.0, 0.0, 0.0, 0.0
             counted = 0
-            # The block may come from another tile, whose threads are not all done with shared memory.
+            # Threads of the block may still use shared memory for the previous tile.
             ti.simt.block.sync()
             if thread == 0:
                 open_pixels[0] = 0
@@ -140,10 +143,10 @@ class DeviceCompositing:
                 ti.simt.block.sync()
                 start += BATCH
                 going = start < count and open_pixels[turn] == 1
-                # That of the next batch, which nobody reads before the next barrier.
+                # Reset the flag of the next batch, which is not read before the next barrier.
                 if thread == 0:
                     open_pixels[1 - turn] = 0
-            # All threads are behind the last batch, whose rows the counts overwrite.
+            # All threads have finished the last batch, whose rows the counts overwrite.
             spans[thread] = counted
             max_over_block(spans, thread)
             if thread == 0:
@@ -204,12 +207,12 @@ class DeviceCompositing:
         spans = ti.simt.block.SharedArray((STEP,), ti.i32)
         origins = ti.simt.block.SharedArray((STEP,), ti.i32)
         image_grad = ti.simt.block.SharedArray(((3 + with_depth) * TILE_PIXELS,), ti.f32)
-        # Weights of phase A, and after phase B has read them its sums.
+        # First the weights of phase A, then the sums of phase B.
         weights = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
         power_grads = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
 
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-        # Shifts and masks, by which LLVM sees that no index overflows.
+        # Shifts and masks, so that LLVM sees that no index overflows.
         tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
         row, column = thread >> ROW_BITS, thread & (TILE_WIDTH - 1)
         left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
@@ -218,7 +221,7 @@ class DeviceCompositing:
         px, py = ti.cast(x, ti.f32) + 0.5, ti.cast(y, ti.f32) + 0.5
         plane = ti.static(self.images.plane)
         red_grad, green_grad, blue_grad, z_grad, behind = 0.0, 0.0, 0.0, 0.0, 0.0
-        # A pixel beyond the image is opaque from the start.
+        # Pixels outside the image are opaque from the start.
         T = 0.0
         if inside:
             source = (y + PAD) * self.images.stride + x + PAD
@@ -235,7 +238,7 @@ class DeviceCompositing:
             if ti.static(with_depth):
                 z_grad = self.images.depth_grad[source]
                 behind += z_grad * self.images.depth[source]
-        # The block may come from another tile, whose threads are not all done with shared memory.
+        # Threads of the block may still use shared memory for the previous tile.
         ti.simt.block.sync()
         image_grad[thread] = red_grad
         image_grad[TILE_PIXELS + thread] = green_grad
@@ -270,7 +273,7 @@ class DeviceCompositing:
                         contribution = weight * shade
                         behind -= contribution
                         T -= weight
-                        # d loss / d power = alpha * d loss / d alpha, and nothing where alpha is clamped.
+                        # d loss / d power = alpha * d loss / d alpha, and 0 where alpha is clamped.
                         if unclamped <= ALPHA_MAX:
                             power_grad = contribution - behind * alpha / (1.0 - alpha)
                     weights[j * PLANE + thread] = weight
@@ -320,9 +323,9 @@ class DeviceCompositing:
 
     @ti.kernel
     def _gather(self, room: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
-        """Sum every slot's pairs, in their order, into the gradients of what was composited.
+        """Sum the pairs of every slot, in order, into the gradients of its composited values.
 
-        Sixteen threads a slot, ten of them with a sum each: together they read a pair's gradient at once.
+        Each slot has sixteen threads, ten of which compute one sum each, so that they read a pair's gradient together.
         """
         ti.loop_config(block_dim=TILE_PIXELS)
         for i in range((self.projected.seen[None] + 15) // 16 * TILE_PIXELS):

@@ -1,4 +1,4 @@
-"""The photometric model on a GPU: a thread a pixel; the gradient of the exposure is summed on the device."""
+"""The photometric model on a GPU: one thread per pixel. The gradient of the exposure is summed on the device."""
 
 import numpy as np
 import taichi as ti
@@ -18,7 +18,7 @@ NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 @ti.data_oriented
 class DevicePhotometricModel(PhotometricModel):
-    """Develops `images.colour` in place, and takes `images.colour_grad` the other way; see `PhotometricModel`."""
+    """Applies exposure and vignette to `images.colour` in place, and propagates gradients; see `PhotometricModel`."""
 
     def __init__(self, images: ImageBuffers) -> None:
         super().__init__(images)
@@ -32,11 +32,11 @@ class DevicePhotometricModel(PhotometricModel):
         self._gradient = torch.zeros(12, dtype=torch.float32, device=torch_device())
 
     def exposure_gradient(self) -> np.ndarray:
-        """d loss / d (A, b) (3, 4) of the picture that was developed last, after `backward`. Waits for the device."""
+        """Return d loss / d (A, b) (3, 4) of the last image, after `backward`. Waits for the device."""
         return self.async_exposure_gradient().numpy().astype(np.float64)
 
     def async_exposure_gradient(self) -> AsyncReadback:
-        """The same in float32, on its way."""
+        """Return `exposure_gradient` in float32 as an asynchronous copy."""
         return AsyncReadback(self._gradient.view(3, 4))
 
     def _develop(self) -> None:
@@ -68,7 +68,7 @@ class DevicePhotometricModel(PhotometricModel):
             store = ti.simt.block.SharedArray((12 * THREADS,), ti.f32)
             plane = ti.static(self.images.plane)
             thread = i & (THREADS - 1)
-            # The block may come from other pixels, whose sums are not all read.
+            # Sums of the block's previous pixels may not all have been read yet.
             ti.simt.block.sync()
             for c in ti.static(range(12)):
                 store[c * THREADS + thread] = 0.0

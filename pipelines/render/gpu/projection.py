@@ -1,4 +1,4 @@
-"""Projection on a GPU: depths sorted on the device, the number of visible Gaussians known only there."""
+"""Projection on a GPU: depths are sorted on the device, and the number of visible Gaussians is known only there."""
 
 import numpy as np
 import taichi as ti
@@ -15,16 +15,13 @@ from pipelines.render.gpu.reductions import THREADS, sum_over_block
 
 __all__ = ["DeviceProjection"]
 
-# Sorts behind every depth. No infinity: Taichi compiles as if there were none.
+# Sorts after every depth. Not infinity, since Taichi's fast-math assumes that there is none.
 UNSEEN = 3e38
 
 
 @ti.data_oriented
 class DeviceProjection(Projection):
-    """Culls, orders and projects the Gaussians of `gaussians` for the view in `view` into `projected`.
-
-    The differentiable kernels are those of the CPU.
-    """
+    """Culls, sorts and projects `gaussians` into `projected`, with the differentiable kernels of the CPU."""
 
     def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
         self.gaussians = gaussians
@@ -37,7 +34,11 @@ class DeviceProjection(Projection):
         self._tangent = torch.zeros(6, dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
-        """Fill `projected` for the current view; return an upper bound of how many Gaussians it sees."""
+        """Fill `projected` for the current view.
+
+        Returns:
+            Upper bound on the number of visible Gaussians.
+        """
         self.projected.count = n = self.gaussians.count
         if n == 0:
             self._none_seen()
@@ -46,7 +47,7 @@ class DeviceProjection(Projection):
             self._depths = torch.empty(1 << (n - 1).bit_length(), dtype=torch.float32, device=torch_device())
         depths = self._depths[:n]
         self._cull(depths)
-        # Stable: equal depths stay in the Gaussians' order.
+        # A stable sort keeps Gaussians of equal depth in order.
         ordered, gaussian = torch.sort(depths, stable=True)
         self._assign(ordered, gaussian)
         self._project(n)
@@ -54,11 +55,11 @@ class DeviceProjection(Projection):
         return n
 
     def camera_gradient(self) -> np.ndarray:
-        """d loss / d xi (6,) of the view's T_camera_world, summed over slots in a fixed order. Waits for the device."""
+        """Return d loss / d xi (6,) of T_camera_world, summed over slots in a fixed order. Waits for the device."""
         return self.async_camera_gradient().numpy().astype(np.float64)
 
     def async_camera_gradient(self) -> AsyncReadback:
-        """The same in float32, on its way."""
+        """Return `camera_gradient` in float32 as an asynchronous copy."""
         self._sum_tangents(self._tangent)
         return AsyncReadback(self._tangent)
 

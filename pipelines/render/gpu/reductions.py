@@ -1,7 +1,7 @@
 """Sums and maxima over a block of threads, and sums over blocks, in a fixed order.
 
-A kernel has at most one loop with shared arrays: Taichi 1.7.4 names them loop by loop, and on CUDA two of one name in a
-kernel are one, of either size.
+A kernel must have at most one loop with shared arrays. Taichi 1.7.4 restarts their names in each loop, and on CUDA two
+arrays of the same name in a kernel are merged, with the size of either.
 """
 
 import taichi as ti
@@ -11,7 +11,7 @@ from fields.runtime.compiled_kernel import CompiledKernel
 
 __all__ = ["THREADS", "THREAD_BITS", "BlockSums", "max_over_block", "sum_over_block"]
 
-# Of every block that adds: one of the two halves that meet at each level is a whole number of warps down to the last.
+# Threads of every block that reduces. Down to the last warp, both halves at each level of the sum are whole warps.
 THREADS = 256
 THREAD_BITS = THREADS.bit_length() - 1
 NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -19,10 +19,10 @@ NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 @ti.func
 def sum_over_block(store: ti.template(), thread, quantities: ti.template()):
-    """Add `quantities` numbers over the block's threads.
+    """Sum `quantities` values over the threads of the block. All threads of the block must call it.
 
-    store: shared memory, number c of thread t at `c * THREADS + t`. The sum of c ends at `c * THREADS`, for all to
-    read. Every thread of the block must come here.
+    store: Shared memory with value c of thread t at `c * THREADS + t`. The sum of value c is returned at
+    `c * THREADS`, where all threads can read it.
     """
     ti.simt.block.sync()
     for half in ti.static([THREADS >> level for level in range(1, THREADS.bit_length())]):
@@ -35,7 +35,7 @@ def sum_over_block(store: ti.template(), thread, quantities: ti.template()):
 
 @ti.func
 def max_over_block(store: ti.template(), thread):
-    """The largest of the block's numbers, that of thread t at `store[t]`, in `store[0]`. For every thread of it."""
+    """Maximum over the block, from `store[t]` of thread t to `store[0]`. All threads of the block must call it."""
     ti.simt.block.sync()
     for half in ti.static([THREADS >> level for level in range(1, THREADS.bit_length())]):
         if thread < half:
@@ -45,14 +45,14 @@ def max_over_block(store: ti.template(), thread):
 
 @ti.data_oriented
 class BlockSums:
-    """Adds what the blocks of an earlier kernel have left."""
+    """Sums the partial results of the blocks of an earlier kernel."""
 
     def __init__(self, quantities: int) -> None:
         self.quantities = quantities
         self._launch = CompiledKernel(self._add)
 
     def __call__(self, blocks: int, partial: torch.Tensor, out: torch.Tensor) -> None:
-        """Leave the sum over the blocks of number c, which is at `partial[block * quantities + c]`, in `out[c]`."""
+        """Sum value c over all blocks, from `partial[block * quantities + c]` to `out[c]`."""
         self._launch(blocks, partial, out)
 
     @ti.kernel
