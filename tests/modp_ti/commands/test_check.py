@@ -18,6 +18,8 @@ from typer.testing import CliRunner
 from modp_ti.commands.app import app
 from tests.modp_ti.inputs.tracker_server import clients as clients
 
+pytestmark = pytest.mark.slow
+
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 

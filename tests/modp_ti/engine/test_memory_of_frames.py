@@ -14,6 +14,8 @@ from modp_ti.inputs.tracked_points import TrackedPoints
 from pipelines.settings import MappingSettings
 from tests.pipelines.wall import frame
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = MappingSettings(
     optimise={"steps": 1, "last_steps": 1}, densify={"warm_up": 1}, depth={"sources": ["image"]}, sh_degree=0
 )

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 TERMINATED = """
 import os, signal, sys, threading, time
 {before}

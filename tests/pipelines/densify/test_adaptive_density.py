@@ -14,6 +14,8 @@ from pipelines.render.renderer import Renderer
 from pipelines.settings import OfflineSettings
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = OfflineSettings()
 EXTENT = 3.0
 N = 60

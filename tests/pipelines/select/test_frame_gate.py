@@ -16,6 +16,8 @@ from pipelines.settings import GateSettings
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame, pose
 
+pytestmark = pytest.mark.slow
+
 AWAY = exp_se3([0.9, -0.4, 0.7, 0.2, 0.4, 0.1])
 LENGTH = 7
 

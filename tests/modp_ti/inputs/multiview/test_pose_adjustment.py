@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 from modp_ti.inputs.multiview.observations import Observations
 from modp_ti.inputs.multiview.pose_adjustment import adjusted_poses
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 40
 FOCAL = 500.0
 GATES = (16.0, 8.0, 4.0, 2.0)

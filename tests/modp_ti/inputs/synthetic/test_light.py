@@ -11,6 +11,8 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.synthetic import LightChange, SyntheticTracker, open_synthetic
 from modp_ti.inputs.synthetic.renderer import RoomRenderer
 
+pytestmark = pytest.mark.slow
+
 SHAPE = {"width": 64, "height": 48, "select": slice(3), "points": 60, "seed": 3}
 
 

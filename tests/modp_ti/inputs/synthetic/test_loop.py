@@ -15,6 +15,8 @@ from modp_ti.inputs.synthetic.camera_path import camera_path
 from modp_ti.inputs.synthetic.renderer import RoomRenderer
 from modp_ti.outputs.evaluation import umeyama
 
+pytestmark = pytest.mark.slow
+
 Make = Callable[..., SyntheticTracker]
 
 

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from modp_ti.inputs.synthetic import raytracer
 from modp_ti.inputs.synthetic.scene import Light, Material, Scene, SceneArrays
 
+pytestmark = pytest.mark.slow
+
 GREY = Material("grey")
 NO_SUN = np.array([[0, 0, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0]], np.float32)
 QUADRANTS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)

@@ -16,6 +16,8 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers import Tracker
 from modp_ti.inputs.trackers.transforms import open_transforms
 
+pytestmark = pytest.mark.slow
+
 
 def opened(scene, file=None, progress=None, **source):
     return open_transforms(SourceSettings(path=scene.folder, **source), TransformsSettings(path=file), progress)

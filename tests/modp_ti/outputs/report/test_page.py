@@ -13,6 +13,8 @@ from modp_ti.outputs.report.curves import frame_rate
 from modp_ti.outputs.report.page import ReportedRun, write_report
 from tests.modp_ti.outputs.report.made_up_run import Page, black_frame, delivered, made_up_run, picture
 
+pytestmark = pytest.mark.slow
+
 EVIL = "</td><script>alert('x')</script><img src=http://evil.example/a.png> & \"{{ 7 * 7 }}\""
 
 
