@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from fields.runtime.backend import initialise
 from modp_ti.engine.mapper import Mapper
 from modp_ti.files.errors import InputError
 from pipelines.offline import OfflineMapper
@@ -16,9 +17,10 @@ from tests.pipelines.wall import frame
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def mapper(taichi_on_the_cpu: None) -> Mapper:
-    return Mapper(64, 48, OfflineSettings(steps=3))
+@pytest.fixture
+def mapper() -> Mapper:
+    initialise("cpu")  # which frees the map of the test before
+    return Mapper(64, 48, OfflineSettings(steps=3, max_gaussians=4096))
 
 
 def test_both_are_pipelines(mapper: Mapper) -> None:
@@ -51,7 +53,7 @@ def test_a_map_of_nothing_is_said_to_be_one(mapper: Mapper) -> None:
         mapper.finish()
 
 
-def test_finishing_makes_the_map(taichi_on_the_cpu: None, mapper: Mapper) -> None:
+def test_finishing_makes_the_map(mapper: Mapper) -> None:
     steps: list[int] = []
     for i in range(1, 4):
         mapper.add(frame(i))
