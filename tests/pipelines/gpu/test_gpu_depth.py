@@ -22,8 +22,8 @@ def test_depth_along_epipolar_lines_is_that_of_the_cpu(on_both: Callable) -> Non
     (depth, deviation), (gpu_depth, gpu_deviation) = on_both(estimate)
     known = np.isfinite(deviation)
     assert known.mean() > 0.5
-    # Rounding may decide for the next sample, or for and against a match, here and there. Measured: all are the same, and
-    # depths differ by 6.5e-5 at most.
+    # Rounding may decide for the next sample, or for and against a match, here and there. Measured: all are the same,
+    # and depths differ by 6.5e-5 at most.
     same = np.isfinite(gpu_deviation) == known
     assert same.mean() > 0.98
     close = np.abs(np.log(gpu_depth / depth))[known & same] < 1e-3
