@@ -66,7 +66,8 @@ def adjusted_bundle(
         distortion: Also optimise the distortion.
 
     Returns:
-        The optimised poses, points and camera; None if Ceres finds no usable solution.
+        The optimised poses, camera and points, without those that only one view observes; None if Ceres finds no usable
+        solution.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -86,6 +87,8 @@ def adjusted_bundle(
             tracks.setdefault(number, []).append((k + 1, place))
     names = {}
     for number, seen in tracks.items():
+        if len(seen) == 1:
+            continue  # one ray constrains nothing, and COLMAP refuses it
         track = pycolmap.Track([pycolmap.TrackElement(*each) for each in seen])
         names[number] = model.add_point3D(xyz[number], track)
     if len(free) == len(poses):
