@@ -35,7 +35,6 @@ COMPARISON = re.compile(rf"(?<![\w.]){NUMBER} (<=|>=|<|>) {NUMBER}(?![\w.])")
 
 _number = 0
 _report: Path | None = None
-_site: tuple[str, int, str] | None = None
 _slacks: dict[tuple[str, int, str], float] = {}
 
 
