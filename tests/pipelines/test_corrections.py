@@ -11,6 +11,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
 from fields.map.keyframes import KeyframeStore
+from fields.runtime.backend import initialise
 from pipelines.corrections import WorldMotion, pending_motion_in_pixels, revise
 from pipelines.offline import OfflineMapper
 from pipelines.online import OnlineMapper
@@ -115,9 +116,10 @@ def test_an_offline_map_starts_from_the_corrected_poses_and_points(taichi_on_the
 # ---- the map ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def mapped(taichi_on_the_cpu: None) -> OnlineMapper:
-    """A map of five frames of the wall. Tests leave it in a world of their own: each starts from the poses it finds."""
+@pytest.fixture
+def mapped() -> OnlineMapper:
+    """A map of five frames of the wall."""
+    initialise("cpu")
     settings = MappingSettings(
         optimise={"steps": 5, "last_steps": 5}, densify={"warm_up": 2, "pixels": 3000}, corrections={"steps": 0}
     )
@@ -158,7 +160,6 @@ def test_a_correction_of_nothing_changes_no_bit(mapped: OnlineMapper) -> None:
     mapped.settings = settings.model_copy(update={"corrections": changed})
     before = everything(mapped)
     assert not mapped.correct(moving(mapped, np.eye(4))).moved
-    mapped.settings = settings
     after = everything(mapped)
     for name in before:
         np.testing.assert_array_equal(after[name], before[name], err_msg=name)
@@ -173,7 +174,6 @@ def test_disabled_corrections_move_poses_alone(mapped: OnlineMapper) -> None:
     np.testing.assert_allclose(mapped.keyframes[2].T_tracked, moved_pose(S, T), atol=1e-9)
     # And back.
     mapped.correct(moving(mapped, np.linalg.inv(S)))
-    mapped.settings = settings
     np.testing.assert_array_equal(mapped.gaussians.to_numpy()["position"], before["position"])
 
 
@@ -226,7 +226,7 @@ def test_a_world_that_moves_as_a_whole_looks_as_before_in_the_voxels_of_a_fresh_
 
 def test_the_corrected_world_is_mapped_on(mapped: OnlineMapper) -> None:
     """The next frame comes where the correction says; hardly a place of the wall is free."""
-    # What the correction before this test has made of the world, by a frame that all have moved with.
+    assert mapped.correct(moving(mapped, S)).moved
     world = motion_around(frame(0).T_camera_world, mapped.keyframes[0].T_tracked, 1.2)
     f, count = frame(5), len(mapped.gaussians)
     points = replace(f.points, xyz=moved_points(world, f.points.xyz))
