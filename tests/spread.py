@@ -19,7 +19,6 @@ import os
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -46,13 +45,13 @@ def disturbance() -> int:
 def disturbed(values: NDArray) -> NDArray:
     """Return a copy of the values; under `--spread`, each moves up or down by one unit in the last place.
 
-    Zeros stay, because their neighbours are denormal numbers.
+    Zeros stay, because their neighbours are denormal numbers, which kernels flush.
     """
     if not _number:
         return values.copy()
     up = _default_rng([_number, values.size]).random(values.shape) < 0.5
     moved = np.nextafter(values, np.where(up, np.inf, -np.inf).astype(values.dtype))
-    return np.where(values == 0, values, moved)  # zero's neighbours are denormal numbers, which kernels flush
+    return np.where(values == 0, values, moved)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -145,22 +144,24 @@ def pytest_assertion_pass(item: pytest.Item, lineno: int, orig: str, expl: str) 
     if orig.partition("\n")[0] not in linecache.getline(str(item.path), lineno):
         return  # assertion of a plugin
     site = (str(item.path).rpartition("/tests/")[2], lineno, orig)
+    low = _lower_bound(orig)
     for left, operator, right in COMPARISON.findall(expl.partition("\n")[0]):
         slack = float(right) - float(left)
         _keep(site, slack if operator[0] == "<" else -slack)
-        for bound, above in _bounds_before(orig):  # in a chain, the explanation contains only the last comparison
-            _keep((*site[:2], f"{orig} [{bound}]"), float(left) - bound if above else bound - float(left))
+        if low is not None:  # in a chain, the explanation contains only the last comparison
+            _keep((*site[:2], f"{orig} [{low}]"), float(left) - low)
 
 
-def _bounds_before(source: str) -> Iterator[tuple[float, bool]]:
-    """Yield the bound before the value in `low < value < high`, and whether the value lies above it."""
+def _lower_bound(source: str) -> float | None:
+    """Return the number `low` of an assertion `low < value < high`, None for others."""
     try:
         test = ast.parse(source.strip(), mode="eval").body
     except SyntaxError:
-        return
-    if isinstance(test, ast.Compare) and len(test.ops) == 2 and isinstance(test.left, ast.Constant):
-        if isinstance(test.ops[0], ast.Lt | ast.LtE) and isinstance(test.left.value, int | float):
-            yield float(test.left.value), True
+        return None
+    match test:
+        case ast.Compare(left=ast.Constant(value=int() | float() as low), ops=[ast.Lt() | ast.LtE(), _]):
+            return float(low)
+    return None
 
 
 @pytest.hookimpl(trylast=True)
