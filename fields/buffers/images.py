@@ -1,4 +1,5 @@
 """`ImageBuffers`: the rendered image, the reference image, and gradients."""
+# pyright: reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

@@ -1,4 +1,5 @@
 """`TilePairs`: lists of the Gaussians that reach each tile, nearest first."""
+# pyright: reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

@@ -1,4 +1,5 @@
 """`ViewField`: the pose and camera of the current render, as fields for kernels."""
+# pyright: reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

@@ -1,4 +1,5 @@
 """`GaussianField`: the Gaussians of a map, in a pool that grows without recompiling kernels."""
+# pyright: reportInvalidTypeForm=false
 
 from collections.abc import Sequence
 

@@ -1,4 +1,5 @@
 """`OccupancyVoxels`: the Multi-level Occupancy Hash Voxels (MOHV, Section 3.2.3) as a sparse SNode hierarchy."""
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

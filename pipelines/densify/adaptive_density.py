@@ -1,4 +1,5 @@
 """Adaptive density control of 3DGS [Kerbl 2023, Section 5.2]: clone, split, prune, reset opacities."""
+# pyright: reportInvalidTypeForm=false
 
 from typing import NamedTuple
 

@@ -1,4 +1,5 @@
 """The contribution of each Gaussian to a set of views, for the removal of invisible Gaussians."""
+# pyright: reportInvalidTypeForm=false
 
 from collections.abc import Iterable
 

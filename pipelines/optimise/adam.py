@@ -1,4 +1,5 @@
 """Adam over the Gaussians that the last batch of views saw."""
+# pyright: reportInvalidTypeForm=false
 
 from dataclasses import dataclass
 

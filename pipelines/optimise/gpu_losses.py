@@ -3,6 +3,7 @@
 The formulas are those of `pipelines/optimise/losses.py`. The sums stay on the device, where the backward pass reads the
 number of valid pixels. The host reads the values later.
 """
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

@@ -1,4 +1,5 @@
 """Real spherical harmonics up to degree 3, with the order and signs of 3DGS files."""
+# pyright: reportInvalidTypeForm=false
 
 from functools import lru_cache
 

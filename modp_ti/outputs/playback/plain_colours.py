@@ -1,4 +1,5 @@
 """`with_plain_colours`: converts a map to view-independent colours in [0, 1] with the same appearance."""
+# pyright: reportInvalidTypeForm=false
 
 from dataclasses import asdict, replace
 

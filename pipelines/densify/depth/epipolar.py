@@ -1,4 +1,5 @@
 """Depth from a search along epipolar lines in neighbouring keyframes."""
+# pyright: reportInvalidTypeForm=false
 
 from collections.abc import Sequence
 

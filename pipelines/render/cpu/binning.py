@@ -3,6 +3,7 @@
 This is a counting sort over (tile, chunk of slots). It is linear in the number of pairs, stable because chunks and the
 slots in them are processed in depth order, and independent of the number of threads.
 """
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

@@ -1,4 +1,5 @@
 """A power of two that LLVM can vectorise. A call to libm would make every compositing loop scalar."""
+# pyright: reportInvalidTypeForm=false
 
 import taichi as ti
 

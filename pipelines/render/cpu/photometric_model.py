@@ -4,6 +4,7 @@ A (3, 3) and b (3,) are a frame's exposure. The vignette is the fraction of the 
 gradient g of the loss with respect to the image and h = vignette * g, the gradients are
     d colour = A^T h,   d A = sum over the pixels of h colour^T,   d b = sum of h.
 """
+# pyright: reportInvalidTypeForm=false
 
 import cv2
 import numpy as np

@@ -1,4 +1,5 @@
 """Binning on a GPU: pairs are emitted slot by slot, nearest first, and then sorted stably by tile."""
+# pyright: reportInvalidTypeForm=false
 
 from collections import deque
 

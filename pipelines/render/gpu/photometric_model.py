@@ -1,4 +1,5 @@
 """The photometric model on a GPU: one thread per pixel. The gradient of the exposure is summed on the device."""
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

@@ -1,4 +1,5 @@
 """Projection on a GPU: depths are sorted on the device, and the number of visible Gaussians is known only there."""
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti

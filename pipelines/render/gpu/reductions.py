@@ -3,6 +3,7 @@
 A kernel must have at most one loop with shared arrays. Taichi 1.7.4 restarts their names in each loop, and on CUDA two
 arrays of the same name in a kernel are merged, with the size of either.
 """
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
 import taichi as ti
 import torch
