@@ -138,6 +138,12 @@ class SourceSettings(StrictModel):
         "vignetting mask, of the recorded image; empty for none, or for the source's own",
     )
 
+    ground_truth: Path | None = Field(
+        default=None,
+        description="true trajectory of the camera in TUM's format, matched with the frames by time: used only for the "
+        "trajectory errors (`ate_rmse`) in `metrics.json` and the report; empty for none",
+    )
+
     def require_path(self) -> Path:
         """Return `path`.
 

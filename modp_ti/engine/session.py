@@ -26,6 +26,7 @@ from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
@@ -68,6 +69,7 @@ class _Session:
         self.clock = RunClock()
         self.record = RunRecord()
         self.line = ProgressLine(console)
+        self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
         self.observer = self._open_observer()  # opened first, as what follows may take minutes
         self.stop = Interruption(lambda: self._print("stopping after this step; Ctrl-C again stops at once"))
         try:
@@ -271,7 +273,7 @@ class _Session:
     def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
         """Write the scores, the metrics and the report, and return the metrics."""
         pipeline, frames, checkpointer = self.mapper.pipeline, self.mapper.frames, self.checkpointer
-        truth = self.tracker.ground_truth()
+        truth = self._true_poses()
         caught = pipeline.caught()
         if warning := caught.warning():
             self._say(warning)
@@ -301,6 +303,15 @@ class _Session:
             if problem:
                 self._say(problem)
         return metrics
+
+    def _true_poses(self) -> list[NDArray[np.float64]]:
+        """Return the true pose of every frame, NaN where it is unknown; empty without ground truth."""
+        if self.truth is None:
+            return self.tracker.ground_truth()
+        truth, note = true_poses(self.truth, self.mapper.frames.timestamp)
+        if note:
+            self._say(note)
+        return truth
 
     # ---- interruption, viewer, notes -------------------------------------------------------------------------
 

@@ -199,11 +199,13 @@ def absolute_trajectory_error(
 
     Args:
         estimate: T_camera_world (4, 4) of every frame.
-        truth: Ground-truth T_camera_world (4, 4) of every frame.
+        truth: Ground-truth T_camera_world (4, 4) of every frame, NaN for frames without one, which do not count.
         with_scale: Whether to align by a similarity; by a rigid motion otherwise.
     """
     source = np.array([inverse_se3(T)[:3, 3] for T in estimate])
     target = np.array([inverse_se3(T)[:3, 3] for T in truth])
+    known = np.isfinite(target).all(axis=1)
+    source, target = source[known], target[known]
     s, R, t = umeyama(source, target, with_scale)
     return float(np.sqrt(((s * source @ R.T + t - target) ** 2).sum(axis=1).mean()))
 

@@ -105,7 +105,8 @@ def _aligned(
     if len(truth) != len(estimate) or len(truth) < 3:
         return None
     there = _centres(truth)
-    s, R, t = umeyama(there, _centres(estimate))
+    known = np.isfinite(there).all(axis=1)
+    s, R, t = umeyama(there[known], _centres(estimate)[known])
     return s * there @ R.T + t
 
 
