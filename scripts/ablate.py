@@ -6,7 +6,6 @@ folder and reused as long as their settings are the same.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -16,11 +15,12 @@ from experiments import (
     Job,
     command_line,
     execute,
+    experiment_parser,
     first_third_psnr,
     markdown_table,
-    mean_figures,
     named_scenes,
     quality,
+    with_mean,
     write_report,
 )
 
@@ -52,13 +52,7 @@ TABLES = (
 @documented_ending()
 def main() -> None:
     """Run the missing variants, then print and write the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: scripts/ablate desk.yaml fox.yaml -o out/ablation",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("scenes", nargs="+", metavar="scene.yaml", help="scene files, one or several")
-    parser.add_argument("-o", "--output", required=True, type=Path, help="folder of runs, ablation.md, ablation.json")
+    parser = experiment_parser(__doc__, "scripts/ablate desk.yaml fox.yaml -o out/ablation")
     parser.add_argument(
         "--tracker", nargs="+", default=[], metavar="other.yaml", help="for each scene the same with another tracker"
     )
@@ -66,8 +60,6 @@ def main() -> None:
         "--refine", type=int, default=0, metavar="STEPS", help="post refinement of each run (default 0)"
     )
     parser.add_argument("--only", nargs="+", choices=list(VARIANTS), help="these variants instead of all")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of every run")
-    parser.add_argument("--fresh", action="store_true", help="run again what is there already")
     arguments = parser.parse_args()
     scenes = named_scenes(arguments.scenes)
     common = {"refine.steps": str(arguments.refine)} | command_line(arguments.set)
@@ -102,23 +94,15 @@ def plan(
     """
     if trackers and len(trackers) != len(scenes):
         raise InputError(f"--tracker needs one file for each of the {len(scenes)} scenes, got {len(trackers)}")
-    jobs = {
-        scene: {
-            name: Job(f"{scene}, {name}", file, output / scene / _folder(name), {**common, **VARIANTS[name]})
-            for name in variants
-        }
-        for scene, file in scenes.items()
-    }
+
+    def job(scene: str, file: Path, variant: str) -> Job:
+        folder = variant.replace("w/o", "without").replace("& ", "").replace(" ", "-").lower()
+        return Job(f"{scene}, {variant}", file, output / scene / folder, {**common, **VARIANTS.get(variant, {})})
+
+    jobs = {scene: {name: job(scene, file, name) for name in variants} for scene, file in scenes.items()}
     for scene, other in zip(scenes, trackers, strict=False):
-        file = Path(other).resolve()
-        jobs[scene][OTHER_TRACKER] = Job(
-            f"{scene}, {OTHER_TRACKER}", file, output / scene / _folder(OTHER_TRACKER), common
-        )
+        jobs[scene][OTHER_TRACKER] = job(scene, Path(other).resolve(), OTHER_TRACKER)
     return jobs
-
-
-def _folder(variant: str) -> str:
-    return variant.replace("w/o", "without").replace("& ", "").replace(" ", "-").lower()
 
 
 def summary(metrics: Mapping, folder: Path) -> Figures:
@@ -136,14 +120,8 @@ def report(figures: Mapping[str, Mapping[str, Figures]]) -> str:
     Args:
         figures: Figures by scene and variant.
     """
-    parts = {}
-    if len(figures) > 1:
-        variants = [v for v in (*VARIANTS, OTHER_TRACKER) if all(v in of_scene for of_scene in figures.values())]
-        parts[f"Mean of {len(figures)} scenes"] = {
-            v: mean_figures([of_scene[v] for of_scene in figures.values()]) for v in variants
-        }
     lines = ["# Ablations", "", "Held-out frames; all frames where none is held out."]
-    for title, rows in (parts | dict(figures)).items():
+    for title, rows in with_mean(figures).items():
         lines += ["", f"## {title}"]
         for name, columns, variants in TABLES:
             shown = {v: rows[v] for v in variants if v in rows}

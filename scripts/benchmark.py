@@ -19,7 +19,7 @@ from typing import Any
 from benchmarks.report import report
 from benchmarks.whole_runs import measure_runs, planned_runs
 from ending import documented_ending
-from experiments import command_line, write_report
+from experiments import command_line, parser, write_report
 
 from modp_ti.files.errors import InputError
 
@@ -31,21 +31,14 @@ DEMO = Path(__file__).resolve().parent.parent / "demo" / "scene.yaml"
 @documented_ending()
 def main() -> None:
     """Measure and print the tables. The exit code is 2 for bad input."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: scripts/benchmark --quick -o out/benchmark",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="also write benchmark.md and .json there")
-    parser.add_argument("--quick", action="store_true", help="the first size only; no growth, no voxels, no whole run")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
-    parser.add_argument("--scene", action="append", metavar="FILE", help="scene of a whole run (default: the demo)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="a setting of the whole runs"
-    )
-    parser.add_argument("--repeats", type=int, default=15, help="timed calls a figure (default 15)")
-    parser.add_argument("--measure", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    options = parser(__doc__, "scripts/benchmark --quick -o out/benchmark")
+    options.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="also write benchmark.md and .json there")
+    options.add_argument("--quick", action="store_true", help="the first size only; no growth, no voxels, no whole run")
+    options.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
+    options.add_argument("--scene", action="append", metavar="FILE", help="scene of a whole run (default: the demo)")
+    options.add_argument("--repeats", type=int, default=15, help="timed calls a figure (default 15)")
+    options.add_argument("--measure", help=argparse.SUPPRESS)
+    arguments = options.parse_args()
     if arguments.measure:
         print(json.dumps(measure(**json.loads(arguments.measure))))
         return
@@ -60,7 +53,7 @@ def main() -> None:
 def collect(arguments: argparse.Namespace) -> dict[str, Any]:
     """Run all measurements and return the figures by kind."""
     device, repeats = arguments.device, arguments.repeats
-    runs = (arguments.scene or [str(DEMO)], device, command_line(arguments.settings))
+    runs = (arguments.scene or [str(DEMO)], device, command_line(arguments.set))
     if not arguments.quick:
         planned_runs(*runs, Path())  # reports bad input now instead of after minutes of measuring
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -6,7 +6,6 @@ runs are kept in the output folder and reused as long as their settings are the 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,13 @@ from experiments import (
     Job,
     command_line,
     execute,
+    experiment_parser,
     mapping_seconds,
     markdown_table,
     mean_figures,
     named_scenes,
     quality,
+    with_mean,
     write_report,
 )
 
@@ -50,21 +51,11 @@ BREAKDOWN = {
 @documented_ending()
 def main() -> None:
     """Run the missing jobs, then print and write the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: scripts/compare desk.yaml -o out/comparison --steps 1000 3000",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("scenes", nargs="+", metavar="scene.yaml", help="scene files, one or several")
-    parser.add_argument(
-        "-o", "--output", required=True, type=Path, help="folder of the runs, comparison.md, comparison.json"
-    )
+    parser = experiment_parser(__doc__, "scripts/compare desk.yaml -o out/comparison --steps 1000 3000")
     parser.add_argument(
         "--steps", nargs="+", type=int, default=[1000], help="post refinements, a run for each (default 1000)"
     )
     parser.add_argument("--no-offline", action="store_true", help="leave offline 3DGS out")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of every run")
-    parser.add_argument("--fresh", action="store_true", help="run again what is there already")
     arguments = parser.parse_args()
     if min(arguments.steps) < 1:
         parser.error("--steps must be positive: the online map is a row in any case")
@@ -150,13 +141,8 @@ def report(figures: Mapping[str, Mapping[str, Figures]], breakdown: Mapping[str,
         figures: Figures by scene and row.
         breakdown: Time by scene [%].
     """
-    tables: dict[str, Mapping[str, Figures]] = {}
     times = dict(breakdown)
     if len(figures) > 1:
-        labels = next(iter(figures.values()))
-        tables[f"Mean of {len(figures)} scenes"] = {
-            label: mean_figures([rows[label] for rows in figures.values()]) for label in labels
-        }
         times["mean"] = mean_figures(list(breakdown.values()))
     lines = [
         "# Online and offline",
@@ -164,7 +150,7 @@ def report(figures: Mapping[str, Mapping[str, Figures]], breakdown: Mapping[str,
         "Held-out frames; all frames where none is held out. Time without compiling, the tracker's preparation and "
         "evaluation.",
     ]
-    for title, rows in (tables | dict(figures)).items():
+    for title, rows in with_mean(figures).items():
         lines += ["", f"## {title}", "", markdown_table("map", COLUMNS, rows)]
     columns = {label: (label, ".2f") for label in (*BREAKDOWN, "FPS")}
     lines += ["", "## Time of the online run, percent", "", markdown_table("scene", columns, times)]

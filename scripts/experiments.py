@@ -5,8 +5,10 @@ Used by ablate.py and compare.py.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
+import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,21 +18,6 @@ from typing import Any
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
-
-__all__ = [
-    "Figures",
-    "Job",
-    "command_line",
-    "execute",
-    "first_third_psnr",
-    "load_metrics",
-    "mapping_seconds",
-    "markdown_table",
-    "mean_figures",
-    "named_scenes",
-    "quality",
-    "write_report",
-]
 
 # Figures of one table row by name; None if a run does not have the figure.
 Figures = Mapping[str, float | None]
@@ -57,9 +44,8 @@ class Job:
     def arguments(self) -> list[str]:
         """Return the overrides, including the output folder, as `key=value` arguments."""
         # JSON is valid YAML, whatever characters the path contains.
-        return [f"{key}={value}" for key, value in self.overrides.items()] + [
-            f"output={json.dumps(str(self.folder.resolve()))}"
-        ]
+        overrides = {**self.overrides, "output": json.dumps(str(self.folder.resolve()))}
+        return [f"{key}={value}" for key, value in overrides.items()]
 
     def check(self) -> dict[str, Any]:
         """Return the run's resolved settings. Raises InputError if they are not valid."""
@@ -74,6 +60,26 @@ class Job:
             return load_scene(written).model_dump(mode="json") == self.check()
         except InputError:  # from an incompatible version
             return False
+
+
+def parser(description: str | None, example: str) -> argparse.ArgumentParser:
+    """Return a command line parser that keeps the lines of the description, with the option `--set`."""
+    result = argparse.ArgumentParser(
+        description=description,
+        epilog=f"example: {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of every run")
+    return result
+
+
+def experiment_parser(description: str | None, example: str) -> argparse.ArgumentParser:
+    """Return a parser of scenes, output folder, `--set` and `--fresh`."""
+    result = parser(description, example)
+    result.add_argument("scenes", nargs="+", metavar="scene.yaml", help="scene files, one or several")
+    result.add_argument("-o", "--output", required=True, type=Path, help="folder of the runs and of the tables")
+    result.add_argument("--fresh", action="store_true", help="repeat finished runs")
+    return result
 
 
 def named_scenes(files: Iterable[str]) -> dict[str, Path]:
@@ -166,23 +172,31 @@ def first_third_psnr(folder: Path, stage: str) -> float | None:
     if not file.is_file():
         return None
     with file.open(encoding="utf-8", newline="") as lines:
-        rows = sorted(
-            (row for row in csv.DictReader(lines) if row["stage"] == stage), key=lambda row: int(row["index"])
-        )
+        rows = [row for row in csv.DictReader(lines) if row["stage"] == stage]
+    rows.sort(key=lambda row: int(row["index"]))
     some_held_out = any(row["held_out"] == "1" for row in rows)
     early = rows[: -(-len(rows) // 3)]
     scores = [float(row["psnr"]) for row in early if row["held_out"] == "1" or not some_held_out]
-    return sum(scores) / len(scores) if scores else None
+    return statistics.fmean(scores) if scores else None
 
 
 def mean_figures(scenes: Sequence[Figures]) -> Figures:
     """Return the mean of every figure over the scenes, None if a scene lacks it."""
     result: dict[str, float | None] = {}
     for name in scenes[0]:
-        values = [figures[name] for figures in scenes]
-        known = [value for value in values if value is not None]
-        result[name] = sum(known) / len(known) if len(known) == len(values) else None
+        known = [value for figures in scenes if (value := figures[name]) is not None]
+        result[name] = statistics.fmean(known) if len(known) == len(scenes) else None
     return result
+
+
+def with_mean(figures: Mapping[str, Mapping[str, Figures]]) -> dict[str, Mapping[str, Figures]]:
+    """Return the rows of every scene by title; with several scenes, the mean of their common rows comes first."""
+    if len(figures) < 2:
+        return dict(figures)
+    first, *others = figures.values()
+    labels = [label for label in first if all(label in rows for rows in others)]
+    mean = {label: mean_figures([rows[label] for rows in figures.values()]) for label in labels}
+    return {f"Mean of {len(figures)} scenes": mean, **figures}
 
 
 def markdown_table(corner: str, columns: Mapping[str, tuple[str, str]], rows: Mapping[str, Figures]) -> str:

@@ -22,9 +22,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
-ROOT = Path(__file__).resolve().parents[1]
-CORPUS = ROOT / "tests" / "corpus"
-sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
+CORPUS = Path(__file__).resolve().parents[1] / "corpus"
 
 TIMEOUT = 20  # seconds for one input
 LONGEST = 1 << 14  # bytes of an input
@@ -40,13 +38,10 @@ def main() -> None:
     options = parser.parse_args()
     import atheris
 
-    for kernels in (
-        "online",
-        "torch_checkpoint",
-    ):  # compiled by Taichi and PyTorch, so there is nothing to instrument
+    for kernels in ("online", "torch_checkpoint"):  # compiled by Taichi and PyTorch: nothing to instrument
         import_module(f"pipelines.{kernels}")
     with atheris.instrument_imports(include=["modp_ti"]):
-        from fault_injection.readers import READERS, import_readers
+        from tests.fault_injection.readers import READERS, import_readers
 
         unknown = [name for name in options.reader if name not in READERS]
         if unknown:
@@ -79,7 +74,7 @@ def one(name: str, options: argparse.Namespace) -> bool:
         runs = [int(number) for number in re.findall(r"(?:^#|^Done |executed_units: *)(\d+)", text, re.MULTILINE)]
         crashes = sorted(kept.glob("crash-new-*"))
         reason = "" if status == 0 and not crashes else _reason(text)
-        new = sorted((file for file in found.iterdir()), key=lambda file: (file.stat().st_size, file.name))
+        new = sorted(found.iterdir(), key=lambda file: (file.stat().st_size, file.name))
         seconds = [f"{time.monotonic() - began:.0f}", f"{used.ru_utime + used.ru_stime:.0f}"]
         row = [name, *seconds, f"{max(runs, default=0):,}", str(len(new)), reason]
         print(f"| {' | '.join(row)} |", flush=True)
@@ -102,7 +97,8 @@ def _reason(text: str) -> str:
 def fuzz(name: str, folder: Path, kept: Path, options: argparse.Namespace) -> NoReturn:
     """Fuzz a reader in this process. libFuzzer ends the process."""
     import atheris
-    from fault_injection.readers import READERS, seeds
+
+    from tests.fault_injection.readers import READERS, seeds
 
     log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT)
     for descriptor in (1, 2):

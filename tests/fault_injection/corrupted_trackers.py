@@ -7,7 +7,7 @@ import struct
 
 import msgpack
 
-from fault_injection.corruptions import (
+from tests.fault_injection.corruptions import (
     HUGE,
     Corruption,
     appended,

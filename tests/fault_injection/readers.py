@@ -15,8 +15,8 @@ from threading import Event
 
 import numpy as np
 
-from fault_injection.samples import SAMPLES, write_sample
 from modp_ti.files.errors import InputError
+from tests.fault_injection.samples import SAMPLES, write_sample
 
 __all__ = ["READERS", "Reader", "import_readers", "seeds"]
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fault_injection.runs import contents, finished, require_success, run_until
+from tests.fault_injection.runs import contents, finished, require_success, run_until
 
 __all__ = ["KILLS_SCENE", "Kills", "kill_and_resume", "kills_table"]
 

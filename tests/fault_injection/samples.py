@@ -14,7 +14,7 @@ import cv2
 import msgpack
 import numpy as np
 
-from fault_injection.small_recording import (
+from tests.fault_injection.small_recording import (
     FOCAL,
     FRAMES,
     HEIGHT,

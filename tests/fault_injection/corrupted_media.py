@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fault_injection.corruptions import (
+from tests.fault_injection.corruptions import (
     HUGE,
     TEXT,
     Corruption,

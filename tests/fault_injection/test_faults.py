@@ -7,20 +7,20 @@ import sys
 from pathlib import Path
 
 import cv2
-import faults
 import numpy as np
 import pytest
-from fault_injection.kills import KILLS_SCENE, Kills, kills_table
-from fault_injection.runs import finished, run_until
-from fault_injection.soak import Soak, soak_table
-from fault_injection.stream import FAULTS, HOLDOUT, Stream, disturb, stream_table, write_recording
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.formats.trajectory import write_trajectory
+from tests.fault_injection.kills import KILLS_SCENE, Kills, kills_table
+from tests.fault_injection.runs import finished, run_until
+from tests.fault_injection.soak import Soak, soak_table
+from tests.fault_injection.stream import FAULTS, HOLDOUT, Stream, disturb, stream_table, write_recording
 
 FRAMES = 60
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -102,8 +102,8 @@ def test_the_tables_say_what_came_of_it() -> None:
 
 
 def test_an_unknown_part_gets_one_line_and_code_two(tmp_path: Path) -> None:
-    command = [sys.executable, faults.__file__, "thunder", "-o", str(tmp_path / "out")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    command = [sys.executable, "-m", "tests.fault_injection.faults", "thunder", "-o", str(tmp_path / "out")]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert result.returncode == 2
     assert "thunder is none of kills, stream, soak" in result.stderr
     assert not (tmp_path / "out").exists()

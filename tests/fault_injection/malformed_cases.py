@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fault_injection.corrupted_media import IMAGES, MASK, PATH, RUN, VIDEO
-from fault_injection.corrupted_trackers import (
+from tests.fault_injection.corrupted_media import IMAGES, MASK, PATH, RUN, VIDEO
+from tests.fault_injection.corrupted_trackers import (
     ARIA,
     COLMAP,
     COLMAP_TEXT,
@@ -20,8 +20,8 @@ from fault_injection.corrupted_trackers import (
     TUM,
     TUM_RGBD,
 )
-from fault_injection.corruptions import ANYWHERE, TEXT, Corruption
-from fault_injection.samples import SAMPLES
+from tests.fault_injection.corruptions import ANYWHERE, TEXT, Corruption
+from tests.fault_injection.samples import SAMPLES
 
 __all__ = ["CASES", "Case"]
 

@@ -6,7 +6,8 @@ import warnings
 from pathlib import Path
 
 import pytest
-from fault_injection.readers import READERS, seeds
+
+from tests.fault_injection.readers import READERS, seeds
 
 CORPUS = Path(__file__).resolve().parents[1] / "corpus"
 

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fault_injection.runs import finished, metrics
 from fields.geometry.se3 import exp_se3
 from fields.runtime.backend import initialise
 from modp_ti.inputs.synthetic import SyntheticTracker
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
+from tests.fault_injection.runs import finished, metrics
 
 __all__ = ["FAULTS", "Stream", "map_both", "stream_table", "write_recording"]
 

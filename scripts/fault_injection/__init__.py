@@ -1,1 +1,0 @@
-"""Fault injection: malformed files, killed runs, disturbed streams."""
