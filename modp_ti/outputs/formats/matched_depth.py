@@ -200,7 +200,7 @@ def _matching_cost(
 
 def _moments(grey: Image, window: int) -> tuple[Image, Image]:
     """Return mean and variance (H, W) of the window around each pixel."""
-    mean = cv2.blur(grey, (window, window))
+    mean = np.asarray(cv2.blur(grey, (window, window)), dtype=np.float32)
     return mean, np.maximum(cv2.blur(grey * grey, (window, window)) - mean * mean, 0.0)
 
 
