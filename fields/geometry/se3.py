@@ -15,6 +15,7 @@ __all__ = [
     "interpolate_se3",
     "inverse_se3",
     "log_se3",
+    "matrices_from_unit_quaternions",
     "matrix_from_quaternion",
     "orthonormalised",
     "quaternion_from_matrix",
@@ -90,37 +91,37 @@ def orthonormalised(T: ArrayLike) -> NDArray[np.float64]:
 
 def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrix (3, 3) of a quaternion (w, x, y, z) of any length but zero."""
-    w, x, y, z = np.asarray(q, dtype=np.float64) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    q = np.asarray(q, dtype=np.float64)
+    return matrices_from_unit_quaternions(q / np.linalg.norm(q))
+
+
+def matrices_from_unit_quaternions(q: NDArray) -> NDArray:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4) as (w, x, y, z), in the type of `q`."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
     """Unit quaternion (w, x, y, z) of a rotation matrix (3, 3), from its largest component for numerical stability."""
     R = np.asarray(R, dtype=np.float64)
-    squares = np.array(
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    # Row k is 4 q_k q.
+    rows = np.array(
         [
-            1 + R[0, 0] + R[1, 1] + R[2, 2],
-            1 + R[0, 0] - R[1, 1] - R[2, 2],
-            1 - R[0, 0] + R[1, 1] - R[2, 2],
-            1 - R[0, 0] - R[1, 1] + R[2, 2],
+            [1 + R[0, 0] + R[1, 1] + R[2, 2], x, y, z],
+            [x, 1 + R[0, 0] - R[1, 1] - R[2, 2], xy, xz],
+            [y, xy, 1 - R[0, 0] + R[1, 1] - R[2, 2], yz],
+            [z, xz, yz, 1 - R[0, 0] - R[1, 1] + R[2, 2]],
         ]
     )
-    k = int(np.argmax(squares))
-    if k == 0:
-        q = [squares[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
-    elif k == 1:
-        q = [R[2, 1] - R[1, 2], squares[1], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]]
-    elif k == 2:
-        q = [R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], squares[2], R[1, 2] + R[2, 1]]
-    else:
-        q = [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], squares[3]]
-    q = np.array(q) / (2.0 * np.sqrt(squares[k]))
+    k = int(np.argmax(rows.diagonal()))
+    q = rows[k] / (2.0 * np.sqrt(rows[k, k]))
     return q / np.linalg.norm(q)
 
 

@@ -9,6 +9,7 @@ import io
 import numpy as np
 import taichi as ti
 import torch
+from taichi.lang import impl
 
 from fields.runtime.kernel_sources import answer_quickly
 from fields.runtime.workers import pin_workers, threads_of_process
@@ -57,7 +58,7 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
         options["cpu_max_num_threads"] = threads
     if device in ("cuda", "auto") and _has_cuda_driver() and torch.cuda.is_available():
         _start(ti.cuda, options | {"device_memory_GB": SPARSE_POOL})
-        if ti.lang.impl.current_cfg().arch == ti.cuda:
+        if impl.current_cfg().arch == ti.cuda:
             return "cuda"
     if device == "cuda":
         # PyTorch sorts on the device, in the same memory: a build without CUDA cannot.
@@ -65,12 +66,12 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
         raise RuntimeError(f"device: cuda was asked for, but {missing}; use device: cpu or auto")
     if device == "vulkan":
         _start(ti.vulkan, options)
-        if ti.lang.impl.current_cfg().arch == ti.vulkan:
+        if impl.current_cfg().arch == ti.vulkan:
             return "vulkan"
         raise RuntimeError("no Vulkan driver starts here")
     before = threads_of_process()
     _start(ti.cpu, options)
-    pin_workers(before, ti.lang.impl.current_cfg().cpu_max_num_threads)
+    pin_workers(before, impl.current_cfg().cpu_max_num_threads)
     return "cpu"
 
 
@@ -109,7 +110,7 @@ def program() -> object:
     Raises:
         RuntimeError: If `initialise` has not been called.
     """
-    running = ti.lang.impl.get_runtime().prog
+    running = impl.get_runtime().prog
     if running is None:
         raise RuntimeError('Taichi does not run yet: call modp_ti.initialise("cpu") (or "cuda", "auto") first')
     return running
@@ -117,12 +118,12 @@ def program() -> object:
 
 def on_gpu() -> bool:
     """Whether dense storage and the kernels of `render/gpu` are in use: on CUDA and Vulkan."""
-    return ti.lang.impl.current_cfg().arch in (ti.cuda, ti.vulkan)
+    return impl.current_cfg().arch in (ti.cuda, ti.vulkan)
 
 
 def torch_device() -> torch.device:
     """Device on which kernels can read and write tensors without a copy."""
-    return torch.device("cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu")
+    return torch.device("cuda" if impl.current_cfg().arch == ti.cuda else "cpu")
 
 
 def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
@@ -137,7 +138,7 @@ def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
     Returns:
         A tensor on a CUDA device; otherwise the array itself.
     """
-    if ti.lang.impl.current_cfg().arch != ti.cuda:
+    if impl.current_cfg().arch != ti.cuda:
         return array
     return torch.from_numpy(array).pin_memory().to("cuda", non_blocking=True)
 
@@ -151,7 +152,7 @@ def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:
     return builder.dense(ti.i, blocks) if on_gpu() else builder.pointer(ti.i, blocks)
 
 
-def refuse_too_many_fields(last_placed: object) -> None:
+def refuse_too_many_fields(last_placed: ti.ScalarField | ti.MatrixField) -> None:
     """Check that the fields placed so far fit into Taichi's runtime.
 
     Args:

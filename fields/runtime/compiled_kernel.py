@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import taichi as ti
 import torch
+from taichi.lang import impl
 
 from fields.runtime.backend import on_gpu
 
@@ -48,6 +48,8 @@ class CompiledKernel:
             self.compile(*arguments)
             return
         context = self._make_context()
+        place: int
+        value: Any  # not narrowed by `kind`, whose comparison is faster than isinstance
         for place, value in enumerate(arguments):
             kind = value.__class__
             if kind is int:
@@ -67,7 +69,7 @@ class CompiledKernel:
 
     def compile(self, *arguments: int | float | np.ndarray | torch.Tensor) -> None:
         """Compile the kernel for arguments of these types, without launching it."""
-        program = ti.lang.impl.get_runtime().prog
+        program: Any = impl.get_runtime().prog
         compiled = self._kernel.compiled_kernels[
             self._kernel.ensure_compiled(self._owner, *self._constants, *arguments)
         ]

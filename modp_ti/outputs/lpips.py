@@ -101,9 +101,9 @@ def open_lpips(folder: Path | None, side: int) -> tuple[Lpips | None, str | None
     places = [folder] if folder is not None else [Path(torch.hub.get_dir()) / "checkpoints"]
     alexnet = _first(places, ALEXNET)
     linear = _first([*places, *_package()], LINEAR)
-    missing = [name for name, file in ((ALEXNET, alexnet), (LINEAR, linear)) if file is None]
     try:
-        if missing:
+        if alexnet is None or linear is None:
+            missing = [name for name, file in ((ALEXNET, alexnet), (LINEAR, linear)) if file is None]
             raise ValueError(f"no {' and no '.join(missing)} in {places[0]}")
         return Lpips(alexnet, linear), None
     except ValueError as error:

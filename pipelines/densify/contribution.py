@@ -1,5 +1,5 @@
 """The contribution of each Gaussian to a set of views, for the removal of invisible Gaussians."""
-# pyright: reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 from collections.abc import Iterable
 

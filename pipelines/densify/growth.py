@@ -68,7 +68,7 @@ def dissimilarity(render: NDArray[np.floating], rgba: NDArray[np.uint8]) -> NDAr
     """
 
     def smooth(image: NDArray, side: int, sigma: float) -> NDArray[np.float32]:
-        return cv2.GaussianBlur(image, (side, side), sigma)
+        return np.asarray(cv2.GaussianBlur(image, (side, side), sigma), dtype=np.float32)
 
     a = smooth(cv2.cvtColor(np.clip(render, 0, 1).astype(np.float32), cv2.COLOR_RGB2GRAY), 5, 0.5)
     b = smooth(cv2.cvtColor(rgba[..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0, 5, 0.5)

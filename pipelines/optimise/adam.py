@@ -1,5 +1,5 @@
 """Adam over the Gaussians that the last batch of views saw."""
-# pyright: reportInvalidTypeForm=false
+# pyright: reportInvalidTypeForm=false, reportOptionalCall=false, reportOptionalSubscript=false
 
 from dataclasses import dataclass
 
@@ -99,6 +99,11 @@ class Adam:
         v = betas[1] * v + (1.0 - betas[1]) * gradient * gradient
         return value - lr * (m * corrections[0]) / (ti.sqrt(v * corrections[1]) + eps)
 
+    @ti.func
+    def _update_field(self, i, value: ti.template(), m: ti.template(), v: ti.template(), lr, betas, corrections, eps):
+        value[i] = self._update(value[i], value.grad[i], m[i], v[i], lr, betas, corrections, eps)
+
+    # Scalars instead of one array: on CUDA, Taichi would copy a NumPy array in both directions and wait for it.
     @ti.kernel
     def _step(
         self,
@@ -133,45 +138,13 @@ class Adam:
                 corrections = ti.Vector([_one_over_complement(t * log_beta1), _one_over_complement(t * log_beta2)])
                 # Vectors, and not components, since unrolled code compiles slowly in Taichi.
                 g = self.gaussians
-                g.position[i] = self._update(
-                    g.position[i],
-                    g.position.grad[i],
-                    g.position_m[i],
-                    g.position_v[i],
-                    lr_position,
-                    betas,
-                    corrections,
-                    eps,
+                self._update_field(i, g.position, g.position_m, g.position_v, lr_position, betas, corrections, eps)
+                self._update_field(i, g.log_scale, g.log_scale_m, g.log_scale_v, lr_log_scale, betas, corrections, eps)
+                self._update_field(
+                    i, g.quaternion, g.quaternion_m, g.quaternion_v, lr_quaternion, betas, corrections, eps
                 )
-                g.log_scale[i] = self._update(
-                    g.log_scale[i],
-                    g.log_scale.grad[i],
-                    g.log_scale_m[i],
-                    g.log_scale_v[i],
-                    lr_log_scale,
-                    betas,
-                    corrections,
-                    eps,
-                )
-                g.quaternion[i] = self._update(
-                    g.quaternion[i],
-                    g.quaternion.grad[i],
-                    g.quaternion_m[i],
-                    g.quaternion_v[i],
-                    lr_quaternion,
-                    betas,
-                    corrections,
-                    eps,
-                )
-                g.opacity_logit[i] = self._update(
-                    g.opacity_logit[i],
-                    g.opacity_logit.grad[i],
-                    g.opacity_logit_m[i],
-                    g.opacity_logit_v[i],
-                    lr_opacity,
-                    betas,
-                    corrections,
-                    eps,
+                self._update_field(
+                    i, g.opacity_logit, g.opacity_logit_m, g.opacity_logit_v, lr_opacity, betas, corrections, eps
                 )
                 for k in range(active):
                     # The view-dependent part has a twentieth of the rate, as in 3DGS.

@@ -40,7 +40,7 @@ def scene_colours(view: Keyframe, pixels: NDArray[np.int64]) -> NDArray[np.float
     column, row = pixels.T
     colours = view.rgba[row, column, :3] / 255.0
     if view.vignette is not None:
-        colours = colours / _vignette_at(view)[row, column]
+        colours = colours / _resized(view.vignette, view.rgba)[row, column]
     if view.exposure is not None:
         colours = (colours - view.exposure[:, 3]) @ np.linalg.pinv(view.exposure[:, :3]).T
     if view.vignette is None and view.exposure is None:
@@ -48,12 +48,12 @@ def scene_colours(view: Keyframe, pixels: NDArray[np.int64]) -> NDArray[np.float
     return np.clip(colours, 0.0, BRIGHTEST)
 
 
-def _vignette_at(view: Keyframe) -> NDArray[np.float32]:
-    """The vignette (H, W, 3) at the size of the view's image, which may be a level of its pyramid."""
-    height, width = view.rgba.shape[:2]
-    if view.vignette.shape[:2] == (height, width):
-        return view.vignette
-    return cv2.resize(view.vignette, (width, height), interpolation=cv2.INTER_AREA)
+def _resized(vignette: NDArray[np.float32], rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The vignette (H, W, 3) at the size of an image, which may be a level of its pyramid."""
+    height, width = rgba.shape[:2]
+    if vignette.shape[:2] == (height, width):
+        return vignette
+    return np.asarray(cv2.resize(vignette, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def fitted_exposure(
@@ -122,7 +122,7 @@ class ExposureRefinement:
             return
         image = view.rgba[known][:, :3] / 255.0
         if view.vignette is not None:
-            image = image / _vignette_at(view)[known]
+            image = image / _resized(view.vignette, view.rgba)[known]
         colours = renderer.images.colour_to_numpy()[known]
         view.exposure = fitted_exposure(colours, image, view.exposure, self.settings.prior)
 

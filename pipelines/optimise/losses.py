@@ -6,7 +6,7 @@ mu = G*x, e_xx = G*xx, e_xy = G*xy, the gradient is
 Both convolutions are separable and work on strips of rows whose scratch memory stays in the cache. S depends on e_xx
 and e_yy only through their sum, which saves one convolution.
 """
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportOptionalSubscript=false
 
 from dataclasses import dataclass
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe, KeyframeStore
@@ -171,7 +172,12 @@ class MapOptimiser:
         return seen
 
     def _move_pose(self, view: Keyframe, gradients: list[AsyncReadback], rate: float) -> None:
-        self.poses.step(view, sum(g.numpy().astype(np.float64) for g in gradients), rate)
+        self.poses.step(view, _total(gradients), rate)
 
     def _move_exposure(self, view: Keyframe, gradients: list[AsyncReadback], weight: float) -> None:
-        self.exposure.step(view, sum(g.numpy().astype(np.float64) for g in gradients), weight)
+        self.exposure.step(view, _total(gradients), weight)
+
+
+def _total(gradients: list[AsyncReadback]) -> NDArray[np.float64]:
+    """Sum of gradients, in order. Waits for the device."""
+    return np.sum([g.numpy().astype(np.float64) for g in gradients], axis=0)

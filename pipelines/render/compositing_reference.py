@@ -3,7 +3,7 @@
 It follows the equations of `compositing.py` directly. It is much slower on a CPU, since each pixel's loop is scalar.
 The tests compare the two implementations, and `scripts/benchmark` prints the ratio of their times.
 """
-# pyright: reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import taichi as ti
 

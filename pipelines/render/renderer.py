@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -27,8 +28,21 @@ from pipelines.render.gpu.projection import DeviceProjection
 __all__ = ["RenderedView", "Renderer"]
 
 
-STAGES = (Projection, Binning, Compositing, PhotometricModel)
-DEVICE_STAGES = (DeviceProjection, DeviceBinning, DeviceCompositing, DevicePhotometricModel)
+class CompositingStage(Protocol):
+    """Protocol of compositing on the CPU and on a GPU."""
+
+    def forward(self) -> None:
+        """Fill `images.colour`, `.depth` and `.opacity`."""
+
+    def backward(self, with_depth: bool = False) -> None:
+        """Propagate `images.*_grad`, with or without `images.depth_grad`, to the gradients in `projected`."""
+
+
+class BinningStage(Protocol):
+    """Protocol of binning on the CPU and on a GPU."""
+
+    def forward(self, exact: bool = True) -> object:
+        """Bin the projected Gaussians of the current view; see `Renderer.forward` for `exact`."""
 
 
 @dataclass(frozen=True)
@@ -77,17 +91,24 @@ class Renderer:
         self.view = ViewField(builder, real)
         self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
         self.images = ImageBuffers(builder, max_width, max_height, real, image_cache_gb)
+        self.projection: Projection
+        self.binning: BinningStage
+        self.compositing: CompositingStage
+        self.photometric_model: PhotometricModel
         if on_gpu():
-            self.pairs = DevicePairs(builder, max_width, max_height)
+            self.pairs = pairs = DevicePairs(builder, max_width, max_height)
+            self.projection = DeviceProjection(gaussians, self.view, self.projected)
+            self.binning = DeviceBinning(self.view, self.projected, pairs)
+            self.compositing = DeviceCompositing(self.view, self.projected, pairs, self.images)
+            self.photometric_model = DevicePhotometricModel(self.images)
         else:
-            self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
+            self.pairs = pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
+            self.projection = Projection(gaussians, self.view, self.projected)
+            self.binning = Binning(self.view, self.projected, pairs)
+            self.compositing = Compositing(self.view, self.projected, pairs, self.images)
+            self.photometric_model = PhotometricModel(self.images)
         builder.finalize()
         refuse_too_many_fields(self.pairs.last_placed)
-        projection, binning, compositing, photometric_model = DEVICE_STAGES if on_gpu() else STAGES
-        self.projection = projection(gaussians, self.view, self.projected)
-        self.binning = binning(self.view, self.projected, self.pairs)
-        self.compositing = compositing(self.view, self.projected, self.pairs, self.images)
-        self.photometric_model = photometric_model(self.images)
         self.view_renders = 0
 
     def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float, exact: bool = True) -> None:

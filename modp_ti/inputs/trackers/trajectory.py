@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import matrices_from_unit_quaternions
 from modp_ti.config.tracker_settings import TimedPosesSettings
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.files.number_rows import read_number_rows
@@ -115,14 +116,8 @@ def poses_of_quaternions(
             f"{where(int(wrong[0]))}: the quaternion qx qy qz qw has length {length[wrong[0]]:.4g} instead of 1; "
             "check the order of the columns"
         )
-    x, y, z, w = (quaternion / length[:, None]).T
     poses = np.tile(np.eye(4), (len(quaternion), 1, 1))
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    poses[:, :3, :3] = np.array(rows).transpose(2, 0, 1)
+    poses[:, :3, :3] = matrices_from_unit_quaternions((quaternion / length[:, None])[:, [3, 0, 1, 2]])
     poses[:, :3, 3] = translation
     return poses
 

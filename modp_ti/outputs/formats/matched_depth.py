@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
+from pipelines.densify.depth.plane_sweep import plane_warp, sub_sample_peak
 
 __all__ = ["DepthView", "agreed_depth", "choose_neighbours", "matched_depth"]
 
@@ -139,11 +140,9 @@ def agreed_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[in
 
 
 def _warp(view: DepthView, other: DepthView) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return A (3, 3), b (3,): pixel (x, y) at inverse depth w is at A (x, y, 1) + w b (homogeneous) in `other`."""
-    T = other.T_camera_world @ inverse_se3(view.T_camera_world)
-    K = other.camera.matrix()
-    A = K @ T[:3, :3] @ np.linalg.inv(view.camera.matrix())
-    return A.astype(np.float32), (K @ T[:3, 3]).astype(np.float32)
+    """Return A (3, 3) and b (3,) of `plane_warp`."""
+    warp = plane_warp(view.camera, view.T_camera_world, other.camera, other.T_camera_world).astype(np.float32)
+    return np.ascontiguousarray(warp[:, :3]), np.ascontiguousarray(warp[:, 3])
 
 
 def _swept(
@@ -201,7 +200,7 @@ def _matching_cost(
 
 def _moments(grey: Image, window: int) -> tuple[Image, Image]:
     """Return mean and variance (H, W) of the window around each pixel."""
-    mean = cv2.blur(grey, (window, window))
+    mean = np.asarray(cv2.blur(grey, (window, window)), dtype=np.float32)
     return mean, np.maximum(cv2.blur(grey * grey, (window, window)) - mean * mean, 0.0)
 
 
@@ -228,4 +227,4 @@ def _least(cost: NDArray[np.float32]) -> Image:
     best = np.clip(cost.argmin(axis=2), 1, cost.shape[2] - 2)[..., None]
     left, middle, right = (np.take_along_axis(cost, best + k, axis=2)[..., 0] for k in (-1, 0, 1))
     curvature = np.maximum(left + right - 2.0 * middle, 1e-6)
-    return best[..., 0] + np.clip((left - right) / (2.0 * curvature), -0.5, 0.5)
+    return best[..., 0] + sub_sample_peak(right, left, curvature)

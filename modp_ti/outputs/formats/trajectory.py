@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import matrices_from_unit_quaternions
 from modp_ti.files import LARGEST, text_lines
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
@@ -78,7 +79,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], 
     table = np.frombuffer(rows).reshape(-1, 8)
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     for pose, row in zip(poses, table, strict=True):
-        rotation = _rotation(row[4:])
+        rotation = matrices_from_unit_quaternions((row[4:] / np.linalg.norm(row[4:]))[[3, 0, 1, 2]])
         pose[:3, :3] = rotation.T
         pose[:3, 3] = -rotation.T @ row[1:4]
     return table[:, 0], poses
@@ -97,15 +98,3 @@ def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     )
     q = np.linalg.eigh(K)[1][:, -1]
     return q if q[3] >= 0 else -q
-
-
-def _rotation(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation matrix of a quaternion (x, y, z, w) of any length."""
-    x, y, z, w = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import matrices_from_unit_quaternions
 from fields.map.gaussians import SH_C0
 
 __all__ = ["Splats", "splats_of"]
@@ -46,15 +47,7 @@ def splats_of(state: Mapping[str, NDArray], units: float, limit: int) -> Splats:
     chosen = np.arange(count) if count <= limit else np.arange(limit) * count // limit
     larger = np.sqrt(count / len(chosen)) if len(chosen) else 1.0
     q = state["quaternion"][chosen].astype(np.float32)
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    R = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1),
-        ],
-        axis=1,
-    )
+    R = matrices_from_unit_quaternions(q / np.linalg.norm(q, axis=1, keepdims=True))
     M = R * (np.exp(state["log_scale"][chosen]) * np.float32(units * larger))[:, None, :]
     opacity = 1.0 / (1.0 + np.exp(-state["opacity_logit"][chosen]))
     colour = np.clip(0.5 + SH_C0 * state["sh"][chosen, 0], 0.0, 1.0)

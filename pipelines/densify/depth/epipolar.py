@@ -13,6 +13,7 @@ from fields.map.keyframes import Keyframe
 from fields.runtime.backend import on_gpu
 from fields.runtime.parallel import HANDED_OUT
 from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
+from pipelines.densify.depth.plane_sweep import plane_warp, sub_sample_peak
 from pipelines.settings import EpipolarSettings
 
 __all__ = ["EpipolarDepth"]
@@ -52,7 +53,9 @@ class EpipolarDepth:
         if len(z) < 3 or not chosen or len(pixels) == 0:
             return unknown_depth(len(pixels))
         near, far = np.percentile(z, [2, 98]) * [1 / 1.5, 1.5]
-        warps = np.stack([self._warp(view, other) for other in chosen]).astype(np.float32)
+        warps = np.stack(
+            [plane_warp(view.camera, view.T_camera_world, k.camera, k.T_camera_world) for k in chosen]
+        ).astype(np.float32)
         # One sample per pixel along the longest epipolar line.
         reach = max(np.linalg.norm(w[:2, 3]) for w in warps)
         samples = int(np.clip(np.ceil(reach * (1 / near - 1 / far)), 8, self.settings.max_samples))
@@ -85,15 +88,8 @@ class EpipolarDepth:
                 rated.append((abs(np.log(parallax / self.settings.parallax)), k.index, k))
         return [k for _, _, k in sorted(rated, key=lambda r: r[:2])[: self.settings.views]]
 
-    @staticmethod
-    def _warp(view: Keyframe, other: Keyframe) -> NDArray[np.float64]:
-        """[A b] (3, 4): pixel (x, y) at inverse depth w is seen in `other` at A (x, y, 1) + w b, homogeneous."""
-        T = other.T_camera_world @ inverse_se3(view.T_camera_world)
-        K, K_other = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1.0]]) for c in (view.camera, other.camera))
-        return np.concatenate([K_other @ T[:3, :3] @ np.linalg.inv(K), (K_other @ T[:3, 3])[:, None]], axis=1)
-
     def _peaks(
-        self, scores: NDArray[np.float32], peak: NDArray[np.float32], inverse: NDArray[np.float64], reach: float
+        self, scores: NDArray[np.float32], peak: NDArray[np.float32], inverse: NDArray[np.float64], reach: np.floating
     ) -> DepthEstimate:
         """Depths at the peaks of `scores` (N, samples). `peak` (N, 3): exact scores around the best inner sample."""
         samples = len(inverse)
@@ -101,7 +97,7 @@ class EpipolarDepth:
         inner = np.clip(best, 1, samples - 2)
         left, top, right = peak.T
         curvature = np.maximum(2 * top - left - right, 1e-6)
-        offset = np.clip((right - left) / (2 * curvature), -0.5, 0.5)
+        offset = sub_sample_peak(left, right, curvature)
         away = np.abs(np.arange(samples)[None] - best[:, None]) > 2
         rival = np.where(away, scores, OUTSIDE).max(axis=1, initial=OUTSIDE)
         good = (

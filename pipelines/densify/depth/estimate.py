@@ -41,6 +41,7 @@ class DepthEstimator(Protocol):
         Returns:
             Depth and deviation of each pixel.
         """
+        ...
 
 
 def unknown_depth(count: int) -> DepthEstimate:

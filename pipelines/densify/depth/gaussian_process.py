@@ -64,7 +64,8 @@ class GaussianProcessDepth:
 
     @staticmethod
     def _correlation(a: torch.Tensor, b: torch.Tensor, length: float, colour: float) -> torch.Tensor:
-        return matern32(torch.cdist(*(torch.cat([f[:, :2] / length, f[:, 2:] / colour], dim=1) for f in (a, b))))
+        a, b = (torch.cat([f[:, :2] / length, f[:, 2:] / colour], dim=1) for f in (a, b))
+        return matern32(torch.cdist(a, b))
 
     def _fit(self, known: torch.Tensor, y: torch.Tensor) -> tuple[float, float, float, float]:
         """(length, colour scale, noise / signal, signal variance) of maximum likelihood; the last in closed form."""

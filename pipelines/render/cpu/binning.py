@@ -3,7 +3,7 @@
 This is a counting sort over (tile, chunk of slots). It is linear in the number of pairs, stable because chunks and the
 slots in them are processed in depth order, and independent of the number of threads.
 """
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
 import numpy as np
 import taichi as ti
@@ -68,14 +68,11 @@ class Binning:
         self._count, self._scan = CompiledKernel(self._count_chunks), CompiledKernel(self._scan_counts)
         self._scatter = CompiledLoop(self._scatter_chunks, 50)
 
-    def forward(self, exact: bool = True) -> int:
+    def forward(self, exact: bool = True) -> None:
         """Bin the projected Gaussians of the current view.
 
         Args:
             exact: Ignored on the CPU, where binning is always exact.
-
-        Returns:
-            Number of pairs.
         """
         tiles_x = -(-self.view.width // self.tile_width)
         tiles_y = -(-self.view.height // self.tile_height)
@@ -87,7 +84,6 @@ class Binning:
             raise ValueError(f"{total} tile pairs exceed the room for {self.pairs.max_pairs}; the map is degenerate")
         self._scatter(slots, slots)
         self.pairs.count = total
-        return total
 
     @ti.func
     def _ellipse(self, s):

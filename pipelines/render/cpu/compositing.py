@@ -8,7 +8,7 @@ The outer loop runs over Gaussians and the inner loop over the consecutive pixel
 GPU implementation. The inner loop has no branches, so that it compiles to SIMD code. Only rows that the ellipse reaches
 are visited.
 """
-# pyright: reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import taichi as ti
 

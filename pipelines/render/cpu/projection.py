@@ -3,7 +3,7 @@
 EWA splatting [Zwicker 2001] with the opacity compensation of Mip-Splatting [Yu 2024]. The gradients, including that of
 the camera tangent, come from Taichi's automatic differentiation.
 """
-# pyright: reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import numpy as np
 import taichi as ti

@@ -1,5 +1,5 @@
 """Binning on a GPU: pairs are emitted slot by slot, nearest first, and then sorted stably by tile."""
-# pyright: reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
 from collections import deque
 

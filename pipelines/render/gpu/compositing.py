@@ -8,7 +8,8 @@ backward pass also goes front to back. It sums without atomics, in three phases 
 This takes about eight accesses to shared memory per pixel and Gaussian, compared with some fifty shuffles for a
 reduction over the warps, and the order of the sums is fixed.
 """
-# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import taichi as ti
 import torch

@@ -1,5 +1,5 @@
 """Projection on a GPU: depths are sorted on the device, and the number of visible Gaussians is known only there."""
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import numpy as np
 import taichi as ti

@@ -9,6 +9,7 @@ from fields.geometry.se3 import inverse_se3
 from fields.map.keyframes import Keyframe, KeyframeStore
 from pipelines.densify.depth import EpipolarDepth
 from pipelines.densify.depth.epipolar import OUTSIDE, RADIUS
+from pipelines.densify.depth.plane_sweep import plane_warp
 from pipelines.settings import EpipolarSettings
 from tests.pipelines.wall import CAMERA, frame, on_the_plane, pose
 
@@ -68,7 +69,7 @@ def test_scores_are_the_correlation_of_patches_carried_over_at_that_depth(store:
     there = np.random.default_rng(1).uniform(size=(48, 64)).astype(np.float32)
     inverse = np.array([0.2, 0.25, 0.3], dtype=np.float32)
     pixels = np.array([[30.5, 20.5], [12.5, 33.5]], dtype=np.float32)
-    warp = EpipolarDepth._warp(view, other)[None].astype(np.float32)
+    warp = plane_warp(view.camera, view.T_camera_world, other.camera, other.T_camera_world)[None].astype(np.float32)
     scores = score(grey, there[None], warp, pixels, inverse)
     T = other.T_camera_world @ inverse_se3(view.T_camera_world)
     steps = np.arange(-RADIUS, RADIUS + 1.0)
@@ -92,7 +93,7 @@ def test_scores_are_the_correlation_of_patches_carried_over_at_that_depth(store:
 def test_patches_that_leave_the_image_have_no_score(store: KeyframeStore) -> None:
     view, other = store[4], store[0]  # the camera moves left: what is at the right edge of 4 is outside 0
     grey = np.random.default_rng(0).uniform(size=(48, 64)).astype(np.float32)
-    warp = EpipolarDepth._warp(view, other)[None].astype(np.float32)
+    warp = plane_warp(view.camera, view.T_camera_world, other.camera, other.T_camera_world)[None].astype(np.float32)
     far_right = np.array([[1000.5, 20.5]], np.float32)
     assert score(grey, grey[None], warp, far_right, np.array([0.25], np.float32))[0, 0] == OUTSIDE
 
@@ -101,7 +102,12 @@ def test_a_sample_is_given_up_only_where_it_cannot_reach_the_floor(store: Keyfra
     """The view itself agrees wholly; once the second neighbour has not, the third cannot lift the mean to the floor."""
     grey, *others = np.random.default_rng(0).uniform(size=(3, 48, 64)).astype(np.float32)
     others = np.stack([grey, *others])
-    warps = np.stack([EpipolarDepth._warp(store[2], store[i]) for i in (2, 0, 1)]).astype(np.float32)
+    warps = np.stack(
+        [
+            plane_warp(store[2].camera, store[2].T_camera_world, store[i].camera, store[i].T_camera_world)
+            for i in (2, 0, 1)
+        ]
+    ).astype(np.float32)
     pixels, inverse = PIXELS.astype(np.float32), np.linspace(0.15, 0.4, 30).astype(np.float32)
     exact = score(grey, others, warps, pixels, inverse)
     bounds = score(grey, others, warps, pixels, inverse, floor=0.7)
