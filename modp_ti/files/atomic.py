@@ -35,9 +35,9 @@ def replacing(path: str | os.PathLike[str], mode: str = "wb", sync: bool = True)
     """
     target = Path(path)
     partial = target.with_name(target.name + ".partial")
-    text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
     try:
-        with partial.open(mode, **text) as file:
+        encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
+        with partial.open(mode, encoding=encoding, newline=newline) as file:
             yield file
             file.flush()
             if sync:

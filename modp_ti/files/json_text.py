@@ -1,4 +1,4 @@
-"""JSON reader that checks brackets and nesting depth before it builds any object."""
+"""JSON reader that checks the nesting depth before it builds any object."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ MAX_DEPTH = 64
 TOKEN = re.compile(r'\\.|["\[{\]}]', re.DOTALL)
 # An escaped UTF-16 surrogate. A valid character consists of a pair of them.
 HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
-CLOSES = {"]": "[", "}": "{"}
 # Integers with more characters than this become floats.
 DIGITS = 18
 
@@ -52,10 +51,10 @@ def parse_json(text: str, name: str, line: int | None = None) -> Any:
         line: Line of the file at which the text starts, for the error message; None for the first.
 
     Raises:
-        InputError: With the line, if the text is not valid JSON, is truncated, or is nested deeper than `MAX_DEPTH`.
+        InputError: With the line, if the text is not valid JSON or is nested deeper than `MAX_DEPTH`.
     """
     first = 1 if line is None else line
-    _require_structure(text, name, first)
+    _require_shallow(text, name, first)
     try:
         data = json.loads(text, parse_int=_whole_number)
         if HALF_CHARACTER.search(text):
@@ -69,27 +68,16 @@ def parse_json(text: str, name: str, line: int | None = None) -> Any:
         raise _invalid(name, first, str(error)) from None
 
 
-def _require_structure(text: str, name: str, first: int) -> None:
-    open_brackets: list[str] = []
-    in_string = False
+def _require_shallow(text: str, name: str, first: int) -> None:
+    depth, in_string = 0, False
     for token in TOKEN.finditer(text):
         kind = token[0]
         if kind == '"':
             in_string = not in_string
-        elif in_string:
-            continue
-        elif kind in "[{":
-            open_brackets.append(kind)
-            if len(open_brackets) > MAX_DEPTH:
+        elif not in_string and not kind.startswith("\\"):
+            depth += 1 if kind in "[{" else -1
+            if depth > MAX_DEPTH:
                 raise _invalid(name, first + text.count("\n", 0, token.start()), f"nested deeper than {MAX_DEPTH}")
-        elif kind in CLOSES:
-            if not open_brackets or open_brackets.pop() != CLOSES[kind]:
-                raise _invalid(name, first + text.count("\n", 0, token.start()), f"a {kind} that closes nothing")
-    last = first + text.count("\n", 0, len(text.rstrip()))
-    if in_string:
-        raise _invalid(name, last, "it ends before its last string is closed")
-    if open_brackets:
-        raise _invalid(name, last, f"it ends before its last {open_brackets[-1]} is closed")
 
 
 def _invalid(name: str, line: int, reason: str) -> InputError:

@@ -50,7 +50,12 @@ class AriaRecording(KnownFrames):
 
     def __init__(self, path: Path, pinhole: VrsSettings, mask: Path | None = None) -> None:
         try:
-            from projectaria_tools.core import calibration, data_provider, sensor_data
+            # The extra `aria`, which need not be installed.
+            from projectaria_tools.core import (  # pyright: ignore[reportMissingImports]
+                calibration,
+                data_provider,
+                sensor_data,
+            )
         except ImportError as error:
             raise InputError(
                 f"{path}: reading a VRS recording needs projectaria-tools ({error}): pip install 'modp-ti[aria]'"

@@ -58,7 +58,7 @@ class Distortion:
             axis=-1,
         )
 
-    def _radial_factor(self, r: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _radial_factor(self, r: NDArray[np.floating]) -> NDArray[np.floating]:
         if self.fisheye:
             theta = np.arctan(r)
             ratio = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-12)
@@ -75,7 +75,7 @@ class Distortion:
         falling = np.flatnonzero(np.diff(distorted) <= 0)
         return float(r[falling[0]]) if len(falling) else limit
 
-    def _radial_table(self, limit: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _radial_table(self, limit: float) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         r = np.linspace(0.0, limit, TABLE_SIZE)
         return r, r * self._radial_factor(r)
 

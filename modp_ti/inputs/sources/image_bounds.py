@@ -13,7 +13,7 @@ from PIL import BmpImagePlugin, PpmImagePlugin
 from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
 
 from modp_ti.files.memory import available_memory
-from modp_ti.inputs.sources.image_header import HEADER_ERRORS, HeaderReader, JpegHeader, read_tiff_directory
+from modp_ti.inputs.sources.image_header import HEADER_ERRORS, JpegHeader, bounded, read_tiff_directory
 
 __all__ = ["MAX_IMAGE_PIXELS", "why_undecodable"]
 
@@ -97,19 +97,21 @@ def _inflates(data: bytes) -> bool:
 
 
 def _jpeg(data: bytes) -> _Claim:
-    width, height = JpegHeader(HeaderReader(io.BytesIO(data))).size
+    width, height = JpegHeader(bounded(io.BytesIO(data))).size
     return _Claim(width, height, width * height // MOST_JPEG_PIXELS)
 
 
 def _bmp(data: bytes) -> _Claim:
-    image = BmpImagePlugin.BmpImageFile(HeaderReader(io.BytesIO(data)))
-    codec, _, _, parameters = image.tile[0]
+    image = BmpImagePlugin.BmpImageFile(bounded(io.BytesIO(data)))
+    tile, (width, height) = image.tile[0], image.size
+    if tile.codec_name != "raw" or not isinstance(tile.args, tuple):
+        return _Claim(width, height)
     # The last row may lack its padding.
-    return _Claim(*image.size, (image.height - 1) * parameters[1] if codec == "raw" else 0)
+    return _Claim(width, height, (height - 1) * int(tile.args[1]))
 
 
 def _pnm(data: bytes) -> _Claim:
-    width, height = PpmImagePlugin.PpmImageFile(HeaderReader(io.BytesIO(data))).size
+    width, height = PpmImagePlugin.PpmImageFile(bounded(io.BytesIO(data))).size
     return _Claim(width, height, width * height * PNM_BITS[data[1:2]] // 8)
 
 

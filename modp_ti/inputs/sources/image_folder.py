@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
+from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.known_frames import IMAGE_SUFFIXES
 from modp_ti.inputs.sources.listed_images import ListedImages
-from modp_ti.inputs.sources.name_times import times_of_names
 
-__all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key"]
+__all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key", "times_of_names"]
+
+# Unit of a whole number by its digits, for times since 2001: milliseconds, microseconds, nanoseconds. Ten digits are
+# not accepted: whole seconds would not distinguish the frames of a video.
+UNITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}
+SECONDS = re.compile(r"[0-9]{10}\.[0-9]{2,}")
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
@@ -58,3 +64,17 @@ class ImageFolder(ListedImages):
         times = times_of_names(names)
         notes = [] if times is None else [f"{path}: the images' names are taken as their times"]
         super().__init__(path, names, np.arange(len(names)) / fps if times is None else times, notes=notes)
+
+
+def times_of_names(names: Sequence[str]) -> NDArray[np.float64] | None:
+    """Return the times (N,) [s] of images whose names are strictly increasing time stamps, otherwise None."""
+    stems = [PurePosixPath(name).stem for name in names]
+    if all(SECONDS.fullmatch(stem) for stem in stems):
+        times = np.array([float(stem) for stem in stems])
+    elif all(re.fullmatch("[1-9][0-9]+", stem) and len(stem) in UNITS for stem in stems):
+        if len({len(stem) for stem in stems}) > 1:
+            return None
+        times = np.array([int(stem) for stem in stems]) * UNITS[len(stems[0])]
+    else:
+        return None
+    return times if (np.diff(times) > 0).all() else None

@@ -5,7 +5,7 @@ report it in its first second, not at frame 400. JPEG and PNG files are checked 
 left to the decoder.
 
 Pillow keeps everything that it reads from a header, and thousands of TIFF or EXIF tags can refer to the same bytes:
-Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `HeaderReader`.
+Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `bounded` file.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import io
 import struct
 import warnings
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from PIL import JpegImagePlugin, TiffImagePlugin
 
-__all__ = ["HEADER_ERRORS", "HeaderReader", "ImageHeader", "JpegHeader", "read_image_header", "read_tiff_directory"]
+__all__ = ["HEADER_ERRORS", "ImageHeader", "JpegHeader", "bounded", "read_image_header", "read_tiff_directory"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"IEND\xaeB`\x82"
@@ -49,7 +49,7 @@ class ImageHeader:
     complete: bool
 
 
-class HeaderReader(io.BufferedIOBase):
+class _Bounded(io.BufferedIOBase):
     """A file object that raises OSError once more data has been read than a valid header needs."""
 
     def __init__(self, file: BinaryIO) -> None:
@@ -70,6 +70,12 @@ class HeaderReader(io.BufferedIOBase):
 
     def tell(self) -> int:
         return self._file.tell()
+
+
+def bounded(file: BinaryIO) -> IO[bytes]:
+    """Wrap a file so that reading more than a valid header needs raises OSError."""
+    # Pillow reads, seeks and tells only, but its stubs require every method of IO.
+    return _Bounded(file)  # pyright: ignore[reportReturnType]
 
 
 class JpegHeader(JpegImagePlugin.JpegImageFile):
@@ -96,7 +102,7 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
         return None
     file.seek(0)
     try:
-        width, height = JpegHeader(HeaderReader(file)).size
+        width, height = JpegHeader(bounded(file)).size
     except HEADER_ERRORS:
         file.seek(-min(2, file.seek(0, 2)), 2)
         return ImageHeader(0, 0, complete=file.read() == JPEG_END)
@@ -114,7 +120,7 @@ def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlug
     Returns:
         The tags. If the directory is damaged or too large, only those before that position.
     """
-    file = HeaderReader(io.BytesIO(data))
+    file = bounded(io.BytesIO(data))
     # The byte order is passed separately: Pillow recognises BigTIFF in little-endian order only.
     start = b"II+\0" + data[4:16] if data[2:4] in (b"+\0", b"\0+") else b"II*\0" + data[4:8]
     directory = TiffImagePlugin.ImageFileDirectory_v2(start, prefix=data[:2])

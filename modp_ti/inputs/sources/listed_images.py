@@ -16,7 +16,7 @@ from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.known_frames import IMAGE_SUFFIXES, KnownFrames
 
-__all__ = ["ListedImages", "decoded"]
+__all__ = ["ListedImages", "decoded", "decoded_as"]
 
 
 class ListedImages(KnownFrames):
@@ -119,11 +119,18 @@ def decoded(data: bytes) -> NDArray[np.uint8] | None:
     """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation; None if that fails."""
     import cv2
 
+    image = decoded_as(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def decoded_as(data: bytes, flags: int) -> NDArray | None:
+    """Decode an image file's bytes with OpenCV's flags, BGR and silently; None if that fails."""
+    import cv2
+
     log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:  # OpenCV is silenced because the error is reported by the caller
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
-        image = None
+        return None
     finally:
         cv2.utils.logging.setLogLevel(log_level)
-    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -185,7 +185,7 @@ class LiveSource(ImageSource):
             more, image = self._capture.retrieve() if more else (False, None)
         except cv2.error:
             return None
-        return (self._clock + arrived, image) if more else None
+        return (self._clock + arrived, np.asarray(image, dtype=np.uint8)) if more else None
 
     def _take(self) -> None:
         """Capture frames until the recording ends; runs in the thread."""
@@ -221,7 +221,7 @@ class LiveSource(ImageSource):
         number = len(self._names)
         try:
             _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-            self._file(number).write_bytes(data)
+            self._file(number).write_bytes(data.tobytes())
         except OSError as error:
             raise InputError(
                 f"{self._kept.name}: frames of the live source cannot be kept there: {error.strerror}; "

@@ -75,4 +75,4 @@ class MaskFolder:
 def differs_from_colour(image: NDArray[np.uint8], colour: tuple[int, int, int], tolerance: int) -> NDArray[np.bool_]:
     """Return a mask (H, W), True where a channel of the image (H, W, 3) differs from `colour` by over `tolerance`."""
     difference = np.abs(image.astype(np.int16) - np.array(colour, dtype=np.int16))
-    return (difference > tolerance).any(axis=2)
+    return np.any(difference > tolerance, axis=2)

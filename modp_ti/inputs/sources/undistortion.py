@@ -69,12 +69,12 @@ class Undistorter:
             raise ValueError(f"image is {raw.shape} {raw.dtype}, the camera {self.raw.width}x{self.raw.height}")
         mask = None if self._lookup is None else self._lookup[2]
         if valid is None:
-            return self._resampled(raw).astype(np.float32) / 255.0, mask
+            return np.divide(self._resampled(raw), 255.0, dtype=np.float32), mask
         if valid.shape != raw.shape[:2]:
             raise ValueError(f"valid is {valid.shape}, the image {raw.shape}")
         share = self._resampled(valid.astype(np.float32))
         image = self._resampled(np.where(valid[..., None], raw, 0).astype(np.float32))
-        image = np.clip(image / np.maximum(share, 0.5)[..., None] / 255.0, 0.0, 1.0)
+        image = np.clip(image / np.maximum(share, 0.5)[..., None] / 255.0, 0.0, 1.0, dtype=np.float32)
         kept = share >= 0.5
         return image, kept if mask is None else kept & mask
 
@@ -107,8 +107,8 @@ class Undistorter:
 
         size = (self.camera.width, self.camera.height)
         shrinks = picture.shape[1] > size[0]
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-        return self._remapped(picture, cv2.INTER_LINEAR)
+        resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return self._remapped(resized, cv2.INTER_LINEAR)
 
     def _resampled(self, image: NDArray) -> NDArray:
         """Scale a stored image, or a single channel of it, to the working size and undistort it."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import av
+import av.error
 import numpy as np
 from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ CONTAINERS = (
 )
 LIMITS = {"max_pixels": str(MAX_IMAGE_PIXELS)}
 # Exceptions that PyAV raises for malformed files.
-DECODING_ERRORS = (av.FFmpegError, OSError, ValueError, ArithmeticError, MemoryError)
+DECODING_ERRORS = (av.error.FFmpegError, OSError, ValueError, ArithmeticError, MemoryError)
 
 
 class VideoDecoder:
@@ -46,10 +47,11 @@ class VideoDecoder:
             self._container = av.open(f"file:{path}", options=options, metadata_errors="replace")
         except DECODING_ERRORS:
             raise OSError(str(path)) from None
-        self._stream = next(iter(self._container.streams.video), None)
-        if self._stream is None or self._stream.codec_context is None:  # a codec unknown to FFmpeg
+        stream = next(iter(self._container.streams.video), None)
+        if stream is None or stream.codec_context is None:  # a codec unknown to FFmpeg
             self._container.close()
             raise OSError(str(path))
+        self._stream = stream
         self._stream.codec_context.options = LIMITS
         if in_threads:
             self._stream.thread_type = "AUTO"
@@ -106,7 +108,7 @@ class VideoDecoder:
         try:
             # Conversion to BGR with this filter gives the same bits as OpenCV's reader. Direct RGB does not always.
             shown = self._reformatter.reformat(self._frame, width, height, "bgr24", interpolation="BICUBIC")
-            image = shown.to_ndarray()[..., ::-1]
+            image = np.asarray(shown.to_ndarray(), dtype=np.uint8)[..., ::-1]
         except DECODING_ERRORS:
             return None
         return np.ascontiguousarray(np.rot90(image, -turned // 90))

@@ -208,4 +208,4 @@ def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.flo
 
 
 def _checksum(image: NDArray[np.uint8]) -> int:
-    return zlib.crc32(np.ascontiguousarray(image))
+    return zlib.crc32(np.ascontiguousarray(image).data)

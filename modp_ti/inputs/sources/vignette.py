@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from modp_ti.files import read_bytes
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_bounds import why_undecodable
+from modp_ti.inputs.sources.listed_images import decoded_as
 
 __all__ = ["LEAST_LIGHT", "read_vignette"]
 
@@ -36,13 +37,7 @@ def read_vignette(path: Path) -> NDArray[np.float32]:
     if data and reason is not None:
         raise InputError(f"{path}: the vignette is no image that can be used: {reason} (source.vignette)")
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:  # OpenCV is silenced because the error is reported below
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error:
-        image = None
-    finally:
-        cv2.utils.logging.setLogLevel(log_level)
+    image = decoded_as(data, flags) if data else None
     if image is None or not 0 < image.max() < np.inf:
         raise InputError(f"{path}: the vignette is {'no image' if image is None else 'black'} (source.vignette)")
     image = image.astype(np.float32) / float(image.max())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from modp_ti.inputs.sources import ImageFolder
-from modp_ti.inputs.sources.name_times import times_of_names
+from modp_ti.inputs.sources.image_folder import times_of_names
 
 
 def test_nanoseconds_microseconds_milliseconds_and_seconds_are_told_apart():
