@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.similarity import moved_points
-from modp_ti.inputs.multiview.observations import Observations
 from modp_ti.inputs.multiview.point_solving import placed_anew
+from modp_ti.inputs.multiview.reprojection import Observations
 from pipelines.memory_budget import OBSERVATION
 
 __all__ = ["TrackedPoints"]
@@ -207,7 +207,7 @@ class TrackedPoints:
         counts = [len(rows) for rows in self.rows]
         seen = Observations(
             np.repeat(np.arange(len(counts)), counts),
-            np.concatenate(self.rows),
+            np.concatenate(self.rows).astype(np.int64),
             np.concatenate(rays),
             np.repeat([1.0 / camera.fx for camera in cameras], counts),
         )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.multiview.bundle_adjustment import adjusted_bundle
+from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_bundle
 
 __all__ = ["adjust_bundle"]
 
@@ -18,8 +18,7 @@ def adjust_bundle(
     free: Sequence[int],
     held: Sequence[int] = (),
     steps: int = 10,
-    focal: bool = False,
-    distortion: bool = False,
+    refined: Collection[Refinable] = (),
 ) -> float:
     """Minimise the robust reprojection error over keyframes and the landmarks that they see, in place.
 
@@ -28,8 +27,7 @@ def adjust_bundle(
         free: Keyframes whose poses are optimised.
         held: Keyframes that take part with fixed poses. Without any, the first two of `free` fix the gauge.
         steps: Levenberg-Marquardt steps at most.
-        focal: Also optimise the focal length.
-        distortion: Also optimise the distortion.
+        refined: Parts of the camera that are optimised too.
 
     Returns:
         The mean cost per observation [px^2 / 2]; infinite if there are too few observations.
@@ -59,14 +57,13 @@ def adjust_bundle(
         landmarks.xyz,
         set(free),
         steps,
-        focal=focal,
-        distortion=distortion,
+        refined=refined,
     )
     if bundle is None:
         return float("inf")
     for k, T in bundle.poses.items():
         landmarks.keyframes[k].T_camera_world[:3] = T[:3]
     landmarks.xyz[bundle.points] = bundle.xyz
-    if focal or distortion:
+    if refined:
         landmarks.use_lens(Lens(bundle.camera))
     return bundle.cost

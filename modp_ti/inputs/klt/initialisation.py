@@ -14,7 +14,8 @@ from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.optical_flow import corners, flow
 from modp_ti.inputs.klt.relocalisation import describe, matches
 from modp_ti.inputs.klt.two_view import two_views
-from modp_ti.inputs.multiview.camera_pose import pose_from_points, ray_errors
+from modp_ti.inputs.multiview.camera_pose import pose_from_points
+from modp_ti.inputs.multiview.reprojection import ray_errors
 
 __all__ = ["Initialisation", "SeenFrame"]
 

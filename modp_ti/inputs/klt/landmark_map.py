@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.multiview.camera_pose import ray_errors
 from modp_ti.inputs.multiview.features import Features
+from modp_ti.inputs.multiview.reprojection import ray_errors
 
 __all__ = ["Keyframe", "LandmarkMap"]
 

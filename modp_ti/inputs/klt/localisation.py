@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.optical_flow import BORDER
 from modp_ti.inputs.klt.patch_alignment import align_landmarks, reference_views
-from modp_ti.inputs.multiview.camera_pose import pose_from_points, ray_errors, refine_pose
+from modp_ti.inputs.multiview.camera_pose import pose_from_points
+from modp_ti.inputs.multiview.reprojection import ray_errors, refine_pose
 
 __all__ = ["FEWEST", "MAX_ERROR", "SIGMA", "localised", "realigned", "searched"]
 
@@ -78,8 +79,8 @@ def searched(
     candidate &= (landmarks.looked < 4) | (landmarks.found > 0.25 * landmarks.looked)
     candidate = np.flatnonzero(candidate)
     at = landmarks.lens.pixels(landmarks.xyz[candidate] @ T[:3, :3].T + T[:3, 3])
-    inside = np.isfinite(at).all(axis=1)
-    inside[inside] = ((at[inside] >= BORDER) & (at[inside] <= (width - BORDER, height - BORDER))).all(axis=1)
+    # Comparisons with NaN, for points behind the camera, are False.
+    inside = ((at >= BORDER) & (at <= (width - BORDER, height - BORDER))).all(axis=1)
     candidate, at = candidate[inside], at[inside]
     if len(candidate) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 2))

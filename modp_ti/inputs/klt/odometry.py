@@ -16,6 +16,7 @@ from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.localisation import FEWEST, localised, realigned, searched
 from modp_ti.inputs.klt.optical_flow import corners, flow
 from modp_ti.inputs.klt.relocalisation import alike_keyframes, describe, inherited, place_by_features, thumbnail
+from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.features import Features
 
 __all__ = ["Odometry", "View"]
@@ -312,8 +313,9 @@ class Odometry:
         """Bundle adjust the whole map and the focal length, and with enough keyframes the distortion."""
         count = len(self.map.keyframes)
         every = range(count)
+        refined: list[Refinable] = ["focal", "distortion"] if count >= DISTORTION_FROM else ["focal"]
         for _ in range(2):
-            adjust_bundle(self.map, every, steps=15, focal=True, distortion=count >= DISTORTION_FROM)
+            adjust_bundle(self.map, every, steps=15, refined=refined)
             self.map.discard_outliers(every)
 
     def _companions(self, free: list[int]) -> list[int]:

@@ -19,7 +19,7 @@ from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry, View
-from modp_ti.inputs.multiview.camera_pose import ray_errors
+from modp_ti.inputs.multiview.reprojection import ray_errors
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import is_held_out, points_inside, require_few, unmasked, unreadable_note
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-__all__ = ["Bundle", "adjusted_bundle"]
+__all__ = ["Bundle", "Refinable", "adjusted_bundle"]
+
+TOLERANCE = 1e-5  # relative change of the cost below which the optimisation stops
+
+Refinable = Literal["focal", "distortion"]
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,7 @@ def adjusted_bundle(
     free: Collection[int],
     steps: int,
     loss_width: float = 1.0,
-    tolerance: float = 1e-5,
-    focal: bool = False,
-    distortion: bool = False,
+    refined: Collection[Refinable] = (),
 ) -> Bundle | None:
     """Minimise the reprojection error under a Cauchy loss over poses and points.
 
@@ -61,9 +63,7 @@ def adjusted_bundle(
         free: Views whose poses are optimised.
         steps: Levenberg-Marquardt steps at most.
         loss_width: Scale of the Cauchy loss [px].
-        tolerance: Relative change of the cost below which the optimisation stops.
-        focal: Also optimise the focal length.
-        distortion: Also optimise the distortion.
+        refined: Parts of the camera that are optimised too.
 
     Returns:
         The optimised poses, camera and points, without those that only one view observes; None if Ceres finds no usable
@@ -93,19 +93,10 @@ def adjusted_bundle(
         names[number] = model.add_point3D(xyz[number], track)
     if len(free) == len(poses):
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    if not (focal or distortion):
+    if not refined:
         config.set_constant_cam_intrinsics(1)
 
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length, options.refine_extra_params = focal, distortion
-    options.refine_principal_point = options.refine_sensor_from_rig = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_width
-    solver = options.ceres.solver_options
-    solver.max_num_iterations = steps
-    solver.num_threads = 1  # with several threads, the order of summation and so the result would vary between runs
-    solver.function_tolerance = tolerance
+    options = _options(steps, loss_width, refined)
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     if not summary.is_solution_usable():
         return None
@@ -118,5 +109,23 @@ def adjusted_bundle(
     numbers = np.fromiter(names, np.int64, len(names))
     places = np.array([model.point3D(name).xyz for name in names.values()]).reshape(-1, 3)
     finite = np.isfinite(places).all(axis=1)
-    cost = summary.ceres_summary.final_cost / len(view) if hasattr(summary, "ceres_summary") else 0.0
+    # The declared type is the base class, which has no Ceres summary.
+    solved = isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
+    cost = summary.ceres_summary.final_cost / len(view) if solved else 0.0
     return Bundle(found, numbers[finite], places[finite], model.camera(1), float(cost))
+
+
+def _options(steps: int, loss_width: float, refined: Collection[Refinable]) -> pycolmap.BundleAdjustmentOptions:
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length, options.refine_extra_params = "focal" in refined, "distortion" in refined
+    options.refine_principal_point = options.refine_sensor_from_rig = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_width
+    solver = options.ceres.solver_options
+    solver.max_num_iterations = steps
+    solver.num_threads = 1  # with several threads, the order of summation and so the result would vary between runs
+    solver.function_tolerance = TOLERANCE
+    return options

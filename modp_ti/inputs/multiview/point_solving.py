@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.multiview.observations import Observations
+from modp_ti.inputs.multiview.reprojection import (
+    Observations,
+    point_errors,
+    refine_points,
+    solve_damped,
+    sum_by_point,
+)
 
-__all__ = ["MAX_ERROR", "placed_anew", "point_errors", "solve_points", "surest_points"]
+__all__ = ["MAX_ERROR", "placed_anew", "solve_points", "surest_points"]
 
 MAX_ERROR = 2.0  # largest reprojection error [px of the image used for detection]
 
@@ -20,7 +26,6 @@ ENOUGH = 50
 # ten points of two views was off by more than 6 % in depth, and one in a hundred with more views.
 MIN_VIEWS = 3
 MIN_ANGLE = 1.5  # smallest parallax of a point in degrees
-SOLVER_STEPS = 6
 ROUNDS = 3
 
 
@@ -43,14 +48,14 @@ def solve_points(
         Positions (P, 3), and the observations that agree with them, whose points index the rows of the positions.
     """
     used = seen.where(solves[seen.frame])
-    used = used.where(np.isfinite(used.rays).all(axis=1))
+    used = used.where(np.isfinite(used.rays[:, 0]) & np.isfinite(used.rays[:, 1]))
     count = int(seen.point.max()) + 1 if len(seen) else 0
     xyz = np.zeros((count, 3))
     for _ in range(ROUNDS):
         used = used.where(np.bincount(used.point, minlength=count)[used.point] >= 2)
         if len(used) == 0:
             break
-        xyz = _refined(poses, used, _nearest_to_rays(poses, used, count))
+        xyz = refine_points(poses, used, _nearest_to_rays(poses, used, count))
         error = point_errors(poses, used, xyz)
         # Remove a point's worst observations first: they may have pulled it away from the good ones.
         worst = np.zeros(count)
@@ -87,7 +92,7 @@ def placed_anew(
     used = used.where(np.bincount(used.point, minlength=len(xyz))[used.point] >= 2)
     if len(used) == 0:
         return xyz
-    moved = _refined(poses, used, xyz)
+    moved = refine_points(poses, used, xyz)
     costs = []
     for places in (xyz, moved):
         error = point_errors(poses, used, places)
@@ -129,56 +134,9 @@ def _nearest_to_rays(poses: NDArray[np.float64], seen: Observations, count: int)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     centre = -np.einsum("mji,mj->mi", rotation, translation)
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    left = _summed(seen.point, across, count)
-    right = _summed(seen.point, np.einsum("mij,mj->mi", across, centre), count)
-    return _solved(left, right, 1e-9)
-
-
-def _refined(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Minimise the reprojection errors of the points under a Cauchy loss by Gauss-Newton."""
-    rotation, translation = poses[seen.frame, :3, :3], poses[seen.frame, :3, 3]
-    for _ in range(SOLVER_STEPS):
-        p = np.einsum("mij,mj->mi", rotation, xyz[seen.point]) + translation
-        z = np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
-        residual = (p[:, :2] / z[:, None] - seen.rays) / seen.sigma[:, None]
-        jacobian = (rotation[:, :2] - (p[:, :2] / z[:, None])[:, :, None] * rotation[:, 2:]) / (z * seen.sigma)[
-            :, None, None
-        ]
-        weight = 1.0 / (1.0 + (residual**2).sum(axis=1))
-        weighted = weight[:, None, None] * jacobian
-        left = _summed(seen.point, np.einsum("mki,mkj->mij", weighted, jacobian), len(xyz))
-        right = _summed(seen.point, np.einsum("mki,mk->mi", weighted, residual), len(xyz))
-        xyz = xyz - _solved(left, right, 1e-6)
-    return xyz
-
-
-def _summed(point: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Sum the values (M, ...) of each point; returns (count, ...)."""
-    columns = values.reshape(len(values), -1).T
-    sums = [np.bincount(point, weights=column, minlength=count) for column in columns]
-    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
-
-
-def _solved(left: NDArray[np.float64], right: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
-    """Solve symmetric systems (P, 3, 3) with damping. Points without observations give zero."""
-    trace = np.trace(left, axis1=1, axis2=2)
-    left = left + np.eye(3) * (damping * trace + (trace == 0))[:, None, None]
-    return np.linalg.solve(left, right[..., None])[..., 0]
-
-
-def point_errors(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Reprojection errors (M,) [px of the image used for detection]; infinite behind the camera.
-
-    Args:
-        poses: (F, 4, 4) T_camera_world.
-        seen: M observations.
-        xyz: (P, 3) positions.
-    """
-    p = np.einsum("mij,mj->mi", poses[seen.frame, :3, :3], xyz[seen.point]) + poses[seen.frame, :3, 3]
-    before = p[:, 2] > 1e-9
-    z = np.where(before, p[:, 2], 1.0)
-    error = np.linalg.norm(p[:, :2] / z[:, None] - seen.rays, axis=1) / seen.sigma
-    return np.where(before & np.isfinite(error), error, np.inf)
+    left = sum_by_point(seen.point, across, count)
+    right = sum_by_point(seen.point, np.einsum("mij,mj->mi", across, centre), count)
+    return solve_damped(left, right, 1e-9)
 
 
 def _widest_angle(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised
 from modp_ti.inputs.multiview.bundle_adjustment import adjusted_bundle
-from modp_ti.inputs.multiview.camera_pose import ray_errors, refine_pose
-from modp_ti.inputs.multiview.observations import Observations
 from modp_ti.inputs.multiview.point_solving import solve_points
+from modp_ti.inputs.multiview.reprojection import Observations, ray_errors, refine_pose
 
 __all__ = ["adjusted_poses"]
 
@@ -151,7 +150,7 @@ def _resected(
     T: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], width: float
 ) -> NDArray[np.float64]:
     """Refine a pose (4, 4) by the points that it observes. Returns `T` if this increases the median error."""
-    seen = seen.where(np.isfinite(seen.rays).all(axis=1))
+    seen = seen.where(np.isfinite(seen.rays[:, 0]) & np.isfinite(seen.rays[:, 1]))
     if len(seen) < FEWEST:
         return T
     sigma = float(np.median(seen.sigma))

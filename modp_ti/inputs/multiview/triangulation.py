@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from modp_ti.inputs.multiview.feature_tracks import feature_tracks
 from modp_ti.inputs.multiview.features import MAX_FEATURES, Features, detect_features, essential_matrix, match_features
 from modp_ti.inputs.multiview.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
-from modp_ti.inputs.multiview.observations import Observations
-from modp_ti.inputs.multiview.point_solving import point_errors, solve_points, surest_points
+from modp_ti.inputs.multiview.point_solving import solve_points, surest_points
+from modp_ti.inputs.multiview.reprojection import Observations, point_errors
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources import ImageSource

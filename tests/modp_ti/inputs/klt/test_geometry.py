@@ -14,7 +14,8 @@ from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.optical_flow import corners, flow
 from modp_ti.inputs.klt.patch_alignment import align_landmarks, reference_views
 from modp_ti.inputs.klt.two_view import two_views
-from modp_ti.inputs.multiview.camera_pose import pose_from_points, ray_errors, refine_pose
+from modp_ti.inputs.multiview.camera_pose import pose_from_points
+from modp_ti.inputs.multiview.reprojection import ray_errors, refine_pose
 
 CAMERA = PinholeCamera(500.0, 500.0, 320.0, 240.0, 640, 480)
 
@@ -127,7 +128,7 @@ def test_bundle_adjustment_finds_the_scene_and_leaves_held_keyframes():
 
 def test_bundle_adjustment_finds_the_focal_length():
     landmarks, _, _ = small_map(np.random.default_rng(6), 0.0, Lens.radial(430.0, 0.0, 640, 480))
-    adjust_bundle(landmarks, range(6), steps=100, focal=True)
+    adjust_bundle(landmarks, range(6), steps=100, refined=["focal"])
     assert landmarks.lens.focal == pytest.approx(500.0, rel=1e-3)
 
 

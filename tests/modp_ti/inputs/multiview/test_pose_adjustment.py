@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modp_ti.inputs.multiview.observations import Observations
 from modp_ti.inputs.multiview.pose_adjustment import adjusted_poses
+from modp_ti.inputs.multiview.reprojection import Observations
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from modp_ti.inputs.multiview.features import detect_features, essential_matrix, match_features
-from modp_ti.inputs.multiview.observations import Observations
 from modp_ti.inputs.multiview.point_solving import placed_anew, solve_points
+from modp_ti.inputs.multiview.reprojection import Observations
 from modp_ti.inputs.multiview.triangulation import neighbouring_views
 
 VIEWS, POINTS = 6, 80

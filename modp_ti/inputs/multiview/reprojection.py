@@ -1,0 +1,194 @@
+"""Reprojection errors in normalised coordinates, and their robust Gauss-Newton over one pose or over many points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import exp_se3, orthonormalised
+
+__all__ = ["Observations", "point_errors", "ray_errors", "refine_points", "refine_pose", "solve_damped", "sum_by_point"]
+
+POSE_STEPS = 10
+POINT_STEPS = 6
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Observations of points in frames.
+
+    Attributes:
+        frame: (M,) int64 frame of each observation.
+        point: (M,) int64 point of each observation.
+        rays: (M, 2) normalised coordinates.
+        sigma: (M,) uncertainty in normalised coordinates: one pixel of the image used for detection.
+    """
+
+    frame: NDArray[np.int64]
+    point: NDArray[np.int64]
+    rays: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Observations:
+        """Select observations by a mask (M,) or indices (K,)."""
+        return Observations(self.frame[kept], self.point[kept], self.rays[kept], self.sigma[kept])
+
+    def beside(self, other: Observations) -> Observations:
+        """Concatenate with observations of other points, which are renumbered to follow these."""
+        first = int(self.point.max()) + 1 if len(self) else 0
+        return Observations(
+            np.concatenate([self.frame, other.frame]),
+            np.concatenate([self.point, other.point + first]),
+            np.concatenate([self.rays, other.rays]),
+            np.concatenate([self.sigma, other.sigma]),
+        )
+
+
+def ray_errors(
+    T_camera_world: NDArray[np.float64], xyz: NDArray[np.float64], rays: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Reprojection errors in one view, in normalised coordinates.
+
+    Args:
+        T_camera_world: (4, 4).
+        xyz: (N, 3) world points.
+        rays: (N, 2) observed normalised coordinates.
+
+    Returns:
+        Errors (N,), infinite for points behind the camera.
+    """
+    return _errors(xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3], rays)
+
+
+def point_errors(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Reprojection errors (M,) [px of the image used for detection]; infinite behind the camera.
+
+    Args:
+        poses: (F, 4, 4) T_camera_world.
+        seen: M observations.
+        xyz: (P, 3) positions.
+    """
+    p = np.einsum("mij,mj->mi", poses[seen.frame, :3, :3], xyz[seen.point]) + poses[seen.frame, :3, 3]
+    error = _errors(p, seen.rays) / seen.sigma
+    return np.where(np.isfinite(error), error, np.inf)
+
+
+def _errors(p: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Errors (N,) of points (N, 3) in the camera frame, infinite behind the camera."""
+    before = p[:, 2] > 1e-9
+    z = np.where(before, p[:, 2], 1.0)
+    return np.where(before, np.linalg.norm(p[:, :2] / z[:, None] - rays, axis=1), np.inf)
+
+
+def refine_pose(
+    T_camera_world: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    sigma: float,
+    steps: int = POSE_STEPS,
+) -> NDArray[np.float64]:
+    """Minimise the reprojection error of a view over its pose, under a Cauchy loss.
+
+    Args:
+        T_camera_world: (4, 4) initial pose.
+        xyz: (N, 3) world points.
+        rays: (N, 2) observed normalised coordinates.
+        sigma: Scale of the loss, in normalised coordinates.
+        steps: Gauss-Newton steps at most.
+
+    Returns:
+        T_camera_world (4, 4).
+    """
+    T = np.array(T_camera_world, dtype=np.float64)
+    scale = max(float(np.median(np.abs(xyz @ T[2, :3] + T[2, 3]))), 1e-9) if len(xyz) else 1.0
+    for _ in range(steps):
+        p = xyz @ T[:3, :3].T + T[:3, 3]
+        before = p[:, 2] > 1e-3 * scale
+        p, seen = p[before], rays[before]
+        if len(p) < 3:
+            break
+        z = p[:, 2]
+        u, v = p[:, 0] / z, p[:, 1] / z
+        residual, weight = _cauchy(np.stack([u, v], axis=1), seen, sigma)
+        jacobian = np.zeros((len(p), 2, 6))
+        jacobian[:, 0, 0] = jacobian[:, 1, 1] = scale / z  # translation in units of the scene's depth
+        jacobian[:, 0, 2], jacobian[:, 1, 2] = -scale * u / z, -scale * v / z
+        jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 0, 5] = -u * v, 1 + u * u, -v
+        jacobian[:, 1, 3], jacobian[:, 1, 4], jacobian[:, 1, 5] = -(1 + v * v), u * v, u
+        left, right = _normal_equations(jacobian / sigma, residual, weight)
+        left[np.diag_indices(6)] *= 1.0 + 1e-6
+        left[np.diag_indices(6)] += 1e-12 * np.trace(left) + 1e-300
+        step = -np.linalg.solve(left, right)
+        step[:3] *= scale
+        T = exp_se3(step) @ T
+        if np.abs(step[3:]).max() < 1e-5 and np.abs(step[:3]).max() < 1e-5 * scale:
+            break
+    return orthonormalised(T)
+
+
+def refine_points(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Minimise the reprojection errors of many points over their positions, under a Cauchy loss.
+
+    Args:
+        poses: (F, 4, 4) T_camera_world, which are fixed.
+        seen: Observations; their sigma is the scale of the loss.
+        xyz: (P, 3) initial positions.
+
+    Returns:
+        Positions (P, 3) after POINT_STEPS Gauss-Newton steps.
+    """
+    rotation, translation = poses[seen.frame, :3, :3], poses[seen.frame, :3, 3]
+    sigma = seen.sigma[:, None]
+    for _ in range(POINT_STEPS):
+        p = np.einsum("mij,mj->mi", rotation, xyz[seen.point]) + translation
+        z = np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
+        uv = p[:, :2] / z[:, None]
+        residual, weight = _cauchy(uv, seen.rays, sigma)
+        jacobian = (rotation[:, :2] - uv[:, :, None] * rotation[:, 2:]) / (z * seen.sigma)[:, None, None]
+        left, right = _normal_equations(jacobian, residual, weight, seen.point, len(xyz))
+        xyz = xyz - solve_damped(left, right, 1e-6)
+    return xyz
+
+
+def _cauchy(
+    uv: NDArray[np.float64], rays: NDArray[np.float64], sigma: float | NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Residuals (M, 2) in units of `sigma`, and their weights (M,) under a Cauchy loss."""
+    residual = (uv - rays) / sigma
+    return residual, 1.0 / (1.0 + (residual**2).sum(axis=1))
+
+
+def _normal_equations(
+    jacobian: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    point: NDArray[np.int64] | None = None,
+    count: int = 1,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """J^T W J and J^T W r of Jacobians (M, 2, K): (count, K, K) and (count, K) by point, or (K, K) and (K,) of all."""
+    if point is None:  # a single matrix product is many times faster than a sum over observations
+        flat = jacobian.reshape(-1, jacobian.shape[2])
+        weighted = flat * np.repeat(weight, 2)[:, None]
+        return weighted.T @ flat, weighted.T @ residual.reshape(-1)
+    weighted = weight[:, None, None] * jacobian
+    left = sum_by_point(point, np.einsum("mki,mkj->mij", weighted, jacobian), count)
+    return left, sum_by_point(point, np.einsum("mki,mk->mi", weighted, residual), count)
+
+
+def sum_by_point(point: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Sum the values (M, ...) of each point; returns (count, ...)."""
+    columns = values.reshape(len(values), -1).T
+    sums = [np.bincount(point, weights=column, minlength=count).astype(np.float64) for column in columns]
+    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
+
+
+def solve_damped(left: NDArray[np.float64], right: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
+    """Solve symmetric systems (P, 3, 3) with damping. Points without observations give zero."""
+    trace = np.trace(left, axis1=1, axis2=2)
+    left = left + np.eye(3) * (damping * trace + (trace == 0))[:, None, None]
+    return np.linalg.solve(left, right[..., None])[..., 0].astype(np.float64, copy=False)
