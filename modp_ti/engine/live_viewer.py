@@ -110,7 +110,7 @@ class LiveViewer:
         self._publisher = threading.Thread(target=self._publish, name="viewer", daemon=True)
         self._publisher.start()
         self._serving = ThreadClock([self._publisher, *self.page.threads])
-        self._mapper: Mapper | None = None
+        self._begun_mapper: Mapper | None = None
         self._frame: TrackedFrame | None = None
         self._state = self._psnr = ""
         self._frames: int | None = None
@@ -134,7 +134,7 @@ class LiveViewer:
     # ---- the observer ----------------------------------------------------------------------------------------
 
     def begin(self, mapper: Mapper, frames: int | None) -> None:
-        self._mapper, self._frames = mapper, frames
+        self._begun_mapper, self._frames = mapper, frames
         self._began = self._clock()
         self._serving.since_last()  # do not charge for browsers that connected before mapping began
 
@@ -154,6 +154,12 @@ class LiveViewer:
 
     def on_stage(self, stage: str) -> None:
         self._updates.put(Update(numbers=f"{stage}\n\nThe page ends with the run; `modp-ti view` shows the map."))
+
+    @property
+    def _mapper(self) -> Mapper:
+        if self._begun_mapper is None:
+            raise RuntimeError("the viewer has no map yet: call `begin` before `on_frame`")
+        return self._begun_mapper
 
     # ---- the mapping thread ----------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -27,7 +27,6 @@ class ProgressLine:
     def __init__(self, console: Console) -> None:
         self.console = console
         self._progress: Progress | None = None
-        self._task = None
         self._state = ""
         self._logged = 0.0
 
@@ -68,8 +67,8 @@ class ProgressLine:
             psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
             gaussians = f"  {report.gaussians:,} Gaussians" if report.gaussians else ""
             self._state = f"{report.keyframes} keyframes{gaussians}{psnr}"
-        task = self._progress.tasks[0]
-        speed = f"  {task.speed:.2f} frames/s" if task.speed else ""
+        frame_rate = self._progress.tasks[0].speed if self._progress is not None else None
+        speed = f"  {frame_rate:.2f} frames/s" if frame_rate else ""
         self._update(advance=1, state=self._state + speed)
 
     def start_refining(self, steps: int, done: int = 0) -> None:
@@ -112,12 +111,14 @@ class ProgressLine:
             soft_wrap=True,
         )
 
-    def _update(self, **changes: object) -> None:
-        self._progress.update(self._task, **changes)
+    def _update(self, **changes: Any) -> None:
+        if self._progress is None:
+            raise RuntimeError("no progress is shown: call one of the `start_` methods first")
+        task = self._progress.tasks[0]
+        self._progress.update(task.id, **changes)
         if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
             return
         self._logged = time.monotonic()
-        task = self._progress.tasks[0]
         total = "" if task.total is None else f"/{task.total:.0f}"
         line = f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}"
         self.console.print(line, highlight=False, soft_wrap=True)
@@ -134,5 +135,5 @@ class ProgressLine:
             TextColumn("{task.fields[state]}"),
             console=self.console,
         )
-        self._task = self._progress.add_task(what, total=total, completed=done, state="")
+        self._progress.add_task(what, total=total, completed=done, state="")
         self._progress.start()

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
+from modp_ti.outputs.formats.compressed_splats import write_compressed_ply, write_spz, write_web_splat
 from modp_ti.outputs.formats.datasets import dataset_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
-from modp_ti.outputs.formats.spz import write_spz
-from modp_ti.outputs.formats.web_splat import write_web_splat
 from modp_ti.outputs.playback.film import is_video
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.flight import film, plan_flight

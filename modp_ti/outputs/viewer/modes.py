@@ -18,7 +18,6 @@ __all__ = [
     "MODES",
     "SPLATS",
     "Photograph",
-    "coloured_error",
     "error_picture",
     "image_error",
     "nearest_photograph",
@@ -105,24 +104,20 @@ def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.
     return eight_bits(view.colour)
 
 
-def nearest_photograph(
-    poses: NDArray[np.float64], T_camera_world: NDArray[np.float64], scene_depth: float
-) -> int | None:
+def nearest_photograph(poses: NDArray[np.float64], T_camera_world: NDArray[np.float64], scene_depth: float) -> int:
     """Find the pose that shares most of its view with a given pose.
 
     The measure adds the distance between the points at the scene's depth on both optical axes and half the distance
     between the camera centres.
 
     Args:
-        poses: (N, 4, 4) T_camera_world of the candidates.
+        poses: (N, 4, 4) T_camera_world of the candidates, at least one.
         T_camera_world: (4, 4) pose to compare with.
         scene_depth: The scene's depth [scene units].
 
     Returns:
-        Index of the pose, None if there are no candidates.
+        Index of the pose.
     """
-    if len(poses) == 0:
-        return None
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     centre = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
     towards = centres + scene_depth * poses[:, 2, :3] - (centre + scene_depth * T_camera_world[2, :3])
@@ -179,16 +174,6 @@ def image_error(
     return np.where(before.reshape(z.shape) & same & valid, error, np.nan).astype(np.float32)
 
 
-def coloured_error(error: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Map an error (H, W) to colours (H, W, 3): blue for 0, red for LARGEST_ERROR and more, dark grey for NaN."""
-    import cv2
-
-    known = np.isfinite(error)
-    scaled = eight_bits(np.where(known, error, 0.0) / LARGEST_ERROR)
-    colours = cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO)[..., ::-1]
-    return np.where(known[..., None], colours, UNSEEN).astype(np.uint8)
-
-
 def error_picture(
     view: RenderedView,
     camera: PinholeCamera,
@@ -196,5 +181,11 @@ def error_picture(
     photograph: Photograph,
     seen: RenderedView,
 ) -> NDArray[np.uint8]:
-    """Return `image_error` as colours (H, W, 3)."""
-    return coloured_error(image_error(view, camera, T_camera_world, photograph, seen))
+    """Return `image_error` as colours (H, W, 3): blue for 0, red for LARGEST_ERROR and more, dark grey for NaN."""
+    import cv2
+
+    error = image_error(view, camera, T_camera_world, photograph, seen)
+    known = np.isfinite(error)
+    scaled = eight_bits(np.where(known, error, 0.0) / LARGEST_ERROR)
+    colours = cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO)[..., ::-1]
+    return np.where(known[..., None], colours, UNSEEN).astype(np.uint8)

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -166,28 +167,25 @@ class Page:
     def show_frame(self, frame: ShownFrame) -> None:
         """Show the current frame as a frustum with its image."""
         T_world_camera = inverse_se3(frame.T_camera_world)
-        pose = {"wxyz": quaternion_from_matrix(T_world_camera[:3, :3]), "position": T_world_camera[:3, 3] * self.units}
-        with self._lock:
-            self._frame = frame
-            node = self._nodes.get(FRAME)
-            if node is None:
-                self._nodes[FRAME] = self._server.scene.add_camera_frustum(
-                    "/frame",
-                    fov=_vertical(frame.camera),
-                    aspect=frame.camera.width / frame.camera.height,
-                    scale=FRAME_SIZE,
-                    thickness=2.0,
-                    thickness_units="screen",
-                    color=FRAME_COLOUR,
-                    image=frame.picture,
-                    format="jpeg",
-                    jpeg_quality=JPEG_QUALITY,
-                    visible=self._boxes[FRAME].value,
-                    **pose,
-                )
-                return
-            node.wxyz, node.position = pose["wxyz"], pose["position"]
-            node.image = frame.picture
+        pose: dict[str, NDArray] = {
+            "wxyz": quaternion_from_matrix(T_world_camera[:3, :3]),
+            "position": T_world_camera[:3, 3] * self.units,
+        }
+        scene = self._server.scene
+        self._frame = frame
+        add = partial(
+            scene.add_camera_frustum,
+            "/frame",
+            fov=_vertical(frame.camera),
+            aspect=frame.camera.width / frame.camera.height,
+            scale=FRAME_SIZE,
+            thickness=2.0,
+            thickness_units="screen",
+            color=FRAME_COLOUR,
+            format="jpeg",
+            jpeg_quality=JPEG_QUALITY,
+        )
+        self._show(FRAME, add, image=frame.picture, **pose)
 
     def show_keyframes(self, poses: NDArray[np.float64], camera: PinholeCamera) -> None:
         """Show keyframes as frustums.
@@ -196,36 +194,25 @@ class Page:
             poses: (N, 4, 4) T_camera_world.
             camera: Camera that defines the shape of all frustums.
         """
-        lines = frustum_lines(poses, camera, self.units)
-        with self._lock:
-            if KEYFRAMES in self._nodes:
-                self._nodes[KEYFRAMES].points = lines
-            else:
-                self._nodes[KEYFRAMES] = self._server.scene.add_line_segments(
-                    "/keyframes",
-                    lines,
-                    KEYFRAME_COLOUR,
-                    thickness=1.5,
-                    thickness_units="screen",
-                    visible=self._boxes[KEYFRAMES].value,
-                )
+        scene = self._server.scene
+        style = {"colors": KEYFRAME_COLOUR, "thickness": 1.5, "thickness_units": "screen"}
+        add = partial(scene.add_line_segments, "/keyframes", **style)
+        self._show(KEYFRAMES, add, points=frustum_lines(poses, camera, self.units))
 
     def show_points(self, xyz: NDArray[np.float64]) -> None:
         """Show tracked points (N, 3), in world coordinates."""
-        points = (xyz * self.units).astype(np.float32)
+        style = {"colors": POINT_COLOUR, "point_size": POINT_SIZE, "point_shape": "circle", "precision": "float32"}
+        add = partial(self._server.scene.add_point_cloud, "/points", **style)
+        self._show(POINTS, add, points=(xyz * self.units).astype(np.float32))
+
+    def _show(self, name: str, add: Callable[..., Any], **values: Any) -> None:
+        """Set the values of a node, which `add` creates first where there is none."""
         with self._lock:
-            if POINTS in self._nodes:
-                self._nodes[POINTS].points = points
-            else:
-                self._nodes[POINTS] = self._server.scene.add_point_cloud(
-                    "/points",
-                    points,
-                    POINT_COLOUR,
-                    point_size=POINT_SIZE,
-                    point_shape="circle",
-                    precision="float32",
-                    visible=self._boxes[POINTS].value,
-                )
+            if name not in self._nodes:
+                self._nodes[name] = add(**values, visible=self._boxes[name].value)
+                return
+            for attribute, value in values.items():
+                setattr(self._nodes[name], attribute, value)
 
     # ---- controls --------------------------------------------------------------------------------------------
 
@@ -233,11 +220,7 @@ class Page:
         gui = self._server.gui
         self._numbers = gui.add_markdown("waiting for the first frame")
         if self._gate is not None:
-            self._pause = gui.add_button("Pause", hint="hold the mapping after the frame or step that it is at")
-            self.show_paused(self._gate.paused)
-            self._pause.on_click(lambda _: self._set_paused(not self._gate.paused))
-            step = gui.add_button("Step", hint="map one frame, or take one step, and hold again")
-            step.on_click(lambda _: self._step())
+            self._add_gate_controls(self._gate)
         if choose is not None:
             slider = gui.add_slider("Frame", min=0, max=max(frames - 1, 1), step=1, initial_value=0)
             slider.on_update(lambda _: choose(min(int(slider.value), frames - 1)))
@@ -250,17 +233,26 @@ class Page:
         look = gui.add_button("Look from the current frame")
         look.on_click(lambda event: self._look_from_frame(event.client))
 
+    def _add_gate_controls(self, gate: Gate) -> None:
+        gui = self._server.gui
+        self._pause = gui.add_button("Pause", hint="pause the mapping after the current frame or step")
+        step = gui.add_button("Step", hint="map one frame or take one step, then pause")
+        self.show_paused(gate.paused)
+
+        def pause(paused: bool) -> None:
+            gate.pause(paused)
+            self.show_paused(paused)
+
+        def take_step() -> None:
+            gate.step()
+            self.show_paused(True)
+
+        self._pause.on_click(lambda _: pause(not gate.paused))
+        step.on_click(lambda _: take_step())
+
     def show_paused(self, paused: bool) -> None:
         """Set the label of the pause button."""
         self._pause.label = "Resume" if paused else "Pause"
-
-    def _set_paused(self, paused: bool) -> None:
-        self._gate.pause(paused)
-        self.show_paused(paused)
-
-    def _step(self) -> None:
-        self._gate.step()
-        self.show_paused(True)
 
     def _set_mode(self, mode: str) -> None:
         with self._lock:
