@@ -27,6 +27,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from modp_ti.version import __version__
+
 # Only for type checkers and editors. At run time `__getattr__` imports these names on first access.
 if TYPE_CHECKING:
     from fields.frames.pose_correction import PoseCorrection
@@ -48,8 +50,6 @@ if TYPE_CHECKING:
     from pipelines.render.rasterize import RasterizedView, rasterize
     from pipelines.render.renderer import Renderer
     from pipelines.settings import MappingSettings, RefineSettings
-
-__version__ = "0.2.0"
 
 _HOMES = {
     "GaussianField": "fields.map.gaussians",

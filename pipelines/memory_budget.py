@@ -56,6 +56,10 @@ class MemoryBudget:
         voxels = 0 if self.voxels is None else self.voxels.nbytes
         return len(self.gaussians) * self.gaussians.bytes_each + self.keyframes.nbytes + voxels + self.beside
 
+    def may_cut(self, count: int) -> bool:
+        """Whether `take_gaussians` may reject some of `count` new Gaussians."""
+        return self.limit is not None or count > self.gaussians.capacity - len(self.gaussians)
+
     def take_gaussians(self, position: NDArray[np.float64], size: float) -> int:
         """Determine how many new Gaussians fit, together with the voxels that they may mark.
 

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from modp_ti import __version__
 from modp_ti.commands.check import EXAMPLES as CHECK_EXAMPLES
 from modp_ti.commands.check import check
 from modp_ti.commands.export import EXAMPLES as EXPORT_EXAMPLES
@@ -20,6 +19,7 @@ from modp_ti.commands.view import EXAMPLES as VIEW_EXAMPLES
 from modp_ti.commands.view import view
 from modp_ti.commands.warmup import EXAMPLES as WARMUP_EXAMPLES
 from modp_ti.commands.warmup import warmup
+from modp_ti.version import __version__
 
 __all__ = ["app"]
 

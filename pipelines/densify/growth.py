@@ -158,10 +158,11 @@ def grow(
     Returns:
         Number of Gaussians added.
     """
-    if voxels is not None:
-        seeds = seeds[~voxels.query(seeds.xyz, target)]
-    # Cut to the budget before marking: a cell that is marked but empty would reject all later Gaussians.
-    seeds = seeds[: budget.take_gaussians(seeds.xyz, target)]
+    if budget.may_cut(len(seeds)):
+        # Cut to the budget before marking: a cell that is marked but empty would reject all later Gaussians.
+        if voxels is not None:
+            seeds = seeds[~voxels.query(seeds.xyz, target)]
+        seeds = seeds[: budget.take_gaussians(seeds.xyz, target)]
     if voxels is not None:
         seeds = seeds[voxels.admit(seeds.xyz, target)]
     n = len(seeds)
