@@ -107,10 +107,13 @@ def test_lists_are_those_of_the_cpu(pair: tuple[Result, Result]) -> None:
 
 def test_gradients_are_those_of_the_cpu(pair: tuple[Result, Result]) -> None:
     cpu, gpu = pair
-    # Where pixels are opaque, Gaussians behind them get a little on the CPU.
-    tolerance = 1e-3 if cpu["opacity"].max() > 1 - 2 * OPAQUE else 1e-4
+    # Where pixels are opaque, the CPU still gives Gaussians behind them up to OPAQUE of each pixel, of either sign:
+    # of `rest`, at most 3.6 in ten draws.
+    is_opaque = cpu["opacity"].max() > 1 - 2 * OPAQUE
+    rest = OPAQUE * np.sqrt(cpu["opacity"].size) if is_opaque else 0.0
     for name in (*NAMES, "camera"):
-        np.testing.assert_allclose(gpu[name], cpu[name], rtol=0, atol=tolerance * max(np.abs(cpu[name]).max(), 1e-6))
+        tolerance = (1e-3 if is_opaque else 1e-4) * max(np.abs(cpu[name]).max(), 1e-6) + 8 * rest
+        np.testing.assert_allclose(gpu[name], cpu[name], rtol=0, atol=tolerance)
     np.testing.assert_array_equal(gpu["touched"], cpu["touched"])
 
 

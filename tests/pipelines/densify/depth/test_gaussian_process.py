@@ -51,7 +51,8 @@ def test_points_are_met_and_far_from_them_nothing_is_known(grid: np.ndarray) -> 
     at = estimator().estimate(v, [], corner)
     away = estimator().estimate(v, [], np.array([[155.0, 115.0]]))
     assert at.deviation.max() < 0.7 * away.deviation[0]
-    assert away.deviation[0] == pytest.approx(0.3, rel=0.5)
+    # At least the spread of the points: 0.996 to 2.3 times it in 25 draws.
+    assert away.deviation[0] > 0.9 * np.log(depth).std()
 
 
 def test_the_process_is_the_closed_form(grid: np.ndarray) -> None:
