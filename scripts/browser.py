@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,7 +42,9 @@ def open_page(url: str, width: int = 1000, height: int = 640) -> Iterator[Page]:
 
     executable = next(path for path in map(shutil.which, NAMES) if path)
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=executable, args=OPTIONS)
+        # Chromium brings its own software Vulkan, which variables that choose the system's driver would hide.
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("VK_")}
+        browser = driver.chromium.launch(executable_path=executable, args=OPTIONS, env=environment)
         try:
             page = browser.new_page(viewport={"width": width, "height": height})
             page.set_default_timeout(PATIENCE)
