@@ -72,8 +72,8 @@ def test_frames_of_a_place_keep_the_same_points_where_there_are_too_many(posed):
     everywhere = posed.open("tum", points=posed.root / "points.txt")
     seen_by_all = set.intersection(*(set(frame.points.ids.tolist()) for frame in everywhere.frames))
     assert len(set.union(*kept)) < 30, "drawn anew for each frame it would be most of the 60"
-    # Of 15; drawn anew for each frame next to none would be. 7 to 11 over four seeds.
-    assert len(set.intersection(*kept) & seen_by_all) >= 4
+    # Of 15; drawn anew for each of seven frames, 60 / 4^7 would be: none. 5 to 11 in seven draws.
+    assert len(set.intersection(*kept) & seen_by_all) >= 2
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,8 @@ def test_what_is_read_back_is_what_was_written_to_its_last_bits(tmp_path: Path, 
     turn = Rotation.from_quat(back["quaternion"], scalar_first=True).inv() * Rotation.from_quat(
         state["quaternion"], scalar_first=True
     )
-    assert turn.magnitude().max() < {"splat": 0.02, "spz": 0.004, "compressed-ply": 0.004}[form]
+    # Half a step of 2^-9.5 in three components, of which the fourth follows: at most 2 x sqrt(12) of it.
+    assert turn.magnitude().max() < {"splat": 0.02, "spz": 0.005, "compressed-ply": 0.005}[form]
     constant = {"splat": 0.51 / 255 / 0.2820948, "spz": 0.51 / 255 / 0.15, "compressed-ply": 0.51 / 255 * 3.4}[form]
     np.testing.assert_allclose(back["sh"][:, 0], state["sh"][:, 0], rtol=0, atol=constant)
     if form != "splat":
