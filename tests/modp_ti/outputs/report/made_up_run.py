@@ -162,7 +162,7 @@ def made_up_run(
         album.keep(i, image, render)
     config = SceneConfig(
         tracker=TransformsSettings(),
-        source=SourceSettings(scale=0.5, holdout=holdout or None),
+        source=SourceSettings(path=folder / "images", scale=0.5, holdout=holdout or None),
         export=ExportSettings(),
         output=folder / "out",
         mode=mode,
