@@ -126,7 +126,8 @@ def folder(frames: list[TrackedFrame], tmp_path_factory: pytest.TempPathFactory)
 def test_a_run_writes_the_corrected_trajectory_and_counts_corrections(folder: Path) -> None:
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["corrections"] == {"received": 1, "moved": 1}
-    assert metrics["ate_rmse"] < 0.015 and metrics["ate_rmse_tracked"] < 0.015  # 0.032 without the correction
+    # At most 0.011 over three seeds, and 0.031 or more in tracked poses without the correction.
+    assert metrics["ate_rmse"] < 0.015 and metrics["ate_rmse_tracked"] < 0.015
     times, poses = read_trajectory(folder / "trajectory.txt")
     assert len(times) == 21 and absolute_trajectory_error(list(poses), loop(21), with_scale=False) < 0.015
 
