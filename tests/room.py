@@ -130,7 +130,8 @@ class RoomRecording:
         room: The room.
         camera: The camera of all frames.
         T_camera_world: True pose (4, 4) of each frame.
-        points: Twice the number of points that are sampled in each of a few evenly spaced frames.
+        points: Twice the number of points that are sampled in each of `views` evenly spaced frames.
+        views: Number of these frames.
         seed: Seed of the points and their errors.
     """
 
@@ -138,6 +139,7 @@ class RoomRecording:
     camera: PinholeCamera
     T_camera_world: list[NDArray[np.float64]]
     points: int = 160
+    views: int = 4
     seed: int = 0
 
     @cached_property
@@ -150,7 +152,7 @@ class RoomRecording:
         rng = np.random.default_rng(self.seed)
         size = [self.camera.width, self.camera.height]
         found = []
-        for T in self.T_camera_world[:: max(len(self.T_camera_world) // 4, 1)]:
+        for T in self.T_camera_world[:: max(len(self.T_camera_world) // self.views, 1)]:
             pixels = rng.uniform([2, 2], np.array(size) - 2, (self.points // 2, 2))
             z = self.room.depth(self.camera, T, pixels)
             found.append((self.camera.unproject(pixels, z) - T[:3, 3]) @ T[:3, :3])

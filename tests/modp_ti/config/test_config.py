@@ -209,8 +209,8 @@ def test_empty_range_of_frames_is_refused(scene):
     )
 
 
-def test_synthetic_tracker_needs_no_images(scene):
-    assert load_scene(scene("tracker: {kind: synthetic}\noutput: o\n")).source.path is None
+def test_socket_tracker_needs_no_images(scene):
+    assert load_scene(scene("tracker: {kind: socket}\noutput: o\n")).source.path is None
 
 
 @pytest.mark.parametrize(

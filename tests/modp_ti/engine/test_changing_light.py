@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.runtime.backend import initialise
-from modp_ti.inputs.synthetic import LightChange, SyntheticTracker
-from modp_ti.inputs.synthetic.renderer import RoomRenderer
 from modp_ti.outputs.evaluation import score_frame
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
+from tests.room import Room, RoomRecording, pinhole, walk
+from tests.simulated_tracker import smooth_walks
 
 pytestmark = pytest.mark.slow
 
-WIDTH, HEIGHT = 112, 84
-# Wanders faster than the map could pass for the mean of, and slowly enough to be interpolated between keyframes.
-LIGHT = LightChange(gain=0.4, white_balance=0.1, bias=0.02, drift=3.0, vignette=0.5)
+WIDTH, HEIGHT = 80, 60
+# The exposure is correlated over this many frames: it changes too fast for the map to average it, and slowly enough to
+# be interpolated between keyframes.
+SMOOTH = 3.0
 
 
 @pytest.fixture(scope="module")
-def frames(taichi_on_the_cpu: None) -> list[TrackedFrame]:
-    """The first 20 frames, every fifth of them held out."""
-    room = RoomRenderer(texel=0.3)
-    return list(
-        SyntheticTracker(
-            width=WIDTH, height=HEIGHT, select=slice(20), holdout=5, points=150, light=LIGHT, seed=4, room=room
+def frames(room: Room) -> list[TrackedFrame]:
+    """20 frames, every fifth of them held out, of a camera with a changing exposure and a vignette."""
+    recording = RoomRecording(room, pinhole(WIDTH, HEIGHT), walk(20))
+    walks = smooth_walks(20, 7, SMOOTH, np.random.default_rng(4))
+    gain = np.exp(0.4 * walks[:, :1] + 0.1 * walks[:, 1:4])
+    offset = 0.02 * walks[:, 4:]
+    x, y = ((2 * np.arange(size) + 1) / size - 1 for size in (WIDTH, HEIGHT))
+    vignette = np.repeat((1 - 0.25 * (x**2 + y[:, None] ** 2))[..., None], 3, axis=2).astype(np.float32)
+    return [
+        replace(
+            frame,
+            image=np.clip((gain[i] * frame.image + offset[i]) * vignette, 0, 1).astype(np.float32),
+            vignette=vignette,
+            held_out=i % 5 == 0,
         )
-    )
+        for i, frame in enumerate(recording.frames())
+    ]
 
 
 def held_out_psnr(frames: list[TrackedFrame], **exposure: object) -> float:
@@ -58,5 +70,5 @@ def held_out_psnr(frames: list[TrackedFrame], **exposure: object) -> float:
 
 
 def test_estimated_exposure_wins_at_least_a_decibel(frames: list[TrackedFrame]) -> None:
-    """Measured when this was written: 19.8 dB without, 22.6 dB with."""
-    assert held_out_psnr(frames, enabled=True) > held_out_psnr(frames) + 1.0
+    # 8.6 to 11.6 dB over three seeds of the light.
+    assert held_out_psnr(frames, enabled=True) > held_out_psnr(frames) + 4.0

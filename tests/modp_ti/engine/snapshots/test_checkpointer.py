@@ -33,7 +33,9 @@ class Run:
     """The wall of the mapping tests, mapped with a checkpointer beside it."""
 
     def __init__(self, folder: Path) -> None:
-        (folder / "scene.yaml").write_text("tracker: {kind: synthetic}\noutput: out\nsnapshot_every: 2\n")
+        (folder / "scene.yaml").write_text(
+            "source: {path: images}\ntracker: {kind: colmap}\noutput: out\nsnapshot_every: 2\n"
+        )
         self.config = load_scene(folder / "scene.yaml")
         self.mapper = Mapper(64, 48, SETTINGS, seed=5)
         self.record = RunRecord()

@@ -260,7 +260,7 @@ def test_a_folder_without_a_snapshot_says_what_to_do(tmp_path: Path) -> None:
 def test_what_cannot_be_resumed_is_said_at_once(tmp_path: Path, settings: str, said: str) -> None:
     from modp_ti.config.scene_file import load_scene
 
-    text = "tracker: {kind: synthetic}\noutput: out\nsnapshot_every: 3\n"
+    text = "source: {path: images}\ntracker: {kind: colmap}\noutput: out\nsnapshot_every: 3\n"
     (tmp_path / "scene.yaml").write_text(text)
     with pytest.raises(InputError, match=said):
         load_scene(tmp_path / "scene.yaml", [settings])

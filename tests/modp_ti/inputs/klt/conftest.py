@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.inputs.synthetic.camera_path import look_at
+from tests.room import look_at
 
 # Corners of the room [m], texels per metre.
 LOW, HIGH = np.array([-3.0, -2.0, 0.0]), np.array([3.0, 3.0, 2.6])

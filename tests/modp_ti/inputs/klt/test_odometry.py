@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry, View
-from modp_ti.inputs.synthetic.camera_path import look_at
 from modp_ti.outputs.evaluation import umeyama
+from tests.room import look_at
 
 pytestmark = pytest.mark.slow
 

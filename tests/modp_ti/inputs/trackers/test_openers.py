@@ -29,11 +29,10 @@ def test_an_opener_takes_the_settings_that_it_is_registered_for(kind):
 def test_settings_know_their_kind_and_what_it_can_do(kind):
     settings = KINDS[kind]()
     assert settings.kind == kind
-    assert settings.needs_source == (kind not in ("synthetic", "socket"))
-    assert settings.brings_cameras == (kind in ("colmap", "transforms", "synthetic", "socket"))
+    assert settings.needs_source == (kind != "socket")
+    assert settings.brings_cameras == (kind in ("colmap", "transforms", "socket"))
     assert settings.follows_streams == (kind == "klt")
     assert settings.is_live == (kind == "socket")
-    assert settings.renders_frames == (kind == "synthetic")
 
 
 def test_an_opener_can_be_added(monkeypatch):

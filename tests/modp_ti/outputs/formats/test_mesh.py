@@ -10,12 +10,9 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from mesh_accuracy import precision_recall, true_surface
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.synthetic import SyntheticTracker
-from modp_ti.inputs.synthetic.renderer import RoomRenderer
 from modp_ti.outputs.formats.mesh import (
     SurfaceView,
     extracted,
@@ -25,6 +22,7 @@ from modp_ti.outputs.formats.mesh import (
     without_floating_parts,
     write_mesh,
 )
+from tests.room import Room, pinhole, walk
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
 COLOUR = np.float32([0.25, 0.5, 1.0])
@@ -61,19 +59,23 @@ def test_a_slanted_plane_is_fused_where_it_is() -> None:
 
 
 @pytest.mark.slow
-def test_the_room_is_fused_to_its_true_surface() -> None:
-    """From true depth at true poses: most lies within one percent of the room's size, both ways."""
-    tracker = SyntheticTracker(width=160, height=120, frames=20, room=RoomRenderer(texel=1.0))
-    poses = tracker.ground_truth()
-    depths = [tracker.depth(index) for index in range(len(tracker))]
+def test_the_room_is_fused_to_its_true_surface(room: Room) -> None:
+    """From true depth at true poses, most of it lies within half a percent of the room's size, both ways."""
+    camera, poses = pinhole(160, 120), walk(20, step=0.1)
     grey = np.full((120, 160, 3), 0.5, np.float32)
-    seen = [without_edges(z) for z in depths]
-    views = [SurfaceView(tracker.camera, T, z, grey) for T, z in zip(poses, seen, strict=True)]
+    pixels = np.stack(np.meshgrid(np.arange(160), np.arange(120)), axis=2).reshape(-1, 2) + 0.5
+    views, surface = [], []
+    for T in poses:
+        z = room.depth(camera, T, pixels)
+        surface.append((camera.unproject(pixels, z) - T[:3, 3]) @ T[:3, :3])
+        views.append(SurfaceView(camera, T, without_edges(z.reshape(120, 160).astype(np.float32)), grey))
     mesh = without_floating_parts(extracted(fused(views, voxel=0.025, farthest=10.0)))
-    surface = true_surface(tracker.camera, poses, depths)
-    precision, recall = precision_recall(np.asarray(mesh.vertices), surface, 0.01 * 4.8)
-    assert precision > 0.85  # 0.894 in a draw
-    assert recall > 0.85
+    vertices, true = (
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz)) for xyz in (mesh.vertices, np.concatenate(surface))
+    )
+    for one, other in ((vertices, true), (true, vertices)):
+        near = np.asarray(one.compute_point_cloud_distance(other)) < 0.025
+        assert near.mean() > 0.95  # 0.990 of the vertices, 0.980 of the surface; nothing here is random
 
 
 def test_depth_is_left_out_at_the_edges_of_things() -> None:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import ExportSettings, SceneConfig, SourceSettings
-from modp_ti.config.tracker_settings import SyntheticSettings
+from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.engine.results import metrics_of
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion
@@ -161,8 +161,8 @@ def made_up_run(
             cv2.imwrite(str(folder / "renders" / f"{i:06d}.png"), pair)
         album.keep(i, image, render)
     config = SceneConfig(
-        tracker=SyntheticSettings(),
-        source=SourceSettings(scale=0.5, holdout=holdout or None),
+        tracker=TransformsSettings(),
+        source=SourceSettings(path=folder / "images", scale=0.5, holdout=holdout or None),
         export=ExportSettings(),
         output=folder / "out",
         mode=mode,

@@ -159,9 +159,10 @@ def test_the_settings_that_were_changed_are_named_with_their_defaults(made) -> N
     rows = {row[0]: row[1:] for row in page.tables["settings"][1:]}
     assert rows["source.scale"] == ["0.5", "1.0"]
     assert rows["source.holdout"] == ["4", "empty"]
-    assert rows["tracker.kind"] == ['"synthetic"', "none"]
+    assert rows["tracker.kind"] == ['"transforms"', "none"]
     assert rows["output"] == [f'"{run.config.output}"', "none"]
-    assert len(rows) == 4
+    assert rows["source.path"] == [f'"{run.config.source.path}"', "empty"]
+    assert len(rows) == 5
     made_with = {row[0]: row[1] for row in page.tables["machine"]}
     assert made_with["backend"] == "CPU" and "Taichi 1." in made_with["libraries"]
 

@@ -117,7 +117,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.M
 
 def test_without_viser_a_run_ends_before_it_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    (tmp_path / "scene.yaml").write_text("tracker: {kind: synthetic}\noutput: out\n")
+    (tmp_path / "scene.yaml").write_text("source: {path: images}\ntracker: {kind: colmap}\noutput: out\n")
     result = CliRunner().invoke(app, ["run", str(tmp_path / "scene.yaml"), "--view"])
     assert result.exit_code == 2
     assert result.stderr.startswith('error: the viewer needs viser: pip install "modp-ti[viewer]"')

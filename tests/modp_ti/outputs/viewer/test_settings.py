@@ -13,7 +13,7 @@ from modp_ti.files.errors import InputError
 
 def settings(folder: Path, text: str, *overrides: str) -> ViewSettings:
     file = folder / "scene.yaml"
-    file.write_text(f"tracker: {{kind: synthetic}}\noutput: out\n{text}\n")
+    file.write_text(f"source: {{path: images}}\ntracker: {{kind: colmap}}\noutput: out\n{text}\n")
     config = load_scene(file, overrides)
     dump_scene(config, folder / "again.yaml")
     assert load_scene(folder / "again.yaml").view == config.view
