@@ -93,7 +93,7 @@ class SourceSettings(StrictModel):
     path: Path | None = Field(
         default=None,
         description="folder of the images (subfolders are searched too), data set, video file or recording "
-        "(not used by `synthetic` and `socket`)",
+        "(not used by `socket`)",
     )
     stream: int | str | None = Field(
         default=None,
