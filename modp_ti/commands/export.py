@@ -15,7 +15,7 @@ __all__ = ["EXAMPLES", "export"]
 EXAMPLES = examples(
     "modp-ti export out/room --format mesh   (out/room/mesh.ply)",
     "modp-ti export out/room --format mesh -o room.glb   (for browsers)",
-    "modp-ti export out/room --format spz   (splats, a tenth of the size)",
+    "modp-ti export out/room --format spz   (splats, 1/5 to 1/4 of the size)",
     "modp-ti export out/room --format nerfstudio -o data/room",
 )
 
@@ -52,7 +52,7 @@ def export(
     voxel: Annotated[
         float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
     ] = None,
-    device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
+    device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:

@@ -67,7 +67,7 @@ def render(
     exposure: Annotated[
         bool, typer.Option("--exposure", help="of the recorded path: each picture as exposed as its frame was")
     ] = False,
-    device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
+    device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:

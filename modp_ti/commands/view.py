@@ -24,7 +24,7 @@ def view(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="port, or the next one that is free; 0 for any")] = 8080,
     max_splats: Annotated[int, typer.Option(min=100, help="splats that a browser draws, of larger maps")] = 300_000,
-    device: Annotated[Device, typer.Option(help="`auto` takes CUDA where there is a GPU")] = Device.auto,
+    device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
 ) -> None:
     """Show a finished map as a web page, until Ctrl-C."""

@@ -25,7 +25,7 @@ __all__ = [
     "VrsSettings",
 ]
 
-NO_PATH = "source.path is missing: give the folder that holds the images"
+NO_PATH = "source.path is missing: set it to the folder of the images"
 
 
 class IntrinsicsSettings(StrictModel):
@@ -34,27 +34,29 @@ class IntrinsicsSettings(StrictModel):
     fx: float | None = Field(
         default=None,
         gt=0,
-        description="focal length in pixels of the stored images; this section wins over what the source itself says "
-        "of its camera. Empty for no such section",
+        description="horizontal focal length in pixels of the stored images. If it is set, this section replaces the "
+        "intrinsics that the source provides",
     )
-    fy: float | None = Field(default=None, gt=0, description="vertical focal length; empty for fx")
+    fy: float | None = Field(default=None, gt=0, description="vertical focal length; empty: the same as fx")
     cx: float | None = Field(
         default=None,
-        description="principal point; pixel centres lie at +0.5, so add 0.5 to what OpenCV or ROS calibrated. "
-        "Empty for the middle",
+        description="horizontal principal point. Pixel centres are at +0.5: add 0.5 to a calibration by OpenCV or "
+        "ROS. Empty: the image centre",
     )
-    cy: float | None = Field(default=None, description="as cx")
+    cy: float | None = Field(default=None, description="vertical principal point, as cx")
     k1: float = Field(default=0.0, description="radial distortion, as in OpenCV")
     k2: float = Field(default=0.0, description="as k1")
     p1: float = Field(default=0.0, description="tangential distortion, as in OpenCV")
     p2: float = Field(default=0.0, description="as p1")
     k3: float = Field(default=0.0, description="as k1")
-    k4: float = Field(default=0.0, description="as k1; with `fisheye` only")
-    fisheye: bool = Field(default=False, description="k1 to k4 are those of OpenCV's fisheye model")
+    k4: float = Field(default=0.0, description="as k1; only with `fisheye`")
+    fisheye: bool = Field(default=False, description="use OpenCV's fisheye model with k1 to k4")
     width: int | None = Field(
-        default=None, ge=1, description="width that this calibration is for; the images are then checked against it"
+        default=None,
+        ge=1,
+        description="image width of the calibration. If it is set, the size of the images is checked",
     )
-    height: int | None = Field(default=None, ge=1, description="as width")
+    height: int | None = Field(default=None, ge=1, description="image height of the calibration")
 
     @property
     def given(self) -> bool:
@@ -64,13 +66,13 @@ class IntrinsicsSettings(StrictModel):
     @model_validator(mode="after")
     def _one_model(self) -> IntrinsicsSettings:
         if not self.given and self.model_fields_set - {"fx"} and self != IntrinsicsSettings():
-            raise ValueError("source.intrinsics.fx is missing: the focal length in pixels of the stored images")
+            raise ValueError("source.intrinsics.fx is missing: set the focal length in pixels of the stored images")
         if self.fisheye and (self.p1 or self.p2):
-            raise ValueError("source.intrinsics: OpenCV's fisheye model has no p1 and p2; take them out")
+            raise ValueError("source.intrinsics: OpenCV's fisheye model has no p1 and p2; remove them")
         if self.k4 and not self.fisheye:
-            raise ValueError("source.intrinsics.k4 is for `fisheye: true` alone; take it out")
+            raise ValueError("source.intrinsics.k4 is only for `fisheye: true`; remove it")
         if (self.width is None) != (self.height is None):
-            raise ValueError("source.intrinsics: give width and height, or neither")
+            raise ValueError("source.intrinsics: set both width and height, or neither")
         return self
 
 
@@ -79,7 +81,11 @@ class VrsSettings(StrictModel):
 
     width: int = Field(default=800, ge=8, description="width of the undistorted image (Aria VRS only)")
     height: int = Field(default=800, ge=8, description="height of the undistorted image (Aria VRS only)")
-    focal: float = Field(default=400.0, gt=0, description="its focal length in pixels; 400 at 800x800 sees 90 degrees")
+    focal: float = Field(
+        default=400.0,
+        gt=0,
+        description="focal length of the undistorted image in pixels; 400 at 800x800 is a field of view of 90 degrees",
+    )
 
 
 class SourceSettings(StrictModel):
@@ -87,55 +93,56 @@ class SourceSettings(StrictModel):
 
     kind: Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] = Field(
         default="auto",
-        description="what `path` or `stream` is; `auto` recognises it. `images`: a folder of images; `release`: the "
-        "folder of an Aria sequence as the paper's authors publish it; `vrs`: a Project Aria recording",
+        description="type of `path` or `stream`; `auto` detects it. `images`: a folder of images; `release`: the "
+        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording",
     )
     path: Path | None = Field(
         default=None,
-        description="folder of the images (subfolders are searched too), data set, video file or recording "
-        "(not used by `socket`)",
+        description="folder of the images (including subfolders), data set, video file or recording; not for the "
+        "tracker `socket`",
     )
     stream: int | str | None = Field(
         default=None,
-        description="number of a camera, or URL of a stream, in the place of `path`: frames are taken live",
+        description="instead of `path`: number of a camera or URL of a stream, for live frames",
     )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
-    scale: float = Field(default=1.0, gt=0, le=1, description="factor on width and height of every frame")
+    scale: float = Field(default=1.0, gt=0, le=1, description="scale factor of the width and height of every frame")
     holdout: int | None = Field(
-        default=None, ge=2, description="n sets aside frames 0, n, 2n, ... for evaluation; empty for none"
+        default=None, ge=2, description="n: frames 0, n, 2n, ... are used only for evaluation; empty: none"
     )
     fps: float = Field(
         default=30.0,
         gt=0,
-        description="frames per second: time stamp = position in the folder / fps, where the source has no times",
+        description="frames per second, for sources without time stamps: time = position in the folder / fps",
     )
-    start: int = Field(default=0, ge=0, description="first frame, as position in the folder")
-    stop: int | None = Field(default=None, ge=1, description="position after the last frame; empty for all")
-    step: int = Field(default=1, ge=1, description="every n-th frame")
+    start: int = Field(default=0, ge=0, description="position of the first frame in the folder")
+    stop: int | None = Field(default=None, ge=1, description="position after the last frame; empty: all frames")
+    step: int = Field(default=1, ge=1, description="use every n-th frame")
     masks: Path | None = Field(
         default=None,
-        description="folder with one mask an image, of its name and size: white valid, black ignored; empty for none",
+        description="folder of masks with the names and sizes of the images: white pixels are valid, black ones "
+        "ignored; empty: no masks",
     )
     mask_colour: tuple[int, int, int] | None = Field(
-        default=None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty for none"
+        default=None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty: none"
     )
     mask_tolerance: int = Field(
         default=0,
         ge=0,
         le=255,
-        description="difference per channel up to which a pixel has mask_colour; some 10 for JPEG",
+        description="largest difference from mask_colour per channel; use about 10 for JPEG images",
     )
     prefetch: int = Field(
         default=4,
         ge=0,
-        description="frames that a thread decodes, undistorts and halves ahead of the mapper; 0 for no thread. "
-        "The map is the same",
+        description="number of frames that a second thread decodes, undistorts and downsamples in advance; 0: no "
+        "thread. The map does not depend on it",
     )
     vignette: Path | None = Field(
         default=None,
-        description="image of how much light reaches each pixel, brightest where all does; with `vrs` Aria's "
-        "vignetting mask, of the recorded image; empty for none, or for the source's own",
+        description="image of the share of light that reaches each pixel (white: all of it). With `vrs`: Aria's "
+        "vignetting mask, which belongs to the recorded image. Empty: the vignette of the source, if it has one",
     )
 
     ground_truth: Path | None = Field(
@@ -164,11 +171,11 @@ class SourceSettings(StrictModel):
     @model_validator(mode="after")
     def _one_place(self) -> SourceSettings:
         if self.stream is None and self.kind == "live":
-            raise ValueError("source.stream is missing: `source.kind: live` needs a camera number or a URL")
+            raise ValueError("source.stream is missing: set it to a camera number or a URL for `source.kind: live`")
         if self.stream is not None and self.kind not in ("auto", "live"):
-            raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; take one of them out")
+            raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; remove one of them")
         if self.stream is not None and self.path is not None:
-            raise ValueError("source.path and source.stream cannot both be given; take one of them out")
+            raise ValueError("source.path and source.stream cannot both be set; remove one of them")
         return self
 
     @model_validator(mode="after")
@@ -184,7 +191,7 @@ class EvaluationSettings(StrictModel):
     lpips_weights: Path | None = Field(
         default=None,
         description="folder with `alexnet-owt-7be5be79.pth` (torchvision) and `alex.pth` (the `lpips` package, v0.1); "
-        "empty: torch's cache and the installed package; LPIPS is null where they are not",
+        "empty: they are searched in torch's cache and in the installed package. Without them, LPIPS is null",
     )
 
 
@@ -193,11 +200,11 @@ class ExportSettings(StrictModel):
 
     images: bool = Field(
         default=False,
-        description="write the undistorted images, as mapped, into `colmap/images`: to go on with elsewhere, since the "
-        "cameras of `colmap/` are theirs",
+        description="write the undistorted images to `colmap/images`. The cameras in `colmap/` belong to these images, "
+        "so other programs need them",
     )
     report: bool = Field(
-        default=True, description="write `report.html`: figures, curves, pictures and settings of the run on one page"
+        default=True, description="write `report.html`, a page with the metrics, plots, images and settings of the run"
     )
 
 
@@ -206,25 +213,32 @@ class ViewSettings(StrictModel):
 
     enabled: bool = Field(
         default=False,
-        description="serve a web page that shows the map as it grows (docs/viewer.md). `view: true` is short for it, "
-        "and a section that says anything else means it too",
+        description="serve a web page that shows the growing map (docs/viewer.md). `view: true` is a short form, and "
+        "setting any other key of this section enables the viewer too",
     )
     host: str = Field(
         default="127.0.0.1",
-        description="address to serve at: this machine alone sees 127.0.0.1; 0.0.0.0 is for all that reach it",
+        description="address of the server: 127.0.0.1 is reachable only from this machine, 0.0.0.0 from the network",
     )
-    port: int = Field(default=8080, ge=0, le=65535, description="port, or the next one that is free; 0 for any")
-    paused: bool = Field(default=False, description="hold after the first frame until a browser says to go on")
+    port: int = Field(
+        default=8080,
+        ge=0,
+        le=65535,
+        description="port of the server; if it is in use, the next free one; 0: any free port",
+    )
+    paused: bool = Field(
+        default=False, description="pause after the first frame until the run is continued in the browser"
+    )
     max_cost: float = Field(
         default=5.0,
         gt=0,
         le=100,
-        description="percent of the mapping time that the viewer may take; it shows less instead",
+        description="largest share of the mapping time [%] that the viewer uses; it updates less often instead",
     )
     max_splats: int = Field(
         default=100_000,
         ge=100,
-        description="splats that a browser draws; of larger maps a subsample, grown to cover the rest",
+        description="largest number of splats in the browser. Of a larger map, a subset with enlarged splats is shown",
     )
 
     @model_validator(mode="before")
@@ -251,20 +265,22 @@ class SceneConfig(StrictModel):
 
     source: SourceSettings = SourceSettings()
     tracker: AnyTrackerSettings
-    output: Path = Field(description="folder of the results, made where it is missing")
-    device: Literal["cpu", "cuda", "auto"] = Field(default="auto", description="`auto` takes CUDA where there is a GPU")
+    output: Path = Field(description="output folder, which is created if it does not exist")
+    device: Literal["cpu", "cuda", "auto"] = Field(
+        default="auto", description="`auto`: CUDA if there is a GPU, otherwise the CPU"
+    )
     mode: Literal["online", "offline"] = Field(
         default="online",
-        description="`online` maps while frames arrive and then refines; `offline` is 3DGS on all frames at once",
+        description="`online`: map while frames arrive, then refine; `offline`: 3DGS with all frames at once",
     )
-    seed: int = Field(default=0, ge=0, description="seed of all randomness")
+    seed: int = Field(default=0, ge=0, description="seed of all random numbers")
     snapshot_every: int | None = Field(
         default=None,
         ge=0,
-        description="frames after which everything is kept in `snapshot.npz`, for `modp-ti run --resume` after a crash "
-        "or a power cut; empty or 0 for none. Ctrl-C keeps it in any case",
+        description="number of frames between snapshots of the run in `snapshot.npz`, for `modp-ti run --resume` after "
+        "a crash; empty or 0: none. Ctrl-C always writes a snapshot",
     )
-    threads: int | None = Field(default=None, ge=1, description="CPU threads; empty for one per core")
+    threads: int | None = Field(default=None, ge=1, description="number of CPU threads; empty: one per core")
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
@@ -286,10 +302,8 @@ class SceneConfig(StrictModel):
     def _snapshots_are_of_use(self) -> SceneConfig:
         if self.snapshot_every and not self.can_be_resumed:
             if self.mode != "online":
-                raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; take it out")
-            raise ValueError(
-                "snapshot_every: frames that come live are gone when the run is; record them, or take it out"
-            )
+                raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
+            raise ValueError("snapshot_every: live frames cannot be read again; record them, or remove the key")
         return self
 
     @model_validator(mode="after")
@@ -298,7 +312,9 @@ class SceneConfig(StrictModel):
         if source.path is None and source.stream is None and tracker.needs_source:
             raise ValueError(NO_PATH)
         if source.intrinsics.given and tracker.brings_cameras:
-            raise ValueError(f"tracker.kind: {tracker.kind} brings its own cameras; take source.intrinsics out")
+            raise ValueError(f"tracker.kind: {tracker.kind} provides the cameras; remove source.intrinsics")
         if source.stream is not None and not tracker.follows_streams:
-            raise ValueError(f"tracker.kind: {tracker.kind} cannot follow source.stream: it knows past images")
+            raise ValueError(
+                f"tracker.kind: {tracker.kind} cannot use source.stream, it needs recorded images; set source.path"
+            )
         return self

@@ -60,10 +60,10 @@ class TimedPosesSettings(RecordedSettings):
     """Base class for trackers that match poses with images by time stamp."""
 
     max_difference: float = Field(
-        default=0.02, gt=0, description="seconds by which a pose's time may differ from its image's time"
+        default=0.02, gt=0, description="largest difference [s] between the times of an image and its pose"
     )
     time_offset: float = Field(
-        default=0.0, description="seconds added to the times of the poses, where their clock is not that of the images"
+        default=0.0, description="offset [s] added to the times of the poses, if their clock differs from the images'"
     )
 
 
@@ -74,15 +74,17 @@ class GivenPosesSettings(RecordedSettings):
 
     points: Path | None = Field(
         default=None,
-        description="world points: PLY, or text with `x y z` a line; empty to have features tracked and triangulated "
+        description="world points: PLY, or text with `x y z` per line; empty: features are tracked and triangulated "
         "with the poses",
     )
     adjust: bool | None = Field(
         default=None,
-        description="without `points`: bundle adjust the poses with the triangulated points before the first frame, "
-        "for poses that are those of another sensor or not exact to a pixel; empty for false",
+        description="without `points`: bundle adjust the poses with the triangulated points before the first frame. "
+        "Use it for poses of another sensor or with errors of more than a pixel. Empty: false",
     )
-    max_points: int = Field(default=2000, ge=10, description="points of the point file that one frame is shown at most")
+    max_points: int = Field(
+        default=2000, ge=10, description="largest number of points of a frame that are taken from `points`"
+    )
 
     @property
     def adjusts(self) -> bool:
@@ -92,7 +94,7 @@ class GivenPosesSettings(RecordedSettings):
     @model_validator(mode="after")
     def _only_triangulated_points_can_adjust(self) -> GivenPosesSettings:
         if self.adjust and self.points is not None:
-            raise ValueError("tracker.adjust is for poses without tracker.points; take one of them out")
+            raise ValueError("tracker.adjust cannot be used with tracker.points; remove one of them")
         return self
 
 
@@ -104,8 +106,8 @@ class ColmapSettings(RecordedSettings):
     kind: Literal["colmap"] = Field(default="colmap", description="a COLMAP model")
     path: Path | None = Field(
         default=None,
-        description="folder with cameras, images and points3D, or the one above its folder `0`; empty: `sparse/0` or "
-        "`sparse`, beside the images' folder or in it",
+        description="folder with cameras, images and points3D, or the parent of such a folder `0`; empty: `sparse/0` "
+        "or `sparse`, next to the images' folder or in it",
     )
 
 
@@ -119,7 +121,7 @@ class TransformsSettings(RecordedSettings):
     )
     path: Path | None = Field(
         default=None,
-        description="the file, or its folder; empty: `transforms.json` beside the images' folder or in it",
+        description="the file or its folder; empty: `transforms.json` next to the images' folder or in it",
     )
 
 
@@ -128,17 +130,17 @@ class KltSettings(TrackerSettings):
 
     follows_streams: ClassVar[bool] = True
 
-    kind: Literal["klt"] = Field(default="klt", description="the images alone: our own tracker")
+    kind: Literal["klt"] = Field(default="klt", description="the built-in tracker, which uses only the images")
 
 
 class TumSettings(TimedPosesSettings, GivenPosesSettings):
     """A trajectory in TUM's format."""
 
-    kind: Literal["tum"] = Field(default="tum", description="any trajectory in TUM's format")
+    kind: Literal["tum"] = Field(default="tum", description="a trajectory in TUM format")
     path: Path | None = Field(
         default=None,
-        description="the file, or its folder; empty: `groundtruth.txt`, `trajectory.txt`, `CameraTrajectory.txt` or "
-        "`KeyFrameTrajectory.txt`, in the images' folder or beside it",
+        description="the file or its folder; empty: `groundtruth.txt`, `trajectory.txt`, `CameraTrajectory.txt` or "
+        "`KeyFrameTrajectory.txt`, in the images' folder or next to it",
     )
 
 
@@ -146,12 +148,12 @@ class OrbSlam3Settings(TimedPosesSettings, GivenPosesSettings):
     """A trajectory that ORB-SLAM2 or ORB-SLAM3 wrote."""
 
     kind: Literal["orbslam3"] = Field(
-        default="orbslam3", description="a trajectory of ORB-SLAM2 or ORB-SLAM3, in TUM's or EuRoC's format"
+        default="orbslam3", description="a trajectory of ORB-SLAM2 or ORB-SLAM3, in TUM or EuRoC format"
     )
     path: Path | None = Field(
         default=None,
-        description="the file, or its folder; empty: `CameraTrajectory.txt` or `KeyFrameTrajectory.txt`, in the "
-        "images' folder or beside it",
+        description="the file or its folder; empty: `CameraTrajectory.txt` or `KeyFrameTrajectory.txt`, in the images' "
+        "folder or next to it",
     )
 
 
@@ -159,11 +161,11 @@ class StellaVslamSettings(TimedPosesSettings):
     """A map of stella_vslam."""
 
     kind: Literal["stella_vslam"] = Field(
-        default="stella_vslam", description="a map of stella_vslam, and its trajectory of all frames"
+        default="stella_vslam", description="a map of stella_vslam and its trajectory of all frames"
     )
     path: Path | None = Field(
         default=None,
-        description="the map, or its folder; empty: `map.msg` beside the images' folder or in it",
+        description="the map or its folder; empty: `map.msg` next to the images' folder or in it",
     )
 
 
@@ -171,21 +173,19 @@ class AriaSettings(TimedPosesSettings):
     """Trajectory and points of Project Aria's machine perception services (MPS)."""
 
     kind: Literal["aria"] = Field(
-        default="aria", description="what Project Aria's machine perception services (MPS) wrote"
+        default="aria", description="output of Project Aria's machine perception services (MPS)"
     )
     path: Path | None = Field(
         default=None,
-        description="MPS's folder, its `slam` or `trajectory` folder, or one of the two trajectories; empty: looked "
-        "for near the images",
+        description="MPS's folder, its `slam` or `trajectory` folder, or one of the two trajectories; empty: it is "
+        "searched near the images",
     )
     camera: str = Field(default="camera-rgb", description="label of the camera in online_calibration.jsonl")
-    max_points: int = Field(default=2000, ge=10, description="points that one frame is shown at most")
+    max_points: int = Field(default=2000, ge=10, description="largest number of points of a frame")
     max_inv_dist_std: float = Field(
-        default=0.005, gt=0, description="points whose inverse distance is less certain [1/m] are left out"
+        default=0.005, gt=0, description="largest standard deviation of a point's inverse distance [1/m]"
     )
-    max_dist_std: float = Field(
-        default=0.05, gt=0, description="points whose distance is less certain [m] are left out"
-    )
+    max_dist_std: float = Field(default=0.05, gt=0, description="largest standard deviation of a point's distance [m]")
 
 
 class ModpSettings(RecordedSettings):
@@ -194,8 +194,8 @@ class ModpSettings(RecordedSettings):
     kind: Literal["modp"] = Field(default="modp", description="the files of the paper's release")
     path: Path | None = Field(
         default=None,
-        description="the file of poses, or its folder; empty: `trajectory.json` or `trajectory_orb.json`, in the "
-        "images' folder or beside it",
+        description="the file of poses or its folder; empty: `trajectory.json` or `trajectory_orb.json`, in the "
+        "images' folder or next to it",
     )
 
 
@@ -204,7 +204,7 @@ class ReplicaSettings(GivenPosesSettings):
 
     kind: Literal["replica"] = Field(default="replica", description="traj.txt of a Replica sequence")
     path: Path | None = Field(
-        default=None, description="the file, or its folder; empty: `traj.txt` in the images' folder or beside it"
+        default=None, description="the file or its folder; empty: `traj.txt` in the images' folder or next to it"
     )
 
 
@@ -217,12 +217,12 @@ class SevenScenesSettings(GivenPosesSettings):
     kind: Literal["sevenscenes"] = Field(default="sevenscenes", description="the pose files of Microsoft's 7-Scenes")
     path: Path | None = Field(
         default=None,
-        description="folder with the `*.pose.txt`; empty: the images' folder, or `poses` in it or beside it",
+        description="folder of the files `*.pose.txt`; empty: the images' folder, or `poses` in it or next to it",
     )
     adjust: bool | None = Field(
         default=None,
-        description="without `points`: bundle adjust the poses with the triangulated points before the first frame; "
-        "empty for true, since the poses are those of the depth camera",
+        description="without `points`: bundle adjust the poses with the triangulated points before the first frame. "
+        "Empty: true, since the poses are those of the depth camera",
     )
 
 
@@ -234,22 +234,22 @@ class SocketSettings(TrackerSettings):
     is_live: ClassVar[bool] = True
 
     kind: Literal["socket"] = Field(
-        default="socket", description="another program, which sends frames and poses: docs/tracker_server.md"
+        default="socket", description="another program that sends frames and poses (docs/tracker_server.md)"
     )
     address: str | None = Field(
-        default=None, description="host:port to listen at; empty: 127.0.0.1:7007, which only this machine reaches"
+        default=None, description="host:port of the server; empty: 127.0.0.1:7007, which only this machine can reach"
     )
     path: Path | None = Field(
-        default=None, description="a Unix socket to be made there, instead of `address`; empty for none"
+        default=None, description="path of a Unix socket that is created, instead of `address`; empty: none"
     )
     patience: float = Field(
-        default=120.0, gt=0, description="seconds without a whole message after which the stream counts as ended"
+        default=120.0, gt=0, description="time [s] without a complete message after which the stream ends"
     )
 
     @model_validator(mode="after")
     def _listens_at_one_place(self) -> SocketSettings:
         if self.address is not None and self.path is not None:
-            raise ValueError("tracker.address and tracker.path both say where to listen: take one out")
+            raise ValueError("tracker.address and tracker.path cannot both be set; remove one of them")
         return self
 
 

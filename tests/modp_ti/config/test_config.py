@@ -154,9 +154,9 @@ def test_wrong_value_in_the_file_is_named_with_its_line(scene):
     [
         ("tracker: {kind: colmap}\noutput: o\n", ["source.path is missing"]),
         ("source: {path: x}\noutput: o\n", ["tracker is missing", "tracker.kind"]),
-        ("source: {path: x}\ntracker: {}\noutput: o\n", ["tracker.kind is missing", "`klt` (the images alone"]),
+        ("source: {path: x}\ntracker: {}\noutput: o\n", ["tracker.kind is missing", "`klt` (the built-in tracker"]),
         ("source: {path: x}\ntracker: {path: m}\noutput: o\n", ["tracker.kind is missing"]),
-        ("source: {path: x}\ntracker: {kind: colmap}\n", ["output is missing", "folder of the results"]),
+        ("source: {path: x}\ntracker: {kind: colmap}\n", ["output is missing", "output folder"]),
     ],
 )
 def test_missing_key_is_named_with_its_meaning(scene, text, parts):
@@ -183,8 +183,8 @@ def test_missing_key_is_named_with_its_meaning(scene, text, parts):
         ("{kind: }", ["tracker.kind: must be", "not null"]),
         ("7", ["tracker: must be an object, not 7"]),
         ("{kind: tum, max_difference: -1}", ["tracker.max_difference: must be greater than 0, not -1"]),
-        ("{kind: tum, points: x, adjust: true}", ["tracker.adjust is for poses without tracker.points"]),
-        ("{kind: socket, address: x, path: y}", ["both say where to listen"]),
+        ("{kind: tum, points: x, adjust: true}", ["tracker.adjust cannot be used with tracker.points"]),
+        ("{kind: socket, address: x, path: y}", ["tracker.address and tracker.path cannot both be set"]),
     ],
 )
 def test_what_a_kind_of_tracker_does_not_take_is_named_with_its_line(scene, tracker, parts):
