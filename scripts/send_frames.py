@@ -217,12 +217,10 @@ def play(
         Number of frames that were passed to the mapper.
     """
     from fields.frames.pose_correction import PoseCorrection
-    from fields.runtime.backend import initialise
     from modp_ti.config.scene_file import load_scene
     from modp_ti.inputs.trackers import open_tracker
 
     config = load_scene(scene, overrides)
-    initialise("cpu", config.threads, config.seed)  # needed to render the demo's frames
     tracker = open_tracker(config)
     waiting: deque = deque()
     next_time = time.monotonic()

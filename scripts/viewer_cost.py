@@ -1,8 +1,8 @@
 """Measure the viewer's cost: CPU time with and without it, in alternating blocks of one process.
 
-A small map of the demo room is refined in blocks of steps. Every other block runs with the viewer, with a real browser
-in each of its modes and without one. The time of the viewer's threads counts; that of the browser does not. The script
-prints the median ratio of neighbouring blocks next to the viewer's own estimate.
+A map of the demo's first frames is refined in blocks of steps. Every other block runs with the viewer, with a real
+browser in each of its modes and without one. The time of the viewer's threads counts; that of the browser does not. The
+script prints the median ratio of neighbouring blocks next to the viewer's own estimate.
 """
 
 from __future__ import annotations
@@ -11,20 +11,24 @@ import argparse
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 from browser import choose_mode, missing, open_page
 from ending import documented_ending
 
 from fields.runtime.backend import initialise
+from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.live_viewer import LiveViewer
 from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.session import build_mapper
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.synthetic import SyntheticTracker
+from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.viewer.modes import MODES
-from pipelines.settings import MappingSettings, RefineSettings
+from pipelines.settings import RefineSettings
 
+DEMO = Path(__file__).resolve().parent.parent / "demo" / "scene.yaml"
 CLOSED = "no browser"
 # Delay before the clock is read at the end of a block, for pending messages of the viewer [s].
 SETTLE = 0.3
@@ -90,7 +94,7 @@ def refine(mapper: Mapper, steps: int, progress: Callable[[int, float], None] | 
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=12, help="of the demo room that are mapped (default 12)")
+    parser.add_argument("--frames", type=int, default=12, help="of the demo that are mapped (default 12)")
     parser.add_argument("--block", type=int, default=60, help="steps of a block (default 60)")
     parser.add_argument("--pairs", type=int, default=8, help="blocks with the viewer, in each mode (default 8)")
     parser.add_argument("--mode", action="append", choices=(CLOSED, *MODES), help="only this one; repeatable")
@@ -99,9 +103,11 @@ def main() -> None:
     if modes != [CLOSED] and missing():
         raise InputError(missing())
     initialise("cpu", 1)
-    tracker = SyntheticTracker(select=slice(arguments.frames))
-    mapper = Mapper(tracker.camera.width, tracker.camera.height, MappingSettings())
-    for frame in tracker:
+    config = load_scene(DEMO)
+    config = load_scene(DEMO, [f"source.stop={arguments.frames * config.source.step}"])
+    frames = list(open_tracker(config))
+    mapper = build_mapper(config, frames[0].camera)
+    for frame in frames:
         mapper.add(frame)
     refine(mapper, arguments.block)  # compiles
     print(f"{len(mapper.pipeline.gaussians):,} Gaussians, {len(mapper.pipeline.keyframes)} keyframes")

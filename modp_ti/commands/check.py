@@ -62,7 +62,6 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
     Raises:
         InputError: If the input cannot be read at all.
     """
-    from fields.runtime.backend import initialise
     from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
     from modp_ti.inputs.inspection.pictures import judge_sequence
     from modp_ti.inputs.inspection.report import Report
@@ -71,8 +70,6 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
     from modp_ti.inputs.trackers import open_tracker
     from modp_ti.outputs.progress import ProgressLine
 
-    if config.tracker.renders_frames:
-        initialise("cpu", config.threads, config.seed)
     line = ProgressLine(console)
     tracker = open_tracker(config, line.prepare)
     try:

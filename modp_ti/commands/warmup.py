@@ -59,11 +59,11 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: b
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.config.scene_file import load_scene
     from modp_ti.config.settings import SceneConfig
-    from modp_ti.config.tracker_settings import SyntheticSettings
+    from modp_ti.config.tracker_settings import SocketSettings
 
     if scene is None:
-        # A placeholder with default settings; neither its tracker nor its output folder is opened.
-        config = SceneConfig(tracker=SyntheticSettings(), output=Path())
+        # A placeholder with default settings, of a tracker that needs no source; neither it nor the output is opened.
+        config = SceneConfig(tracker=SocketSettings(), output=Path())
     else:
         config = load_scene(scene, overrides)
     from modp_ti.outputs.progress import ProgressLine

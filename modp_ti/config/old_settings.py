@@ -4,6 +4,8 @@ Until 0.1.0 the `tracker` section had one flat list of keys for all kinds, and a
 contained all of them with their defaults. Now each kind has its own keys. A key of another kind is therefore dropped
 if its value is empty or the old default, since it never had an effect. With any other value it is reported as an
 unknown key, since the user expects it to have an effect.
+
+A kind that was removed is an error that says what replaces it.
 """
 
 from __future__ import annotations
@@ -13,8 +15,9 @@ from typing import Any
 
 from modp_ti.config.keys import variants_of
 from modp_ti.config.settings import SceneConfig
+from modp_ti.files.errors import InputError
 
-__all__ = ["without_leftovers"]
+__all__ = ["refuse_removed_kind", "without_leftovers"]
 
 # The keys of the old flat section except `kind`, with their defaults.
 FLAT_TRACKER: Mapping[str, Any] = {
@@ -33,6 +36,28 @@ FLAT_TRACKER: Mapping[str, Any] = {
     "drift": 0.0,
     "correction": False,
 }
+
+REMOVED_KINDS: Mapping[str, str] = {
+    "synthetic": "the procedural room was replaced by demo/room.mp4; map demo/scene.yaml",
+}
+"""What to do instead of a tracker that this version no longer has, by kind."""
+
+
+def refuse_removed_kind(settings: Mapping[str, Any], where: Mapping[str, str], name: str) -> None:
+    """Raise an error for a tracker of an older version.
+
+    Args:
+        settings: The settings of a scene as plain data.
+        where: File and line, or the override, that set each dotted key.
+        name: Place to name for keys that are not in `where`.
+
+    Raises:
+        InputError: If this version no longer has the scene's `tracker.kind`.
+    """
+    tracker = settings.get("tracker")
+    if isinstance(tracker, Mapping) and (instead := REMOVED_KINDS.get(str(tracker.get("kind")))):
+        place = where.get("tracker.kind", where.get("tracker", name))
+        raise InputError(f"{place}: tracker.kind: {tracker['kind']} no longer exists: {instead}")
 
 
 def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:

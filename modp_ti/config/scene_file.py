@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from modp_ti.config.keys import as_yaml, documented_keys, sections_of, variants_of
-from modp_ti.config.old_settings import without_leftovers
+from modp_ti.config.old_settings import refuse_removed_kind, without_leftovers
 from modp_ti.config.settings import SceneConfig
 from modp_ti.config.unknown_keys import refuse_unknown_keys
 from modp_ti.files import read_text
@@ -125,6 +125,7 @@ def _resolved(data: dict[str, Any], where: dict[str, str], name: str, overrides:
     for override in overrides:
         _apply_override(data, override, where)
     # After the overrides, since one may change `tracker.kind`, on which the keys of the section depend.
+    refuse_removed_kind(data, where, name)
     data = without_leftovers(data)
     refuse_unknown_keys(data, SceneConfig, where, name)
     return _validated(data, where, name)

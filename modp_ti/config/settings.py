@@ -99,7 +99,7 @@ class SourceSettings(StrictModel):
     path: Path | None = Field(
         default=None,
         description="folder of the images (including subfolders), data set, video file or recording; not for the "
-        "trackers `synthetic` and `socket`",
+        "tracker `socket`",
     )
     stream: int | str | None = Field(
         default=None,

@@ -26,7 +26,6 @@ __all__ = [
     "SevenScenesSettings",
     "SocketSettings",
     "StellaVslamSettings",
-    "SyntheticSettings",
     "TimedPosesSettings",
     "TrackerSettings",
     "TransformsSettings",
@@ -48,8 +47,6 @@ class TrackerSettings(StrictModel):
     """Whether the tracker works on a live `source.stream`, whose images are not known in advance."""
     is_live: ClassVar[bool] = False
     """Whether the frames arrive from another program and cannot be read again after the run."""
-    renders_frames: ClassVar[bool] = False
-    """Whether Taichi renders the frames, so that it must be initialised before the first one is read."""
 
 
 class RecordedSettings(TrackerSettings):
@@ -256,29 +253,6 @@ class SocketSettings(TrackerSettings):
         return self
 
 
-class SyntheticSettings(TrackerSettings):
-    """The built-in synthetic demo scene."""
-
-    needs_source: ClassVar[bool] = False
-    brings_cameras: ClassVar[bool] = True
-    renders_frames: ClassVar[bool] = True
-
-    kind: Literal["synthetic"] = Field(default="synthetic", description="the embedded demo")
-    exposure_change: float = Field(
-        default=0.0, ge=0, description="how much the exposure wanders; at 1 by a factor of 1.3 up and down"
-    )
-    drift: float = Field(
-        default=0.0,
-        ge=0,
-        le=0.5,
-        description="the camera walks in a loop, at whose end the world is off by this: shift in scene depths, turn "
-        "in radians, scale by its exponential",
-    )
-    correction: bool = Field(
-        default=False, description="where the loop closes, the tracker corrects all that has drifted"
-    )
-
-
 AnyTrackerSettings = Annotated[
     ColmapSettings
     | TransformsSettings
@@ -290,8 +264,7 @@ AnyTrackerSettings = Annotated[
     | ModpSettings
     | ReplicaSettings
     | SevenScenesSettings
-    | SocketSettings
-    | SyntheticSettings,
+    | SocketSettings,
     Field(discriminator="kind"),
 ]
 """The type of the `tracker` section: a union of the models, discriminated by `kind`."""

@@ -307,7 +307,7 @@ class _Session:
     def _true_poses(self) -> list[NDArray[np.float64]]:
         """Return the true pose of every frame, NaN where it is unknown; empty without ground truth."""
         if self.truth is None:
-            return self.tracker.ground_truth()
+            return []
         truth, note = true_poses(self.truth, self.mapper.frames.timestamp)
         if note:
             self._say(note)

@@ -6,9 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import UnreadableImageError
@@ -70,10 +67,6 @@ class Tracker(ABC):
     def undistorter(self) -> Undistorter | None:
         """Undistorter of the first frame's image, or None if the tracker does not provide one."""
         return None
-
-    def ground_truth(self) -> list[NDArray[np.float64]]:
-        """Return the ground-truth T_camera_world (4, 4) of every frame, in metres; empty if unknown."""
-        return []
 
     def close(self) -> None:  # noqa: B027 - most trackers hold nothing open
         """Release open resources, such as a camera, a file or a socket."""

@@ -13,16 +13,24 @@ from tests.fault_injection.runs import contents, finished, require_success, run_
 
 __all__ = ["KILLS_SCENE", "Kills", "kill_and_resume", "kills_table"]
 
-# The demo room, so small that starting the process takes the most time. Exposure estimation and pose corrections are
-# enabled so that the snapshots contain all kinds of state.
-KILLS_SCENE = """\
-source:  {scale: 0.25, holdout: 4, step: 3}
-tracker: {kind: synthetic, drift: 0.05, correction: true, exposure_change: 0.5}
+DEMO = Path(__file__).resolve().parents[2] / "demo" / "room.mp4"
+
+# Part of the demo, so small that starting the process takes the most time. Exposure estimation is enabled, and `klt`
+# corrects its poses, so that the snapshots contain all kinds of state.
+KILLS_SCENE = f"""\
+source:
+  path: {json.dumps(str(DEMO))}
+  intrinsics: {{fx: 512, cx: 320, cy: 240}}
+  scale: 0.25
+  holdout: 4
+  step: 4
+  stop: 104
+tracker: {{kind: klt}}
 output:  reference
 device:  cpu
-mapping: {optimise: {steps: 4, last_steps: 6}, exposure: {enabled: true}}
-refine:  {steps: 40}
-export:  {report: false}
+mapping: {{optimise: {{steps: 4, last_steps: 6}}, exposure: {{enabled: true}}}}
+refine:  {{steps: 40}}
+export:  {{report: false}}
 snapshot_every: 2
 """
 

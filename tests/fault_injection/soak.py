@@ -1,4 +1,4 @@
-"""Soak test: maps the demo room repeatedly as one long recording and measures the memory of the process."""
+"""Soak test: maps a walk through the test room again and again, as one recording, and measures the memory."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from pathlib import Path
 from fields.frames.tracked_frame import TrackedFrame
 from fields.runtime.backend import initialise
 from modp_ti.engine.mapper import Mapper
-from modp_ti.inputs.synthetic import SyntheticTracker
 from pipelines.settings import MappingSettings, OptimiseSettings
+from tests.room import Room, RoomRecording, pinhole, walk
 
 __all__ = ["Soak", "soak", "soak_table"]
 
 WIDTH, HEIGHT = 80, 60
+WALK = 56  # frames of the walk
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Soak:
 
 
 def soak(frames: int, memory: float | None, say: Callable[[str], None]) -> Soak:
-    """Map the demo's frames back and forth until there are `frames` of them.
+    """Map the walk's frames back and forth until there are `frames` of them.
 
     Args:
         frames: Number of frames.
@@ -58,13 +59,13 @@ def soak(frames: int, memory: float | None, say: Callable[[str], None]) -> Soak:
         say: Called with progress lines.
     """
     initialise("cpu")
-    tracker = list(SyntheticTracker(width=WIDTH, height=HEIGHT))
+    walked = RoomRecording(Room(), pinhole(WIDTH, HEIGHT), walk(WALK)).frames()
     settings = MappingSettings(optimise=OptimiseSettings(steps=1, last_steps=1), memory=memory)
     mapper = Mapper(WIDTH, HEIGHT, settings)
     megabytes: list[float] = []
     kept: list[float] = []
     gaussians: list[int] = []
-    for frame in _there_and_back(tracker, frames):
+    for frame in _there_and_back(walked, frames):
         mapper.add(frame)
         if (frame.index + 1) % max(frames // 10, 1) == 0:
             megabytes.append(_resident())

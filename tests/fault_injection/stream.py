@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3
-from fields.runtime.backend import initialise
-from modp_ti.inputs.synthetic import SyntheticTracker
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from tests.fault_injection.runs import finished, metrics
+from tests.room import Room, RoomRecording, pinhole, walk
 
 __all__ = ["FAULTS", "Stream", "map_both", "stream_table", "write_recording"]
 
 HOLDOUT = 8
 FPS = 10.0
+WALK = 2.4  # length of the camera's path [m]
 FAULTS = ("black image", "cut-off image", "repeated image", "pose that jumps", "pose of NaN", "clock that jumps")
 SCENE = """\
 source:
@@ -66,20 +66,18 @@ def held_out(figures: dict) -> float:
 
 
 def write_recording(folder: Path, frames: int, scale: float, steps: int, refine: int) -> None:
-    """Write the demo room as an image folder with a TUM trajectory and the tracker's points."""
-    initialise("cpu")
-    tracker = SyntheticTracker(width=round(320 * scale), height=round(240 * scale), frames=frames)
+    """Write a walk through the test room as an image folder with a TUM trajectory and the tracked points."""
+    camera = pinhole(round(320 * scale), round(240 * scale))
+    recording = RoomRecording(Room(), camera, walk(frames, WALK / frames))
     (folder / "images").mkdir(parents=True)
     poses, points = [], {}
-    for frame in tracker:
-        picture = np.round(frame.image[..., ::-1] * 255.0).astype(np.uint8)
-        cv2.imwrite(str(folder / "images" / f"{frame.index:06d}.png"), picture)
+    for frame, image in zip(recording.frames(), recording.images, strict=True):
+        cv2.imwrite(str(folder / "images" / f"{frame.index:06d}.png"), image[..., ::-1])
         poses.append(frame.T_camera_world)
         points |= dict(zip(frame.points.ids.tolist(), frame.points.xyz.tolist(), strict=True))
     write_trajectory(folder / "poses.txt", np.arange(frames) / FPS, poses)
     text = "\n".join(" ".join(map(repr, xyz)) for xyz in points.values())
     (folder / "points.txt").write_text(text + "\n", encoding="utf-8")
-    camera = tracker.camera
     scene = SCENE.format(
         fps=FPS, holdout=HOLDOUT, focal=camera.fx, cx=camera.cx, cy=camera.cy, steps=steps, refine=refine
     )

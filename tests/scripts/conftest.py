@@ -12,9 +12,10 @@ import pytest
 from modp_ti.config.scene_file import dump_scene, load_scene
 from pipelines.stopwatch import breakdown_percent
 
-SCENE = """
-source:  {scale: 0.25, holdout: 4, stop: 9}
-tracker: {kind: synthetic}
+DEMO = Path(__file__).resolve().parents[2] / "demo" / "room.mp4"
+SCENE = f"""
+source:  {{path: {json.dumps(str(DEMO))}, scale: 0.25, holdout: 4, stop: 9}}
+tracker: {{kind: klt}}
 output:  out
 device:  cpu
 """

@@ -20,7 +20,6 @@ from modp_ti.config.tracker_settings import (
     SevenScenesSettings,
     SocketSettings,
     StellaVslamSettings,
-    SyntheticSettings,
     TrackerSettings,
     TransformsSettings,
     TumSettings,
@@ -136,10 +135,3 @@ def _(tracker: SocketSettings, opening: Opening) -> Tracker:
     from modp_ti.inputs.tracker_server import open_tracker_server
 
     return open_tracker_server(opening.source, tracker, opening.progress)
-
-
-@opens(SyntheticSettings)
-def _(tracker: SyntheticSettings, opening: Opening) -> Tracker:
-    from modp_ti.inputs.synthetic import open_synthetic
-
-    return open_synthetic(opening.source, tracker)

@@ -31,7 +31,7 @@ __all__ = [
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 # Truncation distance in voxels before and behind the surface. Larger values round off corners and merge the two sides
-# of thin objects: with five instead of three, the demo room's mesh lost four percent of its correct vertices.
+# of thin objects: with five instead of three, 0.1.0's procedural room lost four percent of its correct vertices.
 TRUNCATION = 3.0
 # Minimum number of views that must have seen a voxel.
 LEAST_VIEWS = 2.0

@@ -47,10 +47,6 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
     config = load_scene(run.folder / "config.yaml")
     if config.is_live:
         raise InputError(f"{run.folder}: its frames were live and are gone; such a run needs `export.images: true`")
-    if config.tracker.renders_frames:
-        from modp_ti.outputs.playback.map_renderer import start_device
-
-        start_device("cpu")
     tracker = open_tracker(config, line.prepare)
     other = InputError(
         f"{config.source.path or run.folder}: the source no longer gives the frames that were mapped; run the scene "
