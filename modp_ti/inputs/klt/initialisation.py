@@ -11,9 +11,10 @@ from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
 from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.relocalisation import describe, matches
+from modp_ti.inputs.klt.relocalisation import describe
 from modp_ti.inputs.klt.two_view import two_views
 from modp_ti.inputs.multiview.camera_pose import pose_from_points
+from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
 __all__ = ["Initialisation"]
@@ -68,7 +69,7 @@ class Initialisation:
     def _match(self, last: Frame, frame: Frame) -> None:
         """Add SIFT matches with the frame before to both frames, where flow has lost too many features."""
         a, b = describe(last.grey), describe(frame.grey)
-        pairs = matches(a, b)
+        pairs = match_anywhere(a, b).pairs
         ids = self._new_ids(len(pairs))
         last.append(ids, a.pixels[pairs[:, 0]])
         frame.append(ids, b.pixels[pairs[:, 1]])

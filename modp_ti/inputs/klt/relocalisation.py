@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.multiview.camera_pose import pose_from_points
-from modp_ti.inputs.multiview.features import Features, detect_features, essential_matrix, match_features
+from modp_ti.inputs.multiview.features import Features, detect_features, essential_matrix, match_anywhere
 
-__all__ = ["alike_keyframes", "describe", "inherited", "matches", "place_by_features", "thumbnail"]
+__all__ = ["alike_keyframes", "describe", "inherited", "place_by_features", "thumbnail"]
 
 # Thresholds in px of the tracked image. MAX_ERROR is RANSAC's, and is wide because many depths are those of neighbours.
 # A SIFT feature nearer than SAME_PLACE to a landmark takes its depth.
@@ -24,13 +24,7 @@ THUMBNAIL = (32, 24)
 
 def describe(grey: NDArray[np.uint8]) -> Features:
     """SIFT features of a tracked image (H, W) uint8."""
-    return detect_features(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))
-
-
-def matches(a: Features, b: Features) -> NDArray[np.int64]:
-    """Indices (M, 2) of unambiguous mutual matches."""
-    nowhere = np.zeros((3, 3))  # a zero essential matrix accepts all positions
-    return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0).pairs
+    return detect_features(np.repeat(grey[..., None], 3, axis=2))
 
 
 def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -62,7 +56,7 @@ def place_by_features(
         and in the frame. None if too few agree.
     """
     keyframe = landmarks.keyframes[k]
-    pairs = matches(_described(keyframe), features)
+    pairs = match_anywhere(_described(keyframe), features).pairs
     if len(pairs) < FEWEST:
         return None
     xyz = _places(landmarks, keyframe)[pairs[:, 0]]

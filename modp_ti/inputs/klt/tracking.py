@@ -157,7 +157,7 @@ class Tracking:
         guess = lens.pixels(world @ T[:3, :3].T + T[:3, 3])
         # The reprojection error of each feature is assumed to persist.
         guess = guess + (last.pixels - lens.pixels(world @ T_last[:3, :3].T + T_last[:3, 3]))
-        return np.where(np.isfinite(guess).all(axis=1)[:, None], guess, last.pixels)
+        return np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, last.pixels)
 
     # ------------------------------------------------------------------------------------------------- keyframes
 
