@@ -105,11 +105,12 @@ def align_landmarks(
     current = _sampled(grey, here)
 
     centre = np.array([((n % COLUMNS) + 0.5, (n // COLUMNS) + 0.5) for n in range(count)]) * TILE - 0.5
+    start = centre.astype(np.float32)[:, None]
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         _mosaic(reference),
         _mosaic(current),
-        centre.astype(np.float32)[:, None],
-        centre.astype(np.float32)[:, None],
+        start,
+        start.copy(),
         winSize=(WINDOW, WINDOW),
         maxLevel=1,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
