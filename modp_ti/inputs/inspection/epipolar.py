@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.inspection.conventions import Convention
-from modp_ti.inputs.multiview.features import Features, essential_matrix, match_features
+from modp_ti.inputs.multiview.features import Features, essential_matrix, match_anywhere
 
 __all__ = ["EpipolarScore", "MatchedPair", "epipolar_score", "matched_pair"]
 
@@ -70,12 +70,10 @@ def matched_pair(a: int, features_a: Features, b: int, features_b: Features) -> 
     """
     import cv2
 
-    nowhere = np.zeros((3, 3))
-    rays = (np.zeros((len(each.pixels), 2)) for each in (features_a, features_b))
-    found = match_features(features_a.descriptors, features_b.descriptors, *rays, nowhere, np.inf)
-    if len(found) < LEAST_MATCHES:
+    pairs = match_anywhere(features_a, features_b).pairs
+    if len(pairs) < LEAST_MATCHES:
         return None
-    pixels_a, pixels_b = features_a.pixels[found.pairs[:, 0]], features_b.pixels[found.pairs[:, 1]]
+    pixels_a, pixels_b = features_a.pixels[pairs[:, 0]], features_b.pixels[pairs[:, 1]]
     pixel = max(features_a.pixel, features_b.pixel)
     cv2.setRNGSeed(0)
     _, inlier = cv2.findFundamentalMat(pixels_a, pixels_b, cv2.USAC_MAGSAC, RANSAC_BAND * pixel, 0.999, 5000)

@@ -149,5 +149,5 @@ def _shown(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g}"
 
 
-def _number(value: float) -> float | None:
+def _number(value: float | np.floating) -> float | None:
     return float(f"{float(value):.6g}") if math.isfinite(value) else None

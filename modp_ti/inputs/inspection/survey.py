@@ -119,7 +119,9 @@ def _record(
 ) -> FrameRecord:
     depths = frame.points.depths(frame.T_camera_world)
     depths = depths[depths > 0]
-    comparable = before is not None and before.shape == thumbnail.shape
+    change = float("nan")
+    if before is not None and before.shape == thumbnail.shape:
+        change = float(np.abs(thumbnail - before).mean())
     return FrameRecord(
         index=frame.index,
         name=frame.name,
@@ -130,7 +132,7 @@ def _record(
         points=len(frame.points),
         depth=float(np.median(depths)) if len(depths) else float("nan"),
         sharpness=sharpness(rgb),
-        change=float(np.abs(thumbnail - before).mean()) if comparable else float("nan"),
+        change=change,
         masked=0.0 if frame.mask is None else float(1.0 - frame.mask.mean()),
     )
 
@@ -140,4 +142,4 @@ def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     factor = min(1.0, THUMBNAIL / max(height, width))
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.odometry import FOCAL_FROM, Odometry
+from modp_ti.inputs.klt.odometry import Odometry
+from modp_ti.inputs.klt.tracking import FOCAL_FROM
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
 
@@ -56,14 +57,15 @@ def estimated_intrinsics(
         used += 1
         if progress is not None:
             progress("estimating the camera", min(used, total - 1), total)
-        if odometry.map is not None and len(odometry.map.keyframes) >= ENOUGH:
+        if odometry.tracking is not None and len(odometry.tracking.map.keyframes) >= ENOUGH:
             break
     if progress is not None:
         progress("estimating the camera", total, total)
-    if odometry is None or odometry.map is None or len(odometry.map.keyframes) < FOCAL_FROM:
+    tracking = None if odometry is None else odometry.tracking
+    if tracking is None or len(tracking.map.keyframes) < FOCAL_FROM:
         return None, used
-    odometry.refine_camera()
-    return _believable(odometry.map, width, height), used
+    tracking.refine_camera()
+    return _believable(tracking.map, width, height), used
 
 
 def _believable(landmarks: LandmarkMap, width: int, height: int) -> Intrinsics | None:

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
+from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.optical_flow import corners, flow
-from modp_ti.inputs.klt.relocalisation import describe, matches
+from modp_ti.inputs.klt.relocalisation import describe
 from modp_ti.inputs.klt.two_view import two_views
 from modp_ti.inputs.multiview.camera_pose import pose_from_points
+from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
-__all__ = ["Initialisation", "SeenFrame"]
+__all__ = ["Initialisation"]
 
-WANTED = 450  # features that are tracked
 FEWEST_SHARED = 60  # features that two views must share
 # Least motion of the pair, as a share of the image's longer side, and least parallax in degrees. After PATIENCE frames
 # half the parallax is enough.
@@ -28,25 +27,6 @@ LEAST_ANGLE = 2.5
 PATIENCE = 90  # frames
 BETWEEN = 3  # keyframes between the two views
 LONGEST = 400  # frames in memory
-
-
-@dataclass
-class SeenFrame:
-    """A frame without a pose.
-
-    Attributes:
-        number: Number of the frame.
-        grey: (H, W) uint8.
-        valid: (H, W), False where no features may be tracked; None for everywhere.
-        ids: (N,) ids of its features.
-        pixels: (N, 2) their positions.
-    """
-
-    number: int
-    grey: NDArray[np.uint8]
-    valid: NDArray[np.bool_] | None
-    ids: NDArray[np.int64]
-    pixels: NDArray[np.float64]
 
 
 class Initialisation:
@@ -61,54 +41,44 @@ class Initialisation:
     """
 
     def __init__(self, lenses: Sequence[Lens], seed: int) -> None:
-        self.frames: list[SeenFrame] = []
+        self.frames: list[Frame] = []
         self._lenses = list(lenses)
         self._seed = seed
         self._count = 0
 
-    def add(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> LandmarkMap | None:
-        """Add a frame.
-
-        Args:
-            number: Number of the frame, increasing.
-            grey: (H, W) uint8.
-            valid: (H, W), False where no features may be tracked.
+    def add(self, frame: Frame) -> LandmarkMap | None:
+        """Add a frame without features. It is given those of the frame before, and new ones.
 
         Returns:
             The map, whose last keyframe is this frame; None as long as it cannot be initialised.
         """
-        ids, pixels = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
         if self.frames:
             last = self.frames[-1]
-            pixels, found = flow(last.grey, grey, last.pixels, last.pixels)
-            ids, pixels = last.ids[found], pixels[found]
-            if len(ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)) <= len(last.ids):
-                more_ids, more_pixels = self._matched(last, grey)
-                fresh = ~np.isin(more_ids, ids)
-                ids, pixels = np.concatenate([ids, more_ids[fresh]]), np.concatenate([pixels, more_pixels[fresh]])
-        frame = SeenFrame(number, grey, valid, ids, pixels)
+            frame.track(last)
+            if len(frame.ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)) <= len(last.ids):
+                self._match(last, frame)
         self.frames.append(frame)
         if len(self.frames) > LONGEST:
             del self.frames[0]
         found = self._attempt(frame)
         if len(frame.ids) < 0.75 * WANTED:
-            new = corners(grey, frame.pixels, WANTED, valid)
-            frame.ids = np.concatenate([frame.ids, np.arange(self._count, self._count + len(new))])
-            frame.pixels = np.concatenate([frame.pixels, new])
-            self._count += len(new)
+            new = frame.new_corners()
+            frame.append(self._new_ids(len(new)), new)
         return found
 
-    def _matched(self, last: SeenFrame, grey: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Match SIFT features with the frame before, where flow has lost too many. They are added to that frame."""
-        a, b = describe(last.grey), describe(grey)
-        pairs = matches(a, b)
-        ids = np.arange(self._count, self._count + len(pairs))
-        self._count += len(pairs)
-        last.ids = np.concatenate([last.ids, ids])
-        last.pixels = np.concatenate([last.pixels, a.pixels[pairs[:, 0]]])
-        return ids, b.pixels[pairs[:, 1]]
+    def _match(self, last: Frame, frame: Frame) -> None:
+        """Add SIFT matches with the frame before to both frames, where flow has lost too many features."""
+        a, b = describe(last.grey), describe(frame.grey)
+        pairs = match_anywhere(a, b).pairs
+        ids = self._new_ids(len(pairs))
+        last.append(ids, a.pixels[pairs[:, 0]])
+        frame.append(ids, b.pixels[pairs[:, 1]])
 
-    def _attempt(self, frame: SeenFrame) -> LandmarkMap | None:
+    def _new_ids(self, count: int) -> NDArray[np.int64]:
+        self._count += count
+        return np.arange(self._count - count, self._count)
+
+    def _attempt(self, frame: Frame) -> LandmarkMap | None:
         first = self._partner(frame)
         if first is None:
             return None
@@ -125,7 +95,7 @@ class Initialisation:
                 best, best_cost = landmarks, cost
         return best
 
-    def _partner(self, frame: SeenFrame) -> int | None:
+    def _partner(self, frame: Frame) -> int | None:
         """Index of the frame with the largest motion to this one, among those that share enough features with it."""
         size = max(frame.grey.shape)
         best, best_shift = None, LEAST_SHIFT * size
@@ -144,7 +114,7 @@ class Initialisation:
         self,
         lens: Lens,
         first: int,
-        frame: SeenFrame,
+        frame: Frame,
         share: NDArray[np.int64],
         T_b_a: NDArray[np.float64],
         xyz: NDArray[np.float64],

@@ -139,14 +139,13 @@ class LandmarkMap:
         Returns:
             Keyframe, index within the keyframe, and landmark id of each observation, (M,) each.
         """
-        of, place, ids = [], [], []
+        nothing = np.zeros(0, dtype=np.int64)
+        of, place, ids = [nothing], [nothing], [nothing]
         for k in keyframes:
             slots = np.flatnonzero(self.known[self.keyframes[k].ids])
             of.append(np.full(len(slots), k))
             place.append(slots)
             ids.append(self.keyframes[k].ids[slots])
-        if not of:
-            return (np.zeros(0, dtype=np.int64),) * 3
         return np.concatenate(of), np.concatenate(place), np.concatenate(ids)
 
     def triangulate(self, k: int) -> NDArray[np.int64]:

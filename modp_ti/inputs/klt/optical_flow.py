@@ -68,7 +68,7 @@ def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[n
     gain = float(deviation_after / max(deviation, 1e-6))
     if not 0.5 < gain < 2.0 or (abs(gain - 1.0) < 0.02 and abs(mean - mean_after) < 2.0):
         return before
-    return cv2.convertScaleAbs(before, alpha=gain, beta=float(mean_after - gain * mean))
+    return np.asarray(cv2.convertScaleAbs(before, alpha=gain, beta=float(mean_after - gain * mean)), dtype=np.uint8)
 
 
 def _levels(grey: NDArray[np.uint8]) -> int:
@@ -132,4 +132,4 @@ def corners(
     order = np.lexsort((-strength, rank))
     chosen = order[: max(0, wanted - len(taken))]
     chosen = chosen[rank[chosen] < 3]
-    return np.stack([x[chosen], y[chosen]], axis=1) + 0.5
+    return np.stack([x[chosen], y[chosen]], axis=1).astype(np.float64) + 0.5

@@ -87,7 +87,7 @@ def align_landmarks(
     if count == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=bool)
     warp = _warps(landmarks, ids, keyframe, pixel, T_camera_world)
-    usable = np.isfinite(warp).all(axis=(1, 2)) & np.isfinite(guess).all(axis=1)
+    usable = np.isfinite(np.c_[warp.reshape(count, 4), guess]).all(axis=1)
     determinant = np.where(usable, np.linalg.det(np.where(usable[:, None, None], warp, np.eye(2))), 0.0)
     usable &= (np.abs(determinant) > 1 / LARGEST_ZOOM**3) & (np.abs(determinant) < LARGEST_ZOOM**3)
     warp = np.where(usable[:, None, None], warp, np.eye(2))
@@ -105,11 +105,12 @@ def align_landmarks(
     current = _sampled(grey, here)
 
     centre = np.array([((n % COLUMNS) + 0.5, (n // COLUMNS) + 0.5) for n in range(count)]) * TILE - 0.5
+    start = centre.astype(np.float32)[:, None]
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         _mosaic(reference),
         _mosaic(current),
-        centre.astype(np.float32)[:, None],
-        None,
+        start,
+        start.copy(),
         winSize=(WINDOW, WINDOW),
         maxLevel=1,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
@@ -119,7 +120,7 @@ def align_landmarks(
     recognised = usable & (status[:, 0] > 0) & (np.abs(shift) <= room).all(axis=1)
     result = guess + np.where(recognised[:, None], shift, 0.0)
     half = WINDOW // 2
-    near = np.stack(np.meshgrid(*[np.arange(-half, half + 1) - 0.0] * 2), axis=-1)
+    near = np.stack(np.meshgrid(*[np.arange(-half, half + 1, dtype=np.float64)] * 2), axis=-1)
     a = _sampled_stack(reference, near)
     b = _sampled(grey, result[:, None, None] + near)
     recognised &= _correlation(a, b) > ALIKE

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.multiview.camera_pose import pose_from_points
-from modp_ti.inputs.multiview.features import Features, detect_features, essential_matrix, match_features
+from modp_ti.inputs.multiview.features import Features, detect_features, essential_matrix, match_anywhere
 
-__all__ = ["Placed", "alike_keyframes", "describe", "inherited", "matches", "place_by_features", "thumbnail"]
+__all__ = ["alike_keyframes", "describe", "inherited", "place_by_features", "thumbnail"]
 
 # Thresholds in px of the tracked image. MAX_ERROR is RANSAC's, and is wide because many depths are those of neighbours.
 # A SIFT feature nearer than SAME_PLACE to a landmark takes its depth.
@@ -24,30 +22,9 @@ FEWEST = 15  # fewest inlier matches of a pose
 THUMBNAIL = (32, 24)
 
 
-@dataclass(frozen=True)
-class Placed:
-    """A frame that was localised against a keyframe.
-
-    Attributes:
-        keyframe: Index of the keyframe.
-        T_camera_world: (4, 4) pose of the frame.
-        pairs: (M, 2) matches: indices of SIFT features in the keyframe and in the frame.
-    """
-
-    keyframe: int
-    T_camera_world: NDArray[np.float64]
-    pairs: NDArray[np.int64]
-
-
 def describe(grey: NDArray[np.uint8]) -> Features:
     """SIFT features of a tracked image (H, W) uint8."""
-    return detect_features(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))
-
-
-def matches(a: Features, b: Features) -> NDArray[np.int64]:
-    """Indices (M, 2) of unambiguous mutual matches."""
-    nowhere = np.zeros((3, 3))  # a zero essential matrix accepts all positions
-    return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0).pairs
+    return detect_features(np.repeat(grey[..., None], 3, axis=2))
 
 
 def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -63,7 +40,9 @@ def alike_keyframes(thumbnails: NDArray[np.float32], grey: NDArray[np.uint8], co
     return [int(k) for k in np.argsort(-likeness, kind="stable")[:count]]
 
 
-def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: int) -> Placed | None:
+def place_by_features(
+    landmarks: LandmarkMap, k: int, features: Features, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Localise a frame by SIFT matches with keyframe k.
 
     Args:
@@ -73,13 +52,11 @@ def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: 
         seed: Seed of RANSAC.
 
     Returns:
-        The pose and its matches; None if too few matches agree.
+        T_camera_world (4, 4) of the frame, and the matches (M, 2) that agree: indices of SIFT features in the keyframe
+        and in the frame. None if too few agree.
     """
     keyframe = landmarks.keyframes[k]
-    if keyframe.described is None:
-        keyframe.described = describe(keyframe.grey)
-        keyframe.described_ids = np.full(len(keyframe.described.pixels), -1, dtype=np.int64)
-    pairs = matches(keyframe.described, features)
+    pairs = match_anywhere(_described(keyframe), features).pairs
     if len(pairs) < FEWEST:
         return None
     xyz = _places(landmarks, keyframe)[pairs[:, 0]]
@@ -92,7 +69,7 @@ def place_by_features(landmarks: LandmarkMap, k: int, features: Features, seed: 
         return None
     agreeing = np.ones(len(pairs), dtype=bool)
     agreeing[placed] = found[1]
-    return Placed(k, found[0], pairs[agreeing])
+    return found[0], pairs[agreeing]
 
 
 def inherited(
@@ -114,7 +91,8 @@ def inherited(
         Ids (N,) and their pixels (N, 2) in the frame.
     """
     keyframe = landmarks.keyframes[k]
-    a, b = keyframe.described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
+    described = _described(keyframe)
+    a, b = described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
     rays_a, rays_b = landmarks.lens.rays(a), landmarks.lens.rays(b)
     lines = np.c_[rays_a, np.ones(len(a))] @ essential_matrix(keyframe.T_camera_world, T).T
     off = np.abs((lines * np.c_[rays_b, np.ones(len(b))]).sum(axis=1))
@@ -126,10 +104,18 @@ def inherited(
     fresh = keyframe.described_ids[slots] < 0
     ids = landmarks.new_ids(int(fresh.sum()))
     keyframe.described_ids[slots[fresh]] = ids
-    pixels = keyframe.described.pixels[slots[fresh]]
+    pixels = described.pixels[slots[fresh]]
     keyframe.append(ids, pixels, landmarks.lens.rays(pixels))
     landmarks.note_observations(k, ids, pixels)
     return keyframe.described_ids[slots], b
+
+
+def _described(keyframe: Keyframe) -> Features:
+    """SIFT features of a keyframe, detected when they are first needed."""
+    if keyframe.described is None:
+        keyframe.described = describe(keyframe.grey)
+        keyframe.described_ids = np.full(len(keyframe.described.pixels), -1, dtype=np.int64)
+    return keyframe.described
 
 
 def _places(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
@@ -138,7 +124,7 @@ def _places(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
     A feature that is a landmark has its position. Any other takes the depth of a landmark at the same pixel, or of the
     landmarks around it if they agree.
     """
-    pixels, ids = keyframe.described.pixels, keyframe.described_ids
+    pixels, ids = _described(keyframe).pixels, keyframe.described_ids
     xyz = np.full((len(pixels), 3), np.nan)
     own = np.flatnonzero(ids >= 0)
     own = own[landmarks.known[ids[own]]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from typing import ClassVar
 
@@ -11,30 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
+from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.odometry import Odometry, View
-from modp_ti.inputs.multiview.reprojection import ray_errors
+from modp_ti.inputs.klt.odometry import Odometry
+from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import is_held_out, points_inside, require_few, unmasked, unreadable_note
+from modp_ti.inputs.replay import is_held_out, require_few, unmasked, unreadable_note
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
 from modp_ti.inputs.sources.exif import focal_length_35mm
 
 __all__ = ["ArrivingNames", "KltTracker", "open_klt"]
 
 FOLLOWED_SIDE = 640  # longer side [px] of the images in which features are tracked, at most
-MAX_ERROR = 2.5  # points with a larger reprojection error [px of these images] are not delivered
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
-# Send a correction once a keyframe has moved by `TOLD_FROM` px of the tracked image; include every keyframe that has
-# moved by `MOVED` px.
-TOLD_FROM = 2.0
-MOVED = 0.2
 DIAGONAL_35MM = 43.27  # mm
 
 
@@ -173,15 +167,6 @@ def _read(images: ImageSource, name: str, width: int, height: int) -> NDArray[np
     return raw
 
 
-@dataclass
-class _Told:
-    """A delivered frame with the pose that the mapper has for it."""
-
-    name: str
-    view: View
-    T_camera_world: NDArray[np.float64]
-
-
 class KltTracker(Tracker):
     """A `Tracker` that estimates poses and sparse points from the images of `reader`'s source as they arrive.
 
@@ -219,10 +204,8 @@ class KltTracker(Tracker):
         self._followed = intrinsics.undistorter(_followed_scale(camera.width, camera.height))
         self._delivered = intrinsics.undistorter(source.scale)
         self._odometry = Odometry([Lens.pinhole(self._followed.camera)], seed)
-        self._told: list[_Told] = []
+        self._trajectory: DeliveredTrajectory | None = None
         self._unreadable: dict[str, UnreadableImageError] = {}
-        self._told_keyframes: dict[int, NDArray[np.float64]] = {}
-        self._told_xyz = np.zeros((0, 3))
         self._progress = self._tracked()
         self._ended = False
 
@@ -238,8 +221,9 @@ class KltTracker(Tracker):
         if not self._ended:
             for _ in self._progress:
                 pass
-        for index in range(len(self._told)):
-            yield self._frame(index)
+        if self._trajectory is not None:
+            for index, delivered in enumerate(self._trajectory.frames):
+                yield self._frame(index, self._trajectory, delivered)
 
     @property
     def notes(self) -> list[str]:
@@ -265,116 +249,60 @@ class KltTracker(Tracker):
                 require_few(list(self._unreadable.values()), max(len(names), len(self._names.there)))
                 continue
             grey, valid = self._followed.grey(raw, self._reader.valid(name, raw))
-            keyframes = self._keyframe_count()
             views = self._odometry.process(number, grey, valid)
-            if self._told and self._keyframe_count() > keyframes:
-                yield from self._corrections(TOLD_FROM)
+            tracking = self._odometry.tracking
+            if tracking is None:
+                continue
+            if self._trajectory is None:
+                self._trajectory = DeliveredTrajectory(tracking, self._delivered)
+            yield from self._trajectory.corrections()
             for view in views:
-                yield self._deliver(names[view.number], view, raw if view.number == number else None)
+                yield self._deliver(self._trajectory, names[view.number], view, raw if view.number == number else None)
         self._ended = True
-        if self._told:
-            yield from self._corrections(MOVED)
+        if self._trajectory is not None:
+            yield from self._trajectory.corrections(last=True)
         self._sum_up(names)
 
-    def _keyframe_count(self) -> int:
-        return 0 if self._odometry.map is None else len(self._odometry.map.keyframes)
-
     def _sum_up(self, names: Sequence[str]) -> None:
-        counts = self._odometry.counts
-        without = len(names) - len(self._told) - len(self._unreadable)
-        if not self._told:
+        if self._odometry.tracking is None or self._trajectory is None:
             raise InputError(
                 f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
                 "and a camera that moves sideways and does not only turn"
             )
+        placed = {frame.name for frame in self._trajectory.frames} | set(self._unreadable)
+        without = [name for name in names if name not in placed]
         if self._unreadable:
             self._notes.append(unreadable_note(list(self._unreadable.values()), len(names)))
         if without:
-            placed = {told.name for told in self._told} | set(self._unreadable)
-            first = next(name for name in names if name not in placed)
             self._notes.append(
-                f"{without} of {len(names)} images could not be placed (the first is {first}): skipped; the camera was "
-                f"found again {counts.recovered} times"
+                f"{len(without)} of {len(names)} images could not be placed (the first is {without[0]}): skipped; the "
+                f"camera was found again {self._odometry.tracking.recovered} times"
             )
 
-    def _deliver(self, name: str, view: View, raw: NDArray[np.uint8] | None) -> TrackedFrame:
-        landmarks = self._odometry.map
-        T = self._odometry.pose(view)
-        self._told.append(_Told(name, view, T))
-        self._told_keyframes.setdefault(view.keyframe, landmarks.keyframes[view.keyframe].T_camera_world.copy())
-        frame = self._frame(len(self._told) - 1, raw)
-        fresh = len(landmarks.known) - len(self._told_xyz)
-        self._told_xyz = np.concatenate([self._told_xyz, np.full((max(0, fresh), 3), np.nan)])
-        ids = frame.points.ids
-        untold = np.isnan(self._told_xyz[ids, 0])
-        self._told_xyz[ids[untold]] = frame.points.xyz[untold]
+    def _deliver(
+        self, trajectory: DeliveredTrajectory, name: str, view: View, raw: NDArray[np.uint8] | None
+    ) -> TrackedFrame:
+        frame = self._frame(len(trajectory.frames), trajectory, trajectory.add(name, view), raw)
+        trajectory.record(frame.points)
         return frame
 
-    def _frame(self, index: int, raw: NDArray[np.uint8] | None = None) -> TrackedFrame:
-        told = self._told[index]
-        picture = self._reader.read(told.name, self._delivered, raw)
+    def _frame(
+        self,
+        index: int,
+        trajectory: DeliveredTrajectory,
+        delivered: DeliveredFrame,
+        raw: NDArray[np.uint8] | None = None,
+    ) -> TrackedFrame:
+        picture = self._reader.read(delivered.name, self._delivered, raw)
         return TrackedFrame(
             index=index,
-            timestamp=self._reader.images.timestamp(told.name),
-            name=told.name,
+            timestamp=self._reader.images.timestamp(delivered.name),
+            name=delivered.name,
             image=picture.image,
             camera=self._delivered.camera,
-            T_camera_world=told.T_camera_world,
-            points=unmasked(self._points(told), picture.mask),
+            T_camera_world=delivered.T_camera_world,
+            points=unmasked(trajectory.points(delivered), picture.mask),
             mask=picture.mask,
             vignette=picture.vignette,
             held_out=is_held_out(index, self._source),
         )
-
-    def _points(self, told: _Told) -> SparsePoints:
-        """Landmarks of a frame whose reprojection error is small, in pixels of the delivered image."""
-        landmarks = self._odometry.map
-        ids = told.view.ids
-        xyz = landmarks.xyz[ids]
-        lens = landmarks.lens
-        error = ray_errors(told.T_camera_world, xyz, lens.rays(told.view.pixels)) * lens.focal
-        good = landmarks.known[ids] & (error < MAX_ERROR)
-        to, of = self._delivered.camera, self._followed.camera
-        pixels = told.view.pixels[good] * np.divide((to.width, to.height), (of.width, of.height))
-        return points_inside(xyz[good], pixels, ids[good], self._delivered, told.T_camera_world)
-
-    # ----------------------------------------------------------------------------------------------- corrections
-
-    def _corrections(self, least: float) -> Iterator[PoseCorrection]:
-        """Yield one correction if a keyframe has moved by at least `least` px, with the frames of all moved ones."""
-        landmarks = self._odometry.map
-        moved = {k: self._shift(k, T) for k, T in self._told_keyframes.items()}
-        if max(moved.values()) < least:
-            return
-        affected = {k for k, shift in moved.items() if shift >= MOVED}
-        index = [i for i, told in enumerate(self._told) if told.view.keyframe in affected]
-        for i in index:
-            self._told[i].T_camera_world = self._odometry.pose(self._told[i].view)
-        for k in affected:
-            self._told_keyframes[k] = landmarks.keyframes[k].T_camera_world.copy()
-        told = np.flatnonzero(~np.isnan(self._told_xyz[:, 0]) & landmarks.known[: len(self._told_xyz)])
-        away = np.linalg.norm(landmarks.xyz[told] - self._told_xyz[told], axis=1)
-        ids = told[away > MOVED * self._depth(max(affected)) / landmarks.lens.focal]
-        self._told_xyz[ids] = landmarks.xyz[ids]
-        yield PoseCorrection(
-            index=np.array(index, dtype=np.int64),
-            T_camera_world=np.stack([self._told[i].T_camera_world for i in index]),
-            ids=ids.astype(np.int64),
-            xyz=landmarks.xyz[ids].copy(),
-        )
-
-    def _depth(self, k: int) -> float:
-        """Median depth of the landmarks that keyframe k sees."""
-        landmarks = self._odometry.map
-        keyframe = landmarks.keyframes[k]
-        ids = keyframe.ids[landmarks.known[keyframe.ids]]
-        T = keyframe.T_camera_world
-        return float(np.median(landmarks.xyz[ids] @ T[2, :3] + T[2, 3])) if len(ids) else 1.0
-
-    def _shift(self, k: int, told: NDArray[np.float64]) -> float:
-        """Approximate image motion [px of the tracked image] of keyframe k since its pose was last delivered."""
-        landmarks = self._odometry.map
-        change = landmarks.keyframes[k].T_camera_world @ inverse_se3(told)
-        turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-        away = float(np.linalg.norm(change[:3, 3])) / max(self._depth(k), 1e-12)
-        return (turn + away) * landmarks.lens.focal

@@ -45,7 +45,8 @@ def feature_tracks(
 
     joined = [place[found.pairs + offset[[a, b]]] for a, b, found in matches]
     if not joined:
-        return (np.zeros(0, dtype=np.int64),) * 3
+        nothing = np.zeros(0, dtype=np.int64)
+        return nothing, nothing, nothing
     late = np.concatenate([np.full(len(found), aside[a] or aside[b]) for a, b, found in matches])
     clearest = np.lexsort((np.concatenate([found.ratio for _, _, found in matches]), late))
     nodes = np.unique(np.concatenate(joined))

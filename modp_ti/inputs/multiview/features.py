@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_FEATURES", "Features", "Matches", "detect_features", "essential_matrix", "match_features"]
+__all__ = [
+    "MAX_FEATURES",
+    "Features",
+    "Matches",
+    "detect_features",
+    "essential_matrix",
+    "match_anywhere",
+    "match_features",
+]
 
 MAX_SIDE = 1000
 MAX_FEATURES = 2000
@@ -66,7 +74,7 @@ def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES) -> Featu
     if small != (width, height):
         gray = cv2.resize(gray, small, interpolation=cv2.INTER_AREA)
     # Without the precise upscale, all keypoints are shifted by a quarter of a pixel to the right and down.
-    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     keypoints, raw = sift.detectAndCompute(gray, None)
     if raw is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), pixel)
@@ -92,6 +100,12 @@ def essential_matrix(T_a_world: NDArray[np.float64], T_b_world: NDArray[np.float
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T_b_a[:3, :3]
 
 
+def match_anywhere(a: Features, b: Features) -> Matches:
+    """Find mutual best matches between two images that pass the ratio test, without an epipolar constraint."""
+    nowhere = np.zeros((3, 3))  # a zero essential matrix accepts all positions
+    return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0)
+
+
 def match_features(
     descriptors_a: NDArray[np.uint8],
     descriptors_b: NDArray[np.uint8],
@@ -107,7 +121,7 @@ def match_features(
         descriptors_b: (Nb, 128) uint8.
         rays_a: (Na, 2) normalised coordinates.
         rays_b: (Nb, 2) normalised coordinates.
-        essential: (3, 3) essential matrix from a to b; zeros for no epipolar constraint.
+        essential: (3, 3) essential matrix from a to b.
         band: Largest distance from the epipolar line in view b, in normalised coordinates (pixels / focal length).
     """
     if len(descriptors_a) < 2 or len(descriptors_b) < 2:

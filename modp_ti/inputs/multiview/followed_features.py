@@ -171,7 +171,7 @@ def _new_corners(picture: _Picture, places: NDArray[np.float32]) -> NDArray[np.f
         cv2.circle(free, (x, y), round(distance), 0, -1)
     wanted = CORNERS - len(places)
     found = cv2.goodFeaturesToTrack(picture.grey, wanted, QUALITY, distance, mask=free, blockSize=5)
-    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
 
 def _followed(
@@ -205,6 +205,7 @@ def _followed(
     }
     there, found, _ = cv2.calcOpticalFlowPyrLK(one.grey, other.grey, start, guess.copy(), **options)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(other.grey, one.grey, there, start.copy(), **options)
+    there = np.asarray(there, np.float32)
     good = (found.ravel() > 0) & (found_back.ravel() > 0)
     good &= np.linalg.norm(back - start, axis=1) <= THERE_AND_BACK
     good &= ((there >= 0) & (there <= np.subtract(other.size, 1))).all(axis=1)

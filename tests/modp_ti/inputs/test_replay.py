@@ -7,6 +7,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
@@ -49,9 +50,9 @@ def test_masks_of_the_source_reach_the_frames_and_take_their_points_away(plane_s
     mask[: 2 * height // 3] = 255
     for name in plane_scene.names:
         cv2.imwrite(str(masks / name), mask)
-        image = cv2.imread(str(plane_scene.folder / name))
-        image[:, : width // 4] = (0, 0, 255)
-        cv2.imwrite(str(plane_scene.folder / name), image)
+        image = np.array(Image.open(plane_scene.folder / name))
+        image[:, : width // 4] = (255, 0, 0)
+        Image.fromarray(image).save(plane_scene.folder / name)
     rng = np.random.default_rng(2)
     xyz = np.c_[rng.uniform(-1.8, 1.8, (60, 2)), np.zeros(60)]
     source = {"path": plane_scene.folder, "scale": 0.5}
@@ -80,6 +81,7 @@ def test_masks_of_the_source_reach_the_frames_and_take_their_points_away(plane_s
         expected = (from_the_left > 0) & (from_the_end > 0)
         if before.mask is not None:
             expected &= before.mask
+        assert after.mask is not None
         np.testing.assert_array_equal(after.mask[sure], expected[sure])
         column, row = after.points.pixels.astype(int).T
         assert after.mask[row, column].all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -13,15 +15,14 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.klt.tracker import ArrivingNames
 from modp_ti.inputs.sources import FrameReader, ImageFolder, Intrinsics
-from modp_ti.inputs.sources.distortion import Distortion
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 
 pytestmark = pytest.mark.slow
 
 
-def known_camera(source: SourceSettings, box_room, distortion: Distortion | None = None) -> KltTracker:
-    images = ImageFolder(source.path)
-    intrinsics = Intrinsics(box_room.camera, distortion or Distortion())
+def known_camera(folder: Path, box_room, **settings) -> KltTracker:
+    source, images = SourceSettings(path=folder, **settings), ImageFolder(folder)
+    intrinsics = Intrinsics(box_room.camera)
     return KltTracker(FrameReader(images, source), ArrivingNames(images, source), intrinsics, source)
 
 
@@ -29,7 +30,7 @@ def known_camera(source: SourceSettings, box_room, distortion: Distortion | None
 def delivered(box_room, box_walk, tmp_path_factory):
     """The walk at half its size: the tracker, what its events were, and the frames that it gives afterwards."""
     folder = box_walk.written(tmp_path_factory.mktemp("walk") / "images")
-    tracker = known_camera(SourceSettings(path=folder, scale=0.5, holdout=8), box_room)
+    tracker = known_camera(folder, box_room, scale=0.5, holdout=8)
     return tracker, list(tracker.events()), list(tracker)
 
 
@@ -76,8 +77,7 @@ def test_corrections_lead_from_the_delivered_poses_to_the_last_ones(delivered, b
 
 
 def test_iterating_alone_tracks_too_and_gives_the_same(delivered, box_room, box_walk, tmp_path):
-    source = SourceSettings(path=box_walk.written(tmp_path / "images"), scale=0.5, holdout=8)
-    frames = list(known_camera(source, box_room))
+    frames = list(known_camera(box_walk.written(tmp_path / "images"), box_room, scale=0.5, holdout=8))
     _, _, last = delivered
     for one, other in zip(frames, last, strict=True):
         np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
@@ -92,7 +92,7 @@ def test_no_point_is_delivered_where_the_mask_is_black(box_room, box_walk, tmp_p
     mask[:, 200:] = 0
     for i in range(60):
         cv2.imwrite(str(masks / f"{i:04d}.png"), mask)
-    frames = list(known_camera(SourceSettings(path=folder, stop=40, masks=masks), box_room))
+    frames = list(known_camera(folder, box_room, stop=40, masks=masks))
     assert len(frames) == 40
     assert all((frame.points.pixels[:, 0] < 200).all() for frame in frames)
     assert min(len(frame.points) for frame in frames) > 30

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
@@ -96,7 +97,7 @@ def test_a_lens_is_followed_through_too(video, tmp_path, monkeypatch):
         np.stack([columns, rows], -1).reshape(-1, 1, 2), K, np.array([-0.15, 0.03, 0, 0]), P=K
     ).reshape(SIZE[1], SIZE[0], 2)
     for file in sorted(video[0].iterdir()):
-        image = cv2.imread(str(file))
+        image = np.array(Image.open(file))
         maps = (ideal - 0.5).astype(np.float32)
         bent = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         cv2.imwrite(str(tmp_path / file.name), bent)
@@ -113,7 +114,7 @@ def test_held_out_frames_change_nothing_but_what_they_are_told(video, tmp_path, 
     images, frames = posed(video)
     before = triangulation.triangulated_frames(images, frames, ~held_out)
     for i, file in enumerate(sorted(video[0].iterdir())):
-        image = cv2.imread(str(file))
+        image = np.array(Image.open(file))
         cv2.imwrite(str(tmp_path / file.name), 255 - image if held_out[i] else image)
     other, _ = posed((tmp_path, video[1]))
     after = triangulation.triangulated_frames(other, frames, ~held_out)
@@ -162,7 +163,7 @@ def test_adjusted_poses_are_those_of_the_images_and_none_hangs_on_held_out_ones(
         assert np.median(np.linalg.norm(CAMERA.project(p) - frame.points.pixels, axis=1)) < 0.5
 
     for i, file in enumerate(sorted(video[0].iterdir())):
-        image = cv2.imread(str(file))
+        image = np.array(Image.open(file))
         cv2.imwrite(str(tmp_path / file.name), 255 - image[::-1] if held_out[i] else image)
     other, _ = posed((tmp_path, wrong))
     again, _ = triangulation.adjusted_frames(other, frames, ~held_out)

@@ -1,0 +1,131 @@
+"""The delivered poses and points, and the corrections of them when bundle adjustment moves the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import SparsePoints
+from fields.geometry.se3 import inverse_se3
+from modp_ti.inputs.klt.tracking import Tracking, View
+from modp_ti.inputs.multiview.reprojection import ray_errors
+from modp_ti.inputs.replay import points_inside
+from modp_ti.inputs.sources import Undistorter
+
+__all__ = ["DeliveredFrame", "DeliveredTrajectory"]
+
+MAX_ERROR = 2.5  # points with a larger reprojection error [px of the tracked image] are not delivered
+# Send a correction once a keyframe has moved by `NOTABLE` px of the tracked image; include every keyframe that has
+# moved by `MOVED` px.
+NOTABLE = 2.0
+MOVED = 0.2
+
+
+@dataclass
+class DeliveredFrame:
+    """A frame with its last delivered pose.
+
+    Attributes:
+        name: Name of its image.
+        view: Its pose relative to a keyframe, and its landmarks.
+        T_camera_world: (4, 4) the delivered pose.
+    """
+
+    name: str
+    view: View
+    T_camera_world: NDArray[np.float64]
+
+
+class DeliveredTrajectory:
+    """Frames and landmarks as the mapper has them.
+
+    Args:
+        tracking: The tracking, whose map changes.
+        undistorter: Undistortion of the delivered images.
+
+    Attributes:
+        frames: The delivered frames in order.
+    """
+
+    def __init__(self, tracking: Tracking, undistorter: Undistorter) -> None:
+        self.frames: list[DeliveredFrame] = []
+        self._tracking = tracking
+        self._map = tracking.map
+        self._undistorter = undistorter
+        self._keyframes: dict[int, NDArray[np.float64]] = {}
+        self._keyframes_checked = len(tracking.map.keyframes)
+        self._xyz = np.zeros((0, 3))
+
+    def add(self, name: str, view: View) -> DeliveredFrame:
+        """Add the next frame."""
+        frame = DeliveredFrame(name, view, self._tracking.pose(view))
+        self.frames.append(frame)
+        self._keyframes.setdefault(view.keyframe, self._map.keyframes[view.keyframe].T_camera_world.copy())
+        return frame
+
+    def points(self, frame: DeliveredFrame) -> SparsePoints:
+        """Landmarks of a frame whose reprojection error is small, in pixels of the delivered image."""
+        ids, lens = frame.view.ids, self._map.lens
+        xyz = self._map.xyz[ids]
+        error = ray_errors(frame.T_camera_world, xyz, lens.rays(frame.view.pixels)) * lens.focal
+        good = self._map.known[ids] & (error < MAX_ERROR)
+        to = self._undistorter.camera
+        pixels = frame.view.pixels[good] * np.divide((to.width, to.height), (lens.width, lens.height))
+        return points_inside(xyz[good], pixels, ids[good], self._undistorter, frame.T_camera_world)
+
+    def record(self, points: SparsePoints) -> None:
+        """Record points that were delivered. Only the first position of each is kept until it is corrected."""
+        fresh = max(0, len(self._map.known) - len(self._xyz))
+        self._xyz = np.concatenate([self._xyz, np.full((fresh, 3), np.nan)])
+        new = np.isnan(self._xyz[points.ids, 0])
+        self._xyz[points.ids[new]] = points.xyz[new]
+
+    def corrections(self, last: bool = False) -> Iterator[PoseCorrection]:
+        """Yield one correction, with the frames of all moved keyframes, if a keyframe has moved notably.
+
+        Keyframes are compared when the map has a new one, and at the end.
+
+        Args:
+            last: There are no more frames: small motions are corrected too.
+        """
+        landmarks = self._map
+        if not last and len(landmarks.keyframes) == self._keyframes_checked:
+            return
+        self._keyframes_checked = len(landmarks.keyframes)
+        moved = {k: self._shift(k, T) for k, T in self._keyframes.items()}
+        if max(moved.values()) < (MOVED if last else NOTABLE):
+            return
+        affected = {k for k, shift in moved.items() if shift >= MOVED}
+        index = [i for i, frame in enumerate(self.frames) if frame.view.keyframe in affected]
+        for i in index:
+            self.frames[i].T_camera_world = self._tracking.pose(self.frames[i].view)
+        for k in affected:
+            self._keyframes[k] = landmarks.keyframes[k].T_camera_world.copy()
+        known = np.flatnonzero(~np.isnan(self._xyz[:, 0]) & landmarks.known[: len(self._xyz)])
+        away = np.linalg.norm(landmarks.xyz[known] - self._xyz[known], axis=1)
+        ids = known[away > MOVED * self._depth(max(affected)) / landmarks.lens.focal]
+        self._xyz[ids] = landmarks.xyz[ids]
+        yield PoseCorrection(
+            index=np.array(index, dtype=np.int64),
+            T_camera_world=np.stack([self.frames[i].T_camera_world for i in index]),
+            ids=ids.astype(np.int64),
+            xyz=landmarks.xyz[ids].copy(),
+        )
+
+    def _depth(self, k: int) -> float:
+        """Median depth of the landmarks that keyframe k sees."""
+        keyframe = self._map.keyframes[k]
+        ids = keyframe.ids[self._map.known[keyframe.ids]]
+        T = keyframe.T_camera_world
+        return float(np.median(self._map.xyz[ids] @ T[2, :3] + T[2, 3])) if len(ids) else 1.0
+
+    def _shift(self, k: int, delivered: NDArray[np.float64]) -> float:
+        """Approximate image motion [px of the tracked image] of keyframe k since its pose was last delivered."""
+        change = self._map.keyframes[k].T_camera_world @ inverse_se3(delivered)
+        turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
+        away = float(np.linalg.norm(change[:3, 3])) / max(self._depth(k), 1e-12)
+        return (turn + away) * self._map.lens.focal

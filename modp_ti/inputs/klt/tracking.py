@@ -1,0 +1,273 @@
+"""Tracking of frames with a map, and the keyframes by which the map grows."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_se3, orthonormalised
+from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
+from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
+from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
+from modp_ti.inputs.klt.localisation import FEWEST, localised, realigned, searched
+from modp_ti.inputs.klt.relocalisation import alike_keyframes, describe, inherited, place_by_features, thumbnail
+from modp_ti.inputs.multiview.bundle_adjustment import Refinable
+from modp_ti.inputs.multiview.features import Features
+
+__all__ = ["FOCAL_FROM", "Tracking", "View"]
+
+# A frame becomes a keyframe if the features have moved by KEYFRAME_SHIFT of the image's longer side since the last
+# keyframe, or if less than KEYFRAME_SHARE of its landmarks are still seen.
+KEYFRAME_SHIFT = 0.05
+KEYFRAME_SHARE = 0.65
+WINDOW = 8  # free keyframes of a local bundle adjustment
+HELD = 12  # fixed keyframes of a local bundle adjustment, at most
+WIDE_EVERY = 12  # keyframes between bundle adjustments of WIDE_WINDOW free ones
+WIDE_WINDOW = 30
+# Numbers of keyframes from which focal length and distortion are estimated. Fewer keyframes fit almost any camera.
+FOCAL_FROM = 6
+DISTORTION_FROM = 12
+REFINED_AT = (6, 12, 24, 48)
+# Relocalisation is tried at each of the first EAGER frames after the track was lost, then at every LAZY-th frame.
+EAGER = 10
+LAZY = 5
+
+
+@dataclass
+class View:
+    """A frame with a pose relative to its keyframe.
+
+    Attributes:
+        number: Number of the frame.
+        keyframe: Index of its keyframe in the map.
+        T_camera_keyframe: (4, 4) pose relative to the keyframe.
+        ids: (N,) landmarks that it sees.
+        pixels: (N, 2) their positions in the tracked image.
+    """
+
+    number: int
+    keyframe: int
+    T_camera_keyframe: NDArray[np.float64]
+    ids: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+
+
+class Tracking:
+    """Localises frames in order, from the last keyframe of a map on, and adds keyframes to the map.
+
+    Args:
+        landmarks: The initial map.
+        valid: (H, W), False where no features of the last keyframe may be tracked.
+        seed: Seed of RANSAC.
+        refines: Refine the camera together with the map.
+
+    Attributes:
+        map: The map.
+        motion: (4, 4) T_camera_camera from the frame before to the last one, which predicts the next pose.
+        recovered: Number of frames that were relocalised after the track was lost.
+    """
+
+    def __init__(
+        self, landmarks: LandmarkMap, valid: NDArray[np.bool_] | None = None, seed: int = 0, refines: bool = False
+    ) -> None:
+        self.map = landmarks
+        self.motion = np.eye(4)
+        self.recovered = 0
+        self._seed = seed
+        self._refines = refines
+        self._thumbnails: list[NDArray[np.float32]] = []  # of the first keyframes, made when they are needed
+        self._lost_for = 0
+        start = landmarks.keyframes[-1]
+        last = LocalisedFrame(
+            start.number, start.grey, valid, start.ids, start.pixels, T_camera_world=start.T_camera_world
+        )
+        self._replenish(last)
+        self._last: LocalisedFrame | None = last
+
+    def pose(self, view: View) -> NDArray[np.float64]:
+        """T_camera_world (4, 4) of a view in the current map."""
+        return orthonormalised(view.T_camera_keyframe @ self.map.keyframes[view.keyframe].T_camera_world)
+
+    def track(self, frame: Frame) -> View | None:
+        """Localise the next frame, which may become a keyframe. None if that fails."""
+        return self._recover(frame) if self._last is None else self._follow(self._last, frame)
+
+    def localised(self, frame: Frame, T_guess: NDArray[np.float64]) -> LocalisedFrame | None:
+        """Localise a frame by its features, without the outliers; None if too few landmarks agree.
+
+        Args:
+            frame: The frame.
+            T_guess: (4, 4) initial T_camera_world.
+        """
+        found = localised(self.map, frame.ids, frame.pixels, T_guess, self._seed)
+        if found is None:
+            return None
+        T, kept = found
+        return LocalisedFrame(
+            frame.number, frame.grey, frame.valid, frame.ids[kept], frame.pixels[kept], T_camera_world=T
+        )
+
+    def search(self, frame: LocalisedFrame) -> None:
+        """Add further landmarks of the map to the frame's features."""
+        frame.append(*searched(self.map, frame.T_camera_world, frame.grey, frame.ids, frame.pixels))
+
+    def view_of_keyframe(self, k: int) -> View:
+        """The view of keyframe k."""
+        keyframe = self.map.keyframes[k]
+        known = self.map.known[keyframe.ids]
+        return View(keyframe.number, k, np.eye(4), keyframe.ids[known], keyframe.pixels[known])
+
+    def view(self, frame: LocalisedFrame) -> View:
+        """The view of a frame relative to the last keyframe before it, or to the first keyframe."""
+        k = max(0, bisect_right(self.map.keyframes, frame.number, key=lambda keyframe: keyframe.number) - 1)
+        T = frame.T_camera_world @ inverse_se3(self.map.keyframes[k].T_camera_world)
+        known = self.map.known[frame.ids]
+        return View(frame.number, k, T, frame.ids[known], frame.pixels[known])
+
+    # ------------------------------------------------------------------------------------------------- following
+
+    def _follow(self, last: LocalisedFrame, frame: Frame) -> View | None:
+        predicted = orthonormalised(self.motion @ last.T_camera_world)
+        frame.track(last, self._predicted(last, predicted))
+        located = self.localised(frame, predicted)
+        if located is None:  # retry without the constant-velocity prediction
+            frame.track(last)
+            located = self.localised(frame, last.T_camera_world)
+        if located is None:
+            return self._bridge(last, frame)
+        self.motion = located.T_camera_world @ inverse_se3(last.T_camera_world)
+        if self._wants_keyframe(located):
+            return self._make_keyframe(located)
+        self._last = located
+        return self.view(located)
+
+    def _predicted(self, last: LocalisedFrame, T: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Predict the pixels of the tracked features at pose T. Untriangulated ones are given the median depth."""
+        lens, T_last = self.map.lens, last.T_camera_world
+        known = self.map.known[last.ids]
+        world = self.map.xyz[last.ids].copy()
+        depth = world[known] @ T_last[2, :3] + T_last[2, 3]
+        typical = float(np.median(depth)) if len(depth) else 1.0
+        rays = lens.rays(last.pixels[~known])
+        world[~known] = (np.c_[rays, np.ones(len(rays))] * typical - T_last[:3, 3]) @ T_last[:3, :3]
+        guess = lens.pixels(world @ T[:3, :3].T + T[:3, 3])
+        # The reprojection error of each feature is assumed to persist.
+        guess = guess + (last.pixels - lens.pixels(world @ T_last[:3, :3].T + T_last[:3, 3]))
+        return np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, last.pixels)
+
+    # ------------------------------------------------------------------------------------------------- keyframes
+
+    def _wants_keyframe(self, frame: LocalisedFrame) -> bool:
+        last = self.map.keyframes[-1]
+        share, a, b = np.intersect1d(last.ids, frame.ids, return_indices=True)
+        if len(share) < FEWEST:
+            return True
+        if self.map.known[share].sum() < KEYFRAME_SHARE * self.map.known[last.ids].sum():
+            return True
+        shift = float(np.median(np.linalg.norm(last.pixels[a] - frame.pixels[b], axis=1)))
+        return shift > (0.6 if self._refines else 1.0) * KEYFRAME_SHIFT * max(frame.grey.shape)
+
+    def _make_keyframe(self, frame: LocalisedFrame) -> View:
+        """Make the last frame a keyframe: realign its landmarks, search for more, and adjust the map."""
+        frame.pixels = realigned(self.map, frame.T_camera_world, frame.grey, frame.ids, frame.pixels)
+        self.search(frame)
+        return self._insert_keyframe(self.localised(frame, frame.T_camera_world) or frame)
+
+    def _insert_keyframe(self, frame: LocalisedFrame) -> View:
+        landmarks = self.map
+        rays = landmarks.lens.rays(frame.pixels)
+        keyframe = Keyframe(frame.number, frame.T_camera_world, frame.grey, frame.ids, frame.pixels, rays)
+        k = landmarks.add_keyframe(keyframe)
+        self._replenish(frame)
+        landmarks.triangulate(k)
+        self._adjust()
+        still = np.isin(frame.ids, keyframe.ids)
+        frame.ids, frame.pixels = frame.ids[still], frame.pixels[still]
+        self._last = frame
+        return self.view_of_keyframe(k)
+
+    def _replenish(self, frame: Frame) -> None:
+        """Detect new corners in the frame of the last keyframe, and add them to both."""
+        new = frame.new_corners()
+        ids = self.map.new_ids(len(new))
+        self.map.keyframes[-1].append(ids, new, self.map.lens.rays(new))
+        self.map.note_observations(len(self.map.keyframes) - 1, ids, new)
+        frame.append(ids, new)
+
+    def _adjust(self) -> None:
+        count = len(self.map.keyframes)
+        if self._refines and count in REFINED_AT:
+            self.refine_camera()
+            return
+        free = list(range(max(0, count - (WIDE_WINDOW if count % WIDE_EVERY == 0 else WINDOW)), count))
+        held = self._companions(free)
+        if not held:
+            held, free = free[:2], free[2:]
+        adjust_bundle(self.map, free, held, steps=8)
+        self.map.discard_outliers(free)
+
+    def refine_camera(self) -> None:
+        """Bundle adjust the whole map and the focal length, and with enough keyframes the distortion."""
+        count = len(self.map.keyframes)
+        every = range(count)
+        refined: list[Refinable] = ["focal", "distortion"] if count >= DISTORTION_FROM else ["focal"]
+        for _ in range(2):
+            adjust_bundle(self.map, every, steps=15, refined=refined)
+            self.map.discard_outliers(every)
+
+    def _companions(self, free: list[int]) -> list[int]:
+        """Other keyframes that share the most landmarks with `free`, at most HELD of them."""
+        seen = np.zeros(len(self.map.known), dtype=bool)
+        seen[self.map.observations(free)[2]] = True
+        others = [k for k in range(len(self.map.keyframes)) if k not in set(free)]
+        shared = {k: int(seen[self.map.keyframes[k].ids].sum()) for k in others}
+        closest = sorted(others, key=lambda k: (-shared[k], -k))[:HELD]
+        return sorted(k for k in closest if shared[k] >= 15)
+
+    # ------------------------------------------------------------------------------------------------- gaps
+
+    def _bridge(self, last: LocalisedFrame, frame: Frame) -> View | None:
+        """Localise a frame where optical flow fails by SIFT matches with the last keyframes and the frame before."""
+        if self.map.keyframes[-1].number != last.number:
+            self._make_keyframe(last)
+        count = len(self.map.keyframes)
+        view = self._placed(frame, describe(frame.grey), range(count - 1, max(-1, count - 4), -1))
+        if view is None:
+            self._last = None
+            self._lost_for = 0
+        return view
+
+    def _recover(self, frame: Frame) -> View | None:
+        """Relocalise a frame after the track was lost, against the most similar keyframes and the last one."""
+        self._lost_for += 1
+        if self._lost_for > EAGER and self._lost_for % LAZY:
+            return None
+        features = describe(frame.grey)
+        if len(features.pixels) < FEWEST:
+            return None
+        self._thumbnails += [thumbnail(each.grey) for each in self.map.keyframes[len(self._thumbnails) :]]
+        alike = alike_keyframes(np.array(self._thumbnails), frame.grey, 3)
+        view = self._placed(frame, features, dict.fromkeys([*alike, len(self.map.keyframes) - 1]))
+        if view is not None:
+            self.recovered += 1
+        return view
+
+    def _placed(self, frame: Frame, features: Features, candidates: Iterable[int]) -> View | None:
+        """Localise the frame against the first candidate keyframe that fits, and make it a keyframe."""
+        for k in candidates:
+            placed = place_by_features(self.map, k, features, self._seed)
+            if placed is None:
+                continue
+            T, pairs = placed
+            located = LocalisedFrame(frame.number, frame.grey, frame.valid, T_camera_world=T)
+            self.search(located)
+            located.append(*inherited(self.map, k, features, pairs, T))
+            located = self.localised(located, T)
+            if located is not None:
+                self.motion = np.eye(4)
+                return self._insert_keyframe(located)
+        return None
