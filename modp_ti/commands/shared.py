@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass, field
 from enum import Enum
@@ -158,7 +158,7 @@ def examples(*lines: str) -> str:
     return "\n".join(["Examples:", *(f"  {line}" for line in lines)])
 
 
-def standalone(command: object, epilog: str) -> None:
+def standalone(command: Callable[..., object], epilog: str) -> None:
     """Run one command as a separate program, as `python -m modp_ti.run` does."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command(epilog=epilog)(command)

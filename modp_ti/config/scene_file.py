@@ -239,7 +239,7 @@ def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any
     if isinstance(node, yaml.SequenceNode):
         return [_plain(item, f"{place}.{i}", name, lines) for i, item in enumerate(node.value)]
     value = str(node.value)
-    if node.style is not None:  # quoted or block text
+    if isinstance(node, yaml.ScalarNode) and node.style is not None:  # quoted or block text
         return value
     if value in ("", "~", "null", "Null", "NULL"):
         return None

@@ -6,6 +6,7 @@ import selectors
 import socket
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 
 __all__ = ["HELLO_PATIENCE", "Lobby"]
 
@@ -38,12 +39,12 @@ class Lobby:
     def next(self, timeout: float) -> socket.socket | None:
         """Return a connection with data to read or at its end, or None after `timeout` seconds without one."""
         self._send_away(lambda since: time.monotonic() - since > self._patience)
-        spoken = None
+        spoken: socket.socket | None = None
         for key, _ in self._selector.select(timeout):
             if key.fileobj is self._listener:
                 self._accept()
             elif spoken is None:
-                spoken = key.fileobj
+                spoken = key.data
         if spoken is not None:
             self._selector.unregister(spoken)
             del self._silent[spoken]
@@ -60,12 +61,12 @@ class Lobby:
         except OSError:  # the client has disconnected, or there are too many open files
             return
         self._silent[sock] = time.monotonic()
-        self._selector.register(sock, selectors.EVENT_READ)
+        self._selector.register(sock, selectors.EVENT_READ, data=sock)
         if len(self._silent) > MAX_SILENT:
             oldest = next(iter(self._silent.values()))
             self._send_away(lambda since: since <= oldest)
 
-    def _send_away(self, whom, counts: bool = True) -> None:
+    def _send_away(self, whom: Callable[[float], bool], counts: bool = True) -> None:
         for sock in [sock for sock, since in self._silent.items() if whom(since)]:
             self._selector.unregister(sock)
             del self._silent[sock]

@@ -153,8 +153,10 @@ class Spool(ImageSource):
         if image is None or image.dtype != np.uint8:
             raise InputError(f"{name}: its {self._encoding.name} image is damaged or not of 8 bits a channel")
         if image.ndim == 2:
-            return np.repeat(image[..., None], 3, axis=2)
-        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+        else:
+            image = cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+        return np.asarray(image, dtype=np.uint8)
 
     def keep_points(self, name: str, points: SparsePoints) -> None:
         """Store the points of a delivered frame. Raises SpoolFullError if the disk has no space."""

@@ -240,4 +240,4 @@ def read_observations(
     order = np.lexsort((point, time))
     time, point = time[order], point[order]
     instants, start = np.unique(time, return_index=True)
-    return instants * MICROSECONDS, [np.unique(each) for each in np.split(point, start[1:])]
+    return instants.astype(np.float64) * MICROSECONDS, [np.unique(each) for each in np.split(point, start[1:])]

@@ -122,7 +122,7 @@ def _no_match(images: ImageSource, folder: Path, absent: Sequence[str]) -> str:
 
 def _undistorter(camera: pycolmap.Camera, scale: float, folder: Path) -> Undistorter:
     model = camera.model.name
-    intrinsics = colmap_intrinsics(model, camera.params)
+    intrinsics = colmap_intrinsics(model, camera.params.tolist())
     if intrinsics is None:
         raise InputError(f"{folder}: camera model {model} is not supported; run `colmap image_undistorter` first")
     fx, fy, cx, cy, distortion = intrinsics

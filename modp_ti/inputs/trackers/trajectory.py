@@ -171,4 +171,4 @@ def rows_at_frames(
             f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the frames from {of_frames.min():.6f} to "
             f"{of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
         )
-    return {names[frame]: pose for frame, pose in pairs.tolist()}
+    return {names[int(frame)]: int(pose) for frame, pose in pairs}
