@@ -79,4 +79,4 @@ class DevicePairs:
     @property
     def count(self) -> int:
         """Number of pairs of the last view, at most `room`. Waits for the device."""
-        return min(self.total[None], self.room)
+        return min(self.total[None], self.room)  # pyright: ignore[reportReturnType]  # an int in a scalar field

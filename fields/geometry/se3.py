@@ -64,7 +64,7 @@ def log_se3(T: ArrayLike) -> NDArray[np.float64]:
     _, b, c = _coefficients(theta)
     w = hat(omega)
     V = np.eye(3) + b * w + c * w @ w
-    return np.concatenate([np.linalg.solve(V, T[:3, 3]), omega])
+    return np.concatenate([np.linalg.solve(V, T[:3, 3]), omega], dtype=np.float64)
 
 
 def inverse_se3(T: ArrayLike) -> NDArray[np.float64]:

@@ -43,6 +43,7 @@ class EvaluatedMap(Protocol):
     @property
     def near(self) -> float:
         """Depth below which nothing is drawn [scene units]."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,8 @@ def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
     """Return the mean scores over the frames, as in metrics.json. A mean is None if there is nothing to average."""
 
     def mean(values: list[float | None], digits: int) -> float | None:
-        return None if not values or None in values else round(float(np.mean(values)), digits)
+        known = [value for value in values if value is not None]
+        return None if not known or len(known) < len(values) else round(float(np.mean(known)), digits)
 
     return {
         "psnr": mean([score.psnr for score in scores], 4),
@@ -134,7 +136,7 @@ def score_frame(
     renderer.images.set_reference(rgba)
     values = loss.forward()
     render = renderer.images.colour_to_numpy()
-    distance = None if lpips is None else lpips(render, rgba[..., :3] / np.float32(255.0))
+    distance = None if lpips is None else lpips(render, np.asarray(rgba[..., :3] / np.float32(255.0), dtype=np.float32))
     return FrameScore(frame.index, frame.name, frame.held_out, stage, values.psnr, values.ssim, distance), render
 
 

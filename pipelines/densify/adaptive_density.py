@@ -117,7 +117,8 @@ class AdaptiveDensity:
         limit = s.prune_size * extent if prune_large else np.inf
         stays, enters = self._worth_keeping(state, limit), self._worth_keeping(new, limit)
         self.gaussians.remove(stays & ~split)
-        self.gaussians.append(**{name: value[enters] for name, value in new.items()})
+        new = {name: value[enters] for name, value in new.items()}
+        self.gaussians.append(new["position"], new["log_scale"], new["quaternion"], new["opacity_logit"], new["sh"])
         self.statistics.clear()
         pruned = int(np.count_nonzero(~stays & ~split)) + int(np.count_nonzero(~enters))
         return Adaptation(int(clone.sum()), int(split.sum()), pruned)

@@ -74,7 +74,7 @@ def spacing(xyz: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> NDArray[n
         raise ValueError(f"{len(xyz)} points have no {neighbours} neighbours each")
     # FLANN works in float32. Centring keeps its precision independent of the world's origin.
     centred = np.ascontiguousarray(xyz - np.median(xyz, axis=0), dtype=np.float32)
-    tree = cv2.flann_Index(centred, {"algorithm": KDTREE_SINGLE})
+    tree = cv2.flann.Index(centred, {"algorithm": KDTREE_SINGLE})
     _, squares = tree.knnSearch(centred, neighbours + 1)
     # The first neighbour is the point itself.
     return np.sqrt(squares[:, 1:].astype(np.float64)).mean(axis=1)

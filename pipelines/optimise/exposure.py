@@ -139,11 +139,12 @@ class ExposureRefinement:
         if not np.isfinite(gradient).all():
             self.safeguards.exposure_steps += 1
             return
-        gradient = gradient + 2.0 * weight * self.settings.regularisation * (view.exposure - IDENTITY)
+        exposure = IDENTITY if view.exposure is None else view.exposure
+        gradient = gradient + 2.0 * weight * self.settings.regularisation * (exposure - IDENTITY)
         beta1, beta2 = self.BETAS
         view.exposure_steps += 1
         view.exposure_m = beta1 * view.exposure_m + (1 - beta1) * gradient
         view.exposure_v = beta2 * view.exposure_v + (1 - beta2) * gradient**2
         m = view.exposure_m / (1 - beta1**view.exposure_steps)
         v = view.exposure_v / (1 - beta2**view.exposure_steps)
-        view.exposure = view.exposure - self.settings.learning_rate * m / (np.sqrt(v) + 1e-15)
+        view.exposure = exposure - self.settings.learning_rate * m / (np.sqrt(v) + 1e-15)

@@ -5,6 +5,8 @@ number of valid pixels. The host reads the values later.
 """
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
+from functools import partial
+
 import numpy as np
 import taichi as ti
 import torch
@@ -17,7 +19,7 @@ from fields.runtime.compiled_kernel import CompiledKernel
 from pipelines.optimise.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 
-__all__ = ["AsyncLossValues", "DevicePhotometricLoss", "photometric_loss"]
+__all__ = ["DevicePhotometricLoss", "photometric_loss"]
 
 # Side of a tile with the border that its windows reach.
 SIDE = TILE_WIDTH + 2 * RADIUS
@@ -43,34 +45,16 @@ class _Values:
     def send(self) -> None:
         """Start the copy to the host if there are new values."""
         if self._sent < self.written:
-            self._late, self._sent = AsyncReadback(self.sums), self.written
+            self._copy()
 
     def row(self, i: int) -> np.ndarray:
         """The sums (4,) of evaluation i. Waits for the copy if it has not finished."""
-        if i >= self._sent:
-            self.send()
-        return self._late.numpy()[i].astype(np.float64)
+        late = self._copy() if self._late is None or i >= self._sent else self._late
+        return late.numpy()[i].astype(np.float64)
 
-
-class AsyncLossValues(LossValues):
-    """Loss values that are copied to the host on first access, or earlier if `DevicePhotometricLoss.send` was called.
-
-    Access waits for the device.
-    """
-
-    def __init__(self, values: _Values, row: int) -> None:
-        object.__setattr__(self, "_source", (values, row))
-
-    def __getattr__(self, name: str) -> float:
-        # Called only for attributes that are not set yet: the three fields of LossValues.
-        if name not in ("l1", "ssim", "squared_error"):
-            raise AttributeError(name)
-        values, row = self._source
-        l1, ssim, square, count = (float(v) for v in values.row(row))
-        count = max(count, 1.0)
-        super().__init__(l1 / count, ssim / count, square / count)
-        object.__setattr__(self, "_source", None)
-        return getattr(self, name)
+    def _copy(self) -> AsyncReadback:
+        self._late, self._sent = AsyncReadback(self.sums), self.written
+        return self._late
 
 
 @ti.data_oriented
@@ -107,7 +91,7 @@ class DevicePhotometricLoss(PhotometricLoss):
         self._sum(3 * tile_count(width, height), self._partial, self._totals)
         values.sums[row] = self._totals
         values.written += 1
-        return AsyncLossValues(values, row)
+        return LossValues(partial(values.row, row))
 
     def send(self) -> None:
         self._values.send()

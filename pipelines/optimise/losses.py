@@ -8,10 +8,12 @@ and e_yy only through their sum, which saves one convolution.
 """
 # pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportOptionalSubscript=false
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from fields.buffers.images import PAD, SCRATCH_ROWS, STRIPS, ImageBuffers
 from fields.map.gaussians import GaussianField
@@ -49,19 +51,37 @@ def window_weights() -> tuple[float, ...]:
     return tuple(float(v) for v in w / w.sum())
 
 
-@dataclass(frozen=True)
 class LossValues:
-    """Means over the valid pixels and channels of one view.
+    """Means over the valid pixels and channels of one view. On a GPU, the first access waits for the device.
 
-    Attributes:
-        l1: Mean absolute error.
-        ssim: Mean SSIM.
-        squared_error: Mean squared error.
+    Args:
+        sums: Returns the sums (4,) of absolute error, SSIM, squared error and the number of values. It is called on the
+            first access.
     """
 
-    l1: float
-    ssim: float
-    squared_error: float
+    def __init__(self, sums: Callable[[], NDArray[np.float64]]) -> None:
+        self._sums = sums
+
+    @cached_property
+    def _means(self) -> tuple[float, float, float]:
+        l1, ssim, square, count = (float(v) for v in self._sums())
+        count = max(count, 1.0)
+        return l1 / count, ssim / count, square / count
+
+    @property
+    def l1(self) -> float:
+        """Mean absolute error."""
+        return self._means[0]
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM."""
+        return self._means[1]
+
+    @property
+    def squared_error(self) -> float:
+        """Mean squared error."""
+        return self._means[2]
 
     @property
     def psnr(self) -> float:
@@ -98,9 +118,8 @@ class PhotometricLoss:
             self._mask(width * height, width, height)
         self._sums[:] = 0.0
         self._compare(width, height, 4, self._sums)
-        l1, ssim, square, count = (float(v) for v in self._sums.sum(axis=0))
-        count = max(count, 1.0)
-        return LossValues(l1 / count, ssim / count, square / count)
+        sums = self._sums.sum(axis=0)
+        return LossValues(lambda: sums)
 
     def send(self) -> None:
         """Start the asynchronous copy of the values so far to the host. Does nothing on the CPU."""

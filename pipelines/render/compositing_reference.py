@@ -23,8 +23,14 @@ class ReferenceCompositing(Compositing):
         """Fill `images.colour`, `.depth` and `.opacity`."""
         self._forward_pixels(self.view.width, self.view.height)
 
-    def backward(self) -> None:
-        """Propagate `images.colour_grad` and `.opacity_grad` to the gradients in `projected`."""
+    def backward(self, with_depth: bool = False) -> None:
+        """Propagate `images.colour_grad` and `.opacity_grad` to the gradients in `projected`.
+
+        Raises:
+            NotImplementedError: If `with_depth` is set.
+        """
+        if with_depth:
+            raise NotImplementedError("the reference has no gradient of depth")
         self._clear(self.projected.count)
         self._backward_pixels(self.view.width, self.view.height)
 

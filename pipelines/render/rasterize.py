@@ -93,7 +93,10 @@ def rasterize(
     if (sh is None) == (colour is None):
         raise TypeError("rasterize takes either sh or colour")
     tensors = {"position": position, "log_scale": log_scale, "quaternion": quaternion, "opacity_logit": opacity_logit}
-    tensors |= {"sh": sh} if colour is None else {"colour": colour}
+    if sh is not None:
+        tensors["sh"] = sh
+    if colour is not None:
+        tensors["colour"] = colour
     _check(tensors, T_camera_world, background)
     if colour is not None:
         sh = ((colour - 0.5) / SH_C0)[:, None]
@@ -227,7 +230,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  # `once_differentiable` hides the name of ctx
+        ctx, *gradients: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         rasterizer = ctx.rasterizer
         # Another image may have been rendered since, or Taichi restarted.
@@ -236,13 +241,13 @@ class _Rasterize(torch.autograd.Function):
         with_depth = gradients[1] is not None
         size, like = (ctx.camera.height, ctx.camera.width), inputs[0]
         shapes = (*size, 3), size, size
-        gradients = [
+        filled = [
             like.new_zeros(shape) if gradient is None else gradient.to(like.dtype).contiguous()
             for shape, gradient in zip(shapes, gradients, strict=True)
         ]
         renderer, gaussians = rasterizer.renderer, rasterizer.gaussians
         gaussians.clear_gradients()
-        renderer.images.set_gradients(*gradients)
+        renderer.images.set_gradients(*filled)
         renderer.backward(with_depth)
         outputs = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs[:5]]
         gaussians.gradients_into(outputs)

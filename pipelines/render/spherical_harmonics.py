@@ -122,4 +122,4 @@ def _fit(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     z, angle = 1.0 - 2.0 * i / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * i
     radius = np.sqrt(1.0 - z * z)
     directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-    return directions, np.linalg.pinv(sh_basis(degree, directions))
+    return directions, np.asarray(np.linalg.pinv(sh_basis(degree, directions)), dtype=np.float64)

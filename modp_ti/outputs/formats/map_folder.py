@@ -78,4 +78,5 @@ def write_map(
     held_out = [line for line, held in enumerate(frames.held_out) if held]
     write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out)
     if len(keyframes) and keyframes[0].exposure is not None:
-        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, version.exposures, indices)
+        exposures = [exposure for exposure in version.exposures if exposure is not None]
+        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, exposures, indices)

@@ -155,8 +155,9 @@ def _swept(
     """Sweep around `inverse` and return the inverse depth (H, W) with the least smoothed matching cost."""
     for reach in SWEEPS:
         # Smoothing except at edges, so that a window is warped as one piece of surface.
-        inverse = cv2.medianBlur(inverse.astype(np.float32), 3)
-        inverse = cv2.bilateralFilter(inverse, -1, 0.03 * float(np.median(inverse)), 6)
+        smooth = cv2.medianBlur(inverse.astype(np.float32), 3)
+        smooth = cv2.bilateralFilter(smooth, -1, 0.03 * float(np.median(smooth)), 6)
+        inverse = np.asarray(smooth, dtype=np.float32)
         offsets = np.arange(-reach, reach + 1, dtype=np.float32)
         cost = _matching_cost(view, others, warps, inverse, step * offsets)
         cost += MAP_WEIGHT * np.abs(offsets) / reach
@@ -188,7 +189,7 @@ def _matching_cost(
             carried = cv2.remap(
                 other.grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-99.0
             )
-            there, spread = _moments(carried, window)
+            there, spread = _moments(np.asarray(carried, dtype=np.float32), window)
             together = cv2.blur(view.grey * carried, (window, window)) - mean * there
             seen = there >= 0.0  # the whole window is inside
             score = together / np.sqrt((variance + LEAST_VARIANCE) * (spread + LEAST_VARIANCE))

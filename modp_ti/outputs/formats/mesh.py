@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,10 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.glb import write_glb
 from modp_ti.outputs.formats.open3d_io import open3d, written_aside
+
+if TYPE_CHECKING:
+    from open3d.pybind.geometry import TriangleMesh
+    from open3d.pybind.t.geometry import VoxelBlockGrid
 
 __all__ = [
     "LEAST_OPACITY",
@@ -71,7 +76,7 @@ def without_edges(z: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(np.maximum(across, down) <= LARGEST_STEP * z, z, 0).astype(np.float32)
 
 
-def fused(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object:
+def fused(views: Iterable[SurfaceView], voxel: float, farthest: float) -> VoxelBlockGrid:
     """Fuse views into a signed distance field.
 
     Args:
@@ -108,7 +113,7 @@ def fused(views: Iterable[SurfaceView], voxel: float, farthest: float) -> object
     return grid
 
 
-def extracted(grid: object) -> object:
+def extracted(grid: VoxelBlockGrid) -> TriangleMesh:
     """Extract the surface with colours from a VoxelBlockGrid.
 
     Returns:
@@ -126,7 +131,7 @@ def extracted(grid: object) -> object:
     return mesh
 
 
-def without_floating_parts(mesh: object) -> object:
+def without_floating_parts(mesh: TriangleMesh) -> TriangleMesh:
     """Remove connected parts with less than LEAST_PART of the surface area from an Open3D TriangleMesh."""
     of_triangle, _, areas = mesh.cluster_connected_triangles()
     areas = np.asarray(areas)
@@ -134,7 +139,7 @@ def without_floating_parts(mesh: object) -> object:
     return mesh.remove_unreferenced_vertices()
 
 
-def write_mesh(path: Path, mesh: object) -> None:
+def write_mesh(path: Path, mesh: TriangleMesh) -> None:
     """Write a mesh with vertex colours as PLY, GLB or OBJ, by the suffix. The file appears whole or not at all.
 
     The axes are those of the poses. Only GLB, where y points up, is rotated by 180 degrees around x.
@@ -154,7 +159,7 @@ def write_mesh(path: Path, mesh: object) -> None:
             raise OSError(None, "Open3D could not write the mesh")
 
 
-def read_mesh(path: Path) -> object:
+def read_mesh(path: Path) -> TriangleMesh:
     """Read an Open3D TriangleMesh.
 
     Raises:

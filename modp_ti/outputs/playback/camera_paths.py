@@ -106,7 +106,8 @@ def _unit_across(v: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[n
     """Return the unit vector (3,) along the part of `v` orthogonal to `axis`; any orthogonal one if it is 0."""
     v = v - (v @ axis) * axis
     if np.linalg.norm(v) < 1e-9:
-        v = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        least: NDArray[np.float64] = np.eye(3)[np.argmin(np.abs(axis))]
+        v = np.cross(axis, least)
     return v / np.linalg.norm(v)
 
 

@@ -103,13 +103,14 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
     try:
         for picture in pictures:
             if writer is None:
-                codec = cv2.VideoWriter_fourcc(*VIDEO_SUFFIXES[path.suffix.lower()])
+                codec = cv2.VideoWriter.fourcc(*VIDEO_SUFFIXES[path.suffix.lower()])
                 writer = cv2.VideoWriter(str(partial), codec, frames_per_second, picture.shape[1::-1])
                 if not writer.isOpened():
                     raise InputError(f"{path}: this OpenCV cannot write such a video; give a folder for pictures")
             writer.write(np.ascontiguousarray(picture[..., ::-1]))
-        writer.release()
-        os.replace(partial, path)
+        if writer is not None:
+            writer.release()
+            os.replace(partial, path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     finally:

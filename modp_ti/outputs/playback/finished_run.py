@@ -106,7 +106,8 @@ def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
     for number, camera in model.cameras.items():
         what = f"{folder}: camera {number}"
         try:
-            pinhole = PinholeCamera(*map(float, camera.params), camera.width, camera.height)
+            fx, fy, cx, cy = map(float, camera.params)
+            pinhole = PinholeCamera(fx, fy, cx, cy, camera.width, camera.height)
         except (ValueError, TypeError) as error:
             raise InputError(f"{what} is none of a run: {error}") from None
         of_id[number], _ = require_plausible(pinhole, NO_DISTORTION, what)

@@ -53,7 +53,7 @@ def surface_views(run: FinishedRun, device: str, line: ProgressLine) -> Iterator
         else:
             grey = cv2.resize(images[number], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         depth = view.expected_depth(LEAST_OPACITY).astype(np.float32)
-        views.append(DepthView(camera, T, grey / np.float32(255.0), depth))
+        views.append(DepthView(camera, T, np.asarray(grey / np.float32(255.0), dtype=np.float32), depth))
     neighbours = [choose_neighbours(views, index) for index in range(len(views))]
     matched = [
         replace(view, depth=matched_depth(views, index, neighbours[index]))

@@ -11,7 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.files.errors import InputError
 from modp_ti.outputs.evaluation import FrameScore
+from modp_ti.outputs.playback.map_renderer import eight_bits
 
 __all__ = ["FULL_SCALE", "Album", "Comparison", "data_uri", "error_colours", "error_map", "picked"]
 
@@ -74,8 +76,7 @@ class Album:
     def keep(self, index: int, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
         """Store the image and render (H, W, 3), in [0, 1], if the frame is wanted."""
         if index in self.wanted:
-            image, render = (np.round(np.clip(p, 0, 1) * 255).astype(np.uint8) for p in (image, render))
-            self.kept[index] = image, render
+            self.kept[index] = eight_bits(image), eight_bits(render)
 
     def comparisons(self, scores: Iterable[FrameScore], renders: Path) -> list[Comparison]:
         """Return the comparisons of the page, worst first.
@@ -118,7 +119,7 @@ def error_map(image: NDArray[np.uint8], render: NDArray[np.uint8]) -> NDArray[np
 def error_colours(error: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Map errors (H, W) to RGB colours (H, W, 3), from black for 0 to pale yellow for FULL_SCALE and more."""
     steps = np.round(np.clip(error / FULL_SCALE, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return cv2.applyColorMap(steps, cv2.COLORMAP_INFERNO)[..., ::-1]
+    return np.asarray(cv2.applyColorMap(steps, cv2.COLORMAP_INFERNO), dtype=np.uint8)[..., ::-1]
 
 
 def data_uri(picture: NDArray[np.uint8], longest: int = LONGEST) -> str:
@@ -127,7 +128,7 @@ def data_uri(picture: NDArray[np.uint8], longest: int = LONGEST) -> str:
     factor = min(1.0, longest / max(height, width))
     if factor < 1.0:
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
@@ -140,6 +141,9 @@ def _comparison(score: FrameScore, rank: str, image: NDArray[np.uint8], render: 
 
 def _read_pair(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Split a side-by-side picture into frame and render."""
-    pair = cv2.imread(str(path))[..., ::-1]
+    pair = cv2.imread(str(path))
+    if pair is None:
+        raise InputError(f"{path}: the picture is missing or damaged; run again to write it")
+    pair = np.asarray(pair, dtype=np.uint8)[..., ::-1]
     half = pair.shape[1] // 2
     return pair[:, :half], pair[:, half:]

@@ -6,7 +6,7 @@ import functools
 import io
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, ParamSpec
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,9 +166,12 @@ def trajectory(
         (close, "closer", _extent(around, around[:0])),
     ):
         if "truth" in ways:
-            _line(axes, *ways["truth"].T, "way-truth", color=GREEN, lw=2.8, alpha=0.6, label="ground truth")
-        _line(axes, *ways["before"].T, "way-before", color=GREY, ls="--", label="tracker")
-        _line(axes, *ways["after"].T, "way-after", color=ORANGE, label="after mapping")
+            x, y = ways["truth"].T
+            _line(axes, x, y, "way-truth", color=GREEN, lw=2.8, alpha=0.6, label="ground truth")
+        x, y = ways["before"].T
+        _line(axes, x, y, "way-before", color=GREY, ls="--", label="tracker")
+        x, y = ways["after"].T
+        _line(axes, x, y, "way-after", color=ORANGE, label="after mapping")
         if len(keyframes):
             axes.plot(*ways["after"][list(keyframes)].T, ".", ms=3.5, color=ORANGE, label="keyframes")
         axes.plot(*ways["after"][0], "o", ms=7, mfc="none", color="black", label="first frame")
@@ -210,10 +213,10 @@ def pose_changes(
     return figure
 
 
-def _line(axes: Axes, x: NDArray, y: NDArray, name: str, **style: object) -> None:
+def _line(axes: Axes, x: NDArray, y: NDArray, name: str, **style: Any) -> None:
     """Plot a curve with an id in the SVG. A single value becomes a dot; values that are not finite become gaps."""
     finite = np.isfinite(y)
-    marker = {"marker": "o", "ms": 4} if finite.sum() < 2 else {}
+    marker: dict[str, Any] = {"marker": "o", "ms": 4} if finite.sum() < 2 else {}
     axes.plot(x, np.where(finite, y, np.nan), gid=name, **marker, **style)
 
 

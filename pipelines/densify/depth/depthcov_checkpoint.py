@@ -66,7 +66,7 @@ def load_depthcov(path: Path) -> DepthCovWeights:
     network.load_state_dict({name.removeprefix(NETWORK): v for name, v in entries.items() if name.startswith(NETWORK)})
     network.requires_grad_(False).eval()
     # The channels-last layout is a quarter faster on a CPU.
-    network.to(memory_format=torch.channels_last)
+    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # torch's overloads lack it
     return DepthCovWeights(network, float(entries[_scales(FINEST)[0]]), float(entries[_noise(FINEST)]))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from pipelines.densify.depth.depthcov import DepthCov
@@ -29,10 +31,16 @@ def build_depth(settings: DepthSettings, renderer: Renderer, near: float, rng: n
     Raises:
         ValueError: If DepthCov's checkpoint cannot be used.
     """
-    makers = {
+
+    def depthcov() -> DepthCov:
+        if settings.checkpoint is None:
+            raise ValueError("depthcov needs its weights: set checkpoint")
+        return DepthCov(settings, load_depthcov(settings.checkpoint), rng)
+
+    makers: dict[str, Callable[[], DepthEstimator]] = {
         "constant": lambda: GaussianProcessDepth(settings, rng),
         "image": lambda: ImageGuidedDepth(settings, rng),
-        "depthcov": lambda: DepthCov(settings, load_depthcov(settings.checkpoint), rng),
+        "depthcov": depthcov,
         "epipolar": lambda: EpipolarDepth(settings.epipolar),
         "map": lambda: MapDepth(renderer, near),
     }

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
 from pipelines.optimise import gpu_losses
-from pipelines.optimise.gpu_losses import AsyncLossValues, photometric_loss
+from pipelines.optimise.gpu_losses import photometric_loss
+from pipelines.optimise.losses import LossValues
 from pipelines.render.renderer import Renderer
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
@@ -72,7 +73,7 @@ def test_values_are_right_whenever_they_are_read(results: tuple, monkeypatch: py
     loss = photometric_loss(renderer.images)
     renderer.forward(CAMERA, POSE, NEAR)  # nothing but black
 
-    def evaluate(grey: int) -> AsyncLossValues:
+    def evaluate(grey: int) -> LossValues:
         image = np.full((CAMERA.height, CAMERA.width, 4), 255, dtype=np.uint8)
         image[..., :3] = grey
         renderer.images.set_reference(image)
