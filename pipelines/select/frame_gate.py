@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
+from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3, log_se3
 from fields.map.keyframes import Keyframe
 from pipelines.corrections import WorldMotion
@@ -71,12 +72,12 @@ class FrameGate:
 
     def _reason(self, frame: TrackedFrame, last: Keyframe | None, renderer: Renderer, near: float) -> str | None:
         glance = frame.rgba[::STRIDE, ::STRIDE]
-        picture, self._picture = self._picture, zlib.crc32(np.ascontiguousarray(glance))
+        picture, self._picture = self._picture, zlib.crc32(np.ascontiguousarray(glance).data)
         valid = glance[glance[..., 3] > 0][:, :3]
         if len(valid) == 0 or valid.std(axis=0).max() < self.settings.min_contrast:
             return "blank"
         seen, self._seen = self._seen, (frame.index, frame.T_camera_world)
-        if picture == self._picture and not np.array_equal(seen[1] if seen else None, frame.T_camera_world):
+        if picture == self._picture and (seen is None or not np.array_equal(seen[1], frame.T_camera_world)):
             return "repeated"
         if last is None or seen is None or self._accepted is None:
             self._accepted = self._seen
@@ -87,22 +88,11 @@ class FrameGate:
             self.settings.jump * float(np.median(self._motions)) if len(self._motions) >= LEAST else np.inf,
             self.settings.min_jump * float(np.hypot(frame.camera.width, frame.camera.height)),
         )
-        if motion > limit and self._map_disagrees(frame, last, renderer, near):
+        if motion > limit and _map_disagrees(frame, last, self._accepted[1], renderer, near):
             return "jumped"
         self._motions.append(motion)
         self._accepted = self._seen
         return None
-
-    def _map_disagrees(self, frame: TrackedFrame, last: Keyframe, renderer: Renderer, near: float) -> bool:
-        """Whether the image matches the map better from the last accepted pose than from the frame's own pose."""
-        level = next((image for image in frame.pyramid[::-1] if _side(image.camera) >= ASKED_SIDE), frame.pyramid[0])
-        image, valid = level.rgba[..., :3] / 255.0, level.rgba[..., 3] > 0
-        errors = []
-        # The last keyframe's refinement is applied to both tracked poses, as it would be to a new keyframe.
-        for T in (self._accepted[1], frame.T_camera_world):
-            renderer.forward(level.camera, last.correction @ T, near)
-            errors.append(float(np.abs(renderer.images.colour_to_numpy() - image)[valid].mean()))
-        return errors[0] < errors[1]
 
     def correct(self, motion: WorldMotion) -> None:
         """Apply a tracker's correction to the poses of the previous and the last accepted frame."""
@@ -136,5 +126,19 @@ def _motion(W: NDArray[np.float64], before: tuple[int, NDArray[np.float64]], fra
     return float(np.linalg.norm(moved)) / max(frame.index - before[0], 1)
 
 
-def _side(camera) -> int:
+def _map_disagrees(
+    frame: TrackedFrame, last: Keyframe, T_accepted: NDArray[np.float64], renderer: Renderer, near: float
+) -> bool:
+    """Whether the image matches the map better from the last accepted pose than from the frame's own pose."""
+    level = next((image for image in frame.pyramid[::-1] if _side(image.camera) >= ASKED_SIDE), frame.pyramid[0])
+    image, valid = level.rgba[..., :3] / 255.0, level.rgba[..., 3] > 0
+    errors = []
+    # The last keyframe's refinement is applied to both tracked poses, as it would be to a new keyframe.
+    for T in (T_accepted, frame.T_camera_world):
+        renderer.forward(level.camera, last.correction @ T, near)
+        errors.append(float(np.abs(renderer.images.colour_to_numpy() - image)[valid].mean()))
+    return errors[0] < errors[1]
+
+
+def _side(camera: PinholeCamera) -> int:
     return min(camera.width, camera.height)

@@ -107,7 +107,10 @@ class Snapshot:
             index=rows["index"].tolist(),
             name=list(state.numbers["name"]),
             timestamp=rows["timestamp"].tolist(),
-            camera=[PinholeCamera(*row[:4], int(row[4]), int(row[5])) for row in rows["camera"].tolist()],
+            camera=[
+                PinholeCamera(fx, fy, cx, cy, int(width), int(height))
+                for fx, fy, cx, cy, width, height in rows["camera"].tolist()
+            ],
             held_out=rows["held_out"].tolist(),
             T_tracked=list(rows["T_tracked"]),
             corrections=dict(state.numbers["corrections"]),
