@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +14,12 @@ from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
 from fields.map.gaussian_motion import GaussianMotion
 from fields.map.keyframes import NO_MOTION, Keyframe, KeyframeStore
+from fields.map.trajectory import Trajectory
 from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation
 from pipelines.settings import CorrectionSettings
 
-__all__ = ["CorrectionReport", "HoldsPoses", "MapCorrector", "WorldMotion", "pending_motion_in_pixels", "revise"]
+__all__ = ["CorrectionReport", "MapCorrector", "WorldMotion", "pending_motion_in_pixels", "revise"]
 
 # Minimum number of moved points to estimate a keyframe's change of scale.
 MIN_POINTS = 10
@@ -81,14 +81,6 @@ class CorrectionReport:
     moved: bool
 
 
-class HoldsPoses(Protocol):
-    """An object that holds tracked poses of earlier frames."""
-
-    def correct(self, motion: WorldMotion) -> None:
-        """Apply a tracker's correction to these poses."""
-        ...
-
-
 class MapCorrector:
     """Applies the corrections of a tracker to an online map.
 
@@ -98,19 +90,17 @@ class MapCorrector:
     Args:
         keyframes: The keyframes of the map.
         densifier: Owner of the map's anchors and voxels.
-        holders: Other objects whose tracked poses must follow.
+        trajectory: Tracked poses of all frames so far.
 
     Attributes:
-        tracked: T_camera_world (4, 4) from the tracker of all frames so far, by frame index.
         motion: Moves the Gaussians.
     """
 
-    def __init__(self, keyframes: KeyframeStore, densifier: Densifier, holders: Sequence[HoldsPoses]) -> None:
+    def __init__(self, keyframes: KeyframeStore, densifier: Densifier, trajectory: Trajectory) -> None:
         self.keyframes = keyframes
         self.densifier = densifier
-        self.tracked: dict[int, NDArray[np.float64]] = {}
+        self.trajectory = trajectory
         self.motion = GaussianMotion(densifier.gaussians)
-        self._holders = holders
 
     def correct(
         self, correction: PoseCorrection, settings: CorrectionSettings
@@ -120,10 +110,8 @@ class MapCorrector:
         Returns:
             Motion of the frames and of the world, and the keyframes (N,) whose Gaussians moved, as places in the store.
         """
-        motion = revise(self.keyframes, self.tracked, correction)
-        self.tracked = {index: motion.of(index, T)[0] for index, T in self.tracked.items()}
-        for holder in self._holders:
-            holder.correct(motion)
+        motion = revise(self.keyframes, self.trajectory, correction)
+        self.trajectory.revise(lambda index, T: motion.of(index, T)[0])
         pending = np.array([pending_motion_in_pixels(view) for view in self.keyframes])
         if not (settings.enabled and (pending > settings.min_pixels).any()):
             return motion, np.zeros(0, dtype=np.int64)

@@ -47,7 +47,7 @@ class OnlineMapper(OnlineMap):
         if frame.held_out:
             raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
         self.frame_count += 1
-        self.corrector.tracked[frame.index] = frame.T_camera_world
+        self.trajectory.add(frame)
         if self.frame_count % self.settings.densify.prune_every == 0:
             self.prune()
         with self.stopwatch.measure("select"):

@@ -9,6 +9,7 @@ import numpy as np
 
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
+from fields.map.trajectory import Trajectory
 from pipelines.corrections import MapCorrector
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
@@ -61,13 +62,14 @@ class OnlineMap(Pipeline):
         self.loss = self.optimiser.loss
         self.contribution = Contribution(self.gaussians, self.renderer)
         self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side)
-        self.gate = FrameGate(settings.gate)
-        self.selector = KeyframeSelector(settings.keyframes)
+        self.trajectory = Trajectory()
+        self.gate = FrameGate(settings.gate, self.trajectory)
+        self.selector = KeyframeSelector(settings.keyframes, self.trajectory)
         depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
         self.budget = self.densifier.budget
         self.views = views or LocalGlobalViews(settings.views, self.rng)
-        self.corrector = MapCorrector(self.keyframes, self.densifier, (self.selector, self.gate))
+        self.corrector = MapCorrector(self.keyframes, self.densifier, self.trajectory)
         self.frame_count = 0
 
     @property

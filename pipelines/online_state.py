@@ -22,15 +22,12 @@ def state_of(mapper: OnlineMap) -> MapState:
     Call it between two steps.
     """
     mapper.optimiser.settle()
-    anchors, voxels, tracked = mapper.densifier.anchors, mapper.densifier.voxels, mapper.corrector.tracked
+    anchors, voxels = mapper.densifier.anchors, mapper.densifier.voxels
     place = {view.index: row for row, view in enumerate(mapper.keyframes)}
     groups = {
         "gaussians": mapper.gaussians.to_numpy() | mapper.gaussians.history(),
         "keyframes": keyframe_arrays(mapper.keyframes),
-        "tracked": {
-            "index": np.array(list(tracked), dtype=np.int64),
-            "T": np.array(list(tracked.values())).reshape(-1, 4, 4),
-        },
+        "tracked": mapper.trajectory.state(),
         "anchors": {
             "keyframe": np.array([place[anchor.keyframe.index] for anchor in anchors], dtype=np.int64),
             "spacing": np.array([anchor.spacing for anchor in anchors]),
@@ -48,8 +45,8 @@ def state_of(mapper: OnlineMap) -> MapState:
         groups["voxels"] = {"places": places, "words": words}
         numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
     if mapper.selector.previous is not None:
-        index, T = mapper.selector.previous
-        groups["previous"] = {"index": np.array(index), "T": T}
+        index = mapper.selector.previous
+        groups["previous"] = {"index": np.array(index), "T": mapper.trajectory[index]}
     return MapState.of(groups, numbers)
 
 
@@ -78,13 +75,14 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     mapper.densifier.anchors = [Anchor(mapper.keyframes[row], spacing) for row, spacing in pairs]
     if len(mapper.gaussians) and mapper.gaussians.anchors().max() >= len(mapper.densifier.anchors):
         raise ValueError("a Gaussian has an anchor that the state does not contain")
-    tracked = state.group("tracked")
-    mapper.corrector.tracked = dict(zip(tracked["index"].tolist(), list(tracked["T"]), strict=True))
+    mapper.trajectory.restore(state.group("tracked"))
     if mapper.densifier.voxels is not None:
         mapper.densifier.voxels.settle(state.numbers["coarsest"], state.numbers["origin"])
         mapper.densifier.voxels.restore(**state.group("voxels"))
     previous = state.group("previous")
-    mapper.selector.previous = (int(previous["index"]), previous["T"]) if previous else None
+    mapper.selector.previous = int(previous["index"]) if previous else None
+    if previous and mapper.selector.previous not in mapper.trajectory:
+        raise ValueError(f"frame {mapper.selector.previous} has no tracked pose")
     mapper.frame_count = int(state.numbers["frames"])
     mapper.renderer.view_renders = int(state.numbers["view_renders"])
     mapper.rng.bit_generator.state = state.numbers["random"]
