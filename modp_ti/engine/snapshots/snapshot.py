@@ -144,7 +144,7 @@ class Snapshot:
 
 def _unfit(path: Path, error: Exception) -> InputError:
     reason = " ".join(str(error).split()) or type(error).__name__
-    return InputError(f"{path}: does not fit together ({reason}); start the run from its scene")
+    return InputError(f"{path}: the parts of the snapshot do not fit together ({reason}); start the run from its scene")
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:
