@@ -12,9 +12,14 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.gaussian_motion import GaussianMotion
+from fields.map.keyframes import NO_MOTION, Keyframe, KeyframeStore
+from fields.map.trajectory import Trajectory
+from pipelines.densify.densifier import Densifier
+from pipelines.render.spherical_harmonics import sh_rotation
+from pipelines.settings import CorrectionSettings
 
-__all__ = ["CorrectionReport", "WorldMotion", "pending_motion_in_pixels", "revise"]
+__all__ = ["CorrectionReport", "MapCorrector", "WorldMotion", "pending_motion_in_pixels", "revise"]
 
 # Minimum number of moved points to estimate a keyframe's change of scale.
 MIN_POINTS = 10
@@ -74,6 +79,64 @@ class CorrectionReport:
 
     motion: WorldMotion
     moved: bool
+
+
+class MapCorrector:
+    """Applies the corrections of a tracker to an online map.
+
+    Keyframe poses change at once. Gaussians move with the views that placed them as soon as a keyframe's image would
+    otherwise be displaced by more than `corrections.min_pixels`; the voxels are then marked again.
+
+    Args:
+        keyframes: The keyframes of the map.
+        densifier: Owner of the map's anchors and voxels.
+        trajectory: Tracked poses of all frames so far.
+
+    Attributes:
+        motion: Moves the Gaussians.
+    """
+
+    def __init__(self, keyframes: KeyframeStore, densifier: Densifier, trajectory: Trajectory) -> None:
+        self.keyframes = keyframes
+        self.densifier = densifier
+        self.trajectory = trajectory
+        self.motion = GaussianMotion(densifier.gaussians)
+
+    def correct(
+        self, correction: PoseCorrection, settings: CorrectionSettings
+    ) -> tuple[WorldMotion, NDArray[np.int64]]:
+        """Apply poses and points that the tracker has revised. Call it between two steps.
+
+        Returns:
+            Motion of the frames and of the world, and the keyframes (N,) whose Gaussians moved, as places in the store.
+        """
+        motion = revise(self.keyframes, self.trajectory, correction)
+        self.trajectory.revise(lambda index, T: motion.of(index, T)[0])
+        pending = np.array([pending_motion_in_pixels(view) for view in self.keyframes])
+        if not (settings.enabled and (pending > settings.min_pixels).any()):
+            return motion, np.zeros(0, dtype=np.int64)
+        self._move_gaussians()
+        return motion, np.flatnonzero(pending > 0)
+
+    def _move_gaussians(self) -> None:
+        """Move the Gaussians by the pending motion of their anchors, and mark the voxels again."""
+        anchors, voxels = self.densifier.anchors, self.densifier.voxels
+        degree = self.densifier.gaussians.sh_degree
+        turns = {
+            view.index: sh_rotation(degree, view.pending_motion[:3, :3] / scale_of(view.pending_motion))
+            for view in self.keyframes
+        }
+        if anchors:
+            S = np.stack([anchor.keyframe.pending_motion for anchor in anchors])
+            self.motion.move(S, np.stack([turns[anchor.keyframe.index] for anchor in anchors]))
+        for anchor in anchors:
+            anchor.spacing *= float(scale_of(anchor.keyframe.pending_motion))
+        if voxels is not None:
+            first = self.keyframes[0].pending_motion
+            origin = moved_points(first, voxels.origin[None])[0]
+            self.densifier.restart_voxels(voxels.coarsest * float(scale_of(first)), origin)
+        for view in self.keyframes:
+            view.pending_motion = NO_MOTION
 
 
 def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], correction: PoseCorrection) -> WorldMotion:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
+from pipelines.online_map import OnlineMap
 from pipelines.select.views import global_probabilities
 from pipelines.settings import RefineSettings
-
-if TYPE_CHECKING:
-    from pipelines.online import OnlineMapper
 
 __all__ = ["decay", "refine"]
 
@@ -20,7 +17,7 @@ def decay(step: int, steps: int, final: float) -> float:
 
 
 def refine(
-    mapper: OnlineMapper,
+    mapper: OnlineMap,
     settings: RefineSettings,
     progress: Callable[[int, float], None] | None = None,
     done: int = 0,

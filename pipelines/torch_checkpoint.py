@@ -77,7 +77,8 @@ def _require_bounded(path: Path) -> None:
             raise ValueError("it is empty")
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             for _ in range(PICKLES):
-                for _, argument, _ in pickletools.genops(content):  # parses the pickle without running it
+                # `genops` parses the pickle without running it. Of a file it needs `read`, `readline` and `tell` only.
+                for _, argument, _ in pickletools.genops(content):  # pyright: ignore[reportArgumentType]
                     if isinstance(argument, int) and argument > max(size, SMALL) and argument != MAGIC:
                         raise ValueError("it announces more than is in the file")
     except (ValueError, OSError, IndexError, OverflowError, zipfile.BadZipFile, NotImplementedError) as error:

@@ -101,7 +101,7 @@ def main() -> None:
     frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
     mapper = OnlineMapper(config.mapping, frames[0].camera.width, frames[0].camera.height, config.seed)
     constant = GaussianProcessDepth(config.mapping.depth, np.random.default_rng(config.seed))
-    mapper.depth = recorder = Recorder(mapper.depth, constant)
+    mapper.densifier.depth = recorder = Recorder(mapper.densifier.depth, constant)
     for n, frame in enumerate(frames):
         mapper.process(frame)
         print(f"\r{n + 1} of {len(frames)} frames", end="", file=sys.stderr, flush=True)

@@ -51,7 +51,7 @@ def build_pyramid(rgba: NDArray[np.uint8], camera: PinholeCamera, levels: int = 
         width, height = above.camera.width // 2, above.camera.height // 2
         if min(width, height) < MIN_SIDE:
             break
-        smaller = cv2.resize(above.rgba, (width, height), interpolation=cv2.INTER_AREA)
+        smaller = np.asarray(cv2.resize(above.rgba, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
         smaller[smaller[..., 3] < 255] = 0
         pyramid.append(ImageLevel(smaller, above.camera.resized(width, height)))
     return tuple(pyramid)

@@ -169,7 +169,8 @@ class TrackedFrame:
         if numbers.shape != (len(xyz),) or numbers.dtype.kind not in "iu":
             raise ValueError(f"{name}: ids are {numbers.shape} {numbers.dtype}, expected ({len(xyz)},) integers")
         try:
-            camera = PinholeCamera(*intrinsics.tolist(), width, height)
+            fx, fy, cx, cy = intrinsics.tolist()
+            camera = PinholeCamera(fx, fy, cx, cy, width, height)
             points = SparsePoints(xyz, pixels, numbers.astype(np.int64))
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None

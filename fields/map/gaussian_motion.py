@@ -1,5 +1,5 @@
 """`GaussianMotion`: moves Gaussians with the views that placed them, after a tracker has revised their poses."""
-# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportOptionalSubscript=false
 
 import numpy as np
 import taichi as ti

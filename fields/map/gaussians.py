@@ -1,5 +1,5 @@
 """`GaussianField`: the Gaussians of a map, in a pool that grows without recompiling kernels."""
-# pyright: reportInvalidTypeForm=false
+# pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 from collections.abc import Sequence
 
@@ -8,6 +8,7 @@ import taichi as ti
 import torch
 from numpy.typing import NDArray
 
+from fields.map.gaussian_arrays import read_integers, read_values, write_integers, write_values
 from fields.runtime.backend import growing, refuse_too_many_fields
 
 __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
@@ -102,6 +103,7 @@ class GaussianField:
         quaternion: NDArray,
         opacity_logit: NDArray,
         sh: NDArray,
+        *,
         anchor: int = NO_ANCHOR,
     ) -> None:
         """Add N Gaussians with zero gradients, moments and step counts.
@@ -175,7 +177,7 @@ class GaussianField:
         """Return the anchor (N,) of every Gaussian."""
         out = np.zeros(self.count, dtype=np.int32)
         if self.count:
-            self._read_numbers(self.anchor, out)
+            read_integers(self.anchor, out)
         return out
 
     def gradients_to_numpy(self) -> dict[str, NDArray]:
@@ -186,7 +188,7 @@ class GaussianField:
         n, k = self.count, self.sh_count
         arrays = [np.zeros(s, dtype=self.dtype) for s in ((n, 3), (n, 3), (n, 4), (n,), (n, k, 3))]
         if n:
-            self._read(n, *fields, *arrays)
+            read_values(*fields, *arrays)
         return dict(zip(_NAMES, arrays, strict=True))
 
     def load(self, state: dict[str, NDArray]) -> None:
@@ -203,12 +205,12 @@ class GaussianField:
             anchor = state.get("anchor")
             if anchor is not None and np.shape(anchor) != np.shape(state["opacity_logit"]):
                 raise ValueError(f"anchor has shape {np.shape(anchor)}, expected {np.shape(state['opacity_logit'])}")
-            self.append(**{name: state[name] for name in _NAMES})
+            self.append(*(state[name] for name in _NAMES))
         except ValueError:
             self.count = before
             raise
         if anchor is not None and self.count:
-            self._write_numbers(self.anchor, np.ascontiguousarray(anchor, dtype=np.int32))
+            write_integers(self.anchor, np.ascontiguousarray(anchor, dtype=np.int32))
 
     def history(self) -> dict[str, NDArray]:
         """Return the optimiser state: moments `NAME_m` and `NAME_v` of each value, `steps` and `anchor`.
@@ -222,7 +224,7 @@ class GaussianField:
         }
         steps = np.zeros(self.count, dtype=np.int32)
         if self.count:
-            self._read_numbers(self.steps, steps)
+            read_integers(self.steps, steps)
         return moments | {"steps": steps, "anchor": self.anchors()}
 
     def restore(self, state: dict[str, NDArray]) -> None:
@@ -246,8 +248,8 @@ class GaussianField:
             return
         for end in MOMENTS:
             arrays = [np.ascontiguousarray(state[name + end], dtype=self.dtype) for name in _NAMES]
-            self._write_moments(*(getattr(self, name + end) for name in _NAMES), *arrays)
-        self._write_numbers(self.steps, np.ascontiguousarray(state["steps"], dtype=np.int32))
+            write_values(*(getattr(self, name + end) for name in _NAMES), *arrays)
+        write_integers(self.steps, np.ascontiguousarray(state["steps"], dtype=np.int32))
 
     def take(self, tensors: Sequence[torch.Tensor]) -> None:
         """Replace all Gaussians by tensors, without a copy through the host.
@@ -271,7 +273,7 @@ class GaussianField:
     def gradients_into(self, tensors: Sequence[torch.Tensor]) -> None:
         """Write the gradients of all Gaussians into tensors of the form that `take` expects."""
         if self.count:
-            self._read(self.count, *(getattr(self, name).grad for name in _NAMES), *tensors)
+            read_values(*(getattr(self, name).grad for name in _NAMES), *tensors)
 
     def clear_gradients(self) -> None:
         """Set the gradients accumulated since the last Adam step to zero."""
@@ -280,9 +282,10 @@ class GaussianField:
 
     def take_caught(self) -> tuple[int, int]:
         """Return and reset the numbers of skipped steps and of exploded Gaussians, see `Adam`."""
-        caught = self._caught[0], self._caught[1]
+        skipped, exploded = self._caught[0], self._caught[1]
         self._caught.fill(0)
-        return caught
+        # Taichi annotates every element of a field as a vector or matrix.
+        return skipped, exploded  # pyright: ignore[reportReturnType]
 
     def opacities(self) -> NDArray:
         """Return the opacity (N,) in (0, 1) of all Gaussians."""
@@ -347,67 +350,6 @@ class GaussianField:
                     self.sh[i, k][c] = sh[j, k, c]
             self._forget(i)
             self.anchor[i] = anchor
-
-    @ti.kernel
-    def _read_numbers(self, field: ti.template(), out: ti.types.ndarray(dtype=ti.i32, ndim=1)):
-        for i in range(out.shape[0]):
-            out[i] = field[i]
-
-    @ti.kernel
-    def _write_numbers(self, field: ti.template(), values: ti.types.ndarray(dtype=ti.i32, ndim=1)):
-        for i in range(values.shape[0]):
-            field[i] = values[i]
-
-    @ti.kernel
-    def _write_moments(
-        self,
-        position: ti.template(),
-        log_scale: ti.template(),
-        quaternion: ti.template(),
-        opacity_logit: ti.template(),
-        sh: ti.template(),
-        of_position: ti.types.ndarray(),
-        of_log_scale: ti.types.ndarray(),
-        of_quaternion: ti.types.ndarray(),
-        of_opacity_logit: ti.types.ndarray(),
-        of_sh: ti.types.ndarray(),
-    ):
-        for i in range(of_opacity_logit.shape[0]):
-            for c in ti.static(range(3)):
-                position[i][c] = of_position[i, c]
-                log_scale[i][c] = of_log_scale[i, c]
-            for c in ti.static(range(4)):
-                quaternion[i][c] = of_quaternion[i, c]
-            opacity_logit[i] = of_opacity_logit[i]
-            for k in range(self.sh_count):
-                for c in ti.static(range(3)):
-                    sh[i, k][c] = of_sh[i, k, c]
-
-    @ti.kernel
-    def _read(
-        self,
-        count: ti.i32,
-        position: ti.template(),
-        log_scale: ti.template(),
-        quaternion: ti.template(),
-        opacity_logit: ti.template(),
-        sh: ti.template(),
-        out_position: ti.types.ndarray(),
-        out_log_scale: ti.types.ndarray(),
-        out_quaternion: ti.types.ndarray(),
-        out_opacity_logit: ti.types.ndarray(),
-        out_sh: ti.types.ndarray(),
-    ):
-        for i in range(count):
-            for c in ti.static(range(3)):
-                out_position[i, c] = position[i][c]
-                out_log_scale[i, c] = log_scale[i][c]
-            for c in ti.static(range(4)):
-                out_quaternion[i, c] = quaternion[i][c]
-            out_opacity_logit[i] = opacity_logit[i]
-            for k in range(self.sh_count):
-                for c in ti.static(range(3)):
-                    out_sh[i, k, c] = sh[i, k][c]
 
     @ti.kernel
     def _move(self, source: ti.types.ndarray(), target: ti.types.ndarray()):

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
+from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3, log_se3
 from fields.map.keyframes import Keyframe
-from pipelines.corrections import WorldMotion
+from fields.map.trajectory import Trajectory
 from pipelines.optimise.pose_refinement import pixel_metric
 from pipelines.render.renderer import Renderer
 from pipelines.settings import GateSettings
@@ -38,16 +39,22 @@ class FrameGate:
       render of the map at the new pose matches the image less well than the render at the last accepted pose. A
       camera that does move elsewhere loses at most one frame.
 
+    Args:
+        settings: Settings of the gate.
+        trajectory: Tracked poses of the frames so far.
+
     Attributes:
         refused: Number of rejected frames by reason.
     """
 
-    def __init__(self, settings: GateSettings) -> None:
+    def __init__(self, settings: GateSettings, trajectory: Trajectory) -> None:
         self.settings = settings
+        self.trajectory = trajectory
         self.refused: dict[str, int] = {"blank": 0, "repeated": 0, "jumped": 0}
         self._picture = 0  # checksum of the last image
-        self._seen: tuple[int, NDArray[np.float64]] | None = None
-        self._accepted: tuple[int, NDArray[np.float64]] | None = None
+        # Frame indices of the previous and the last accepted frame.
+        self._seen: int | None = None
+        self._accepted: int | None = None
         self._motions: deque[float] = deque(maxlen=REMEMBERED)
 
     def refuses(self, frame: TrackedFrame, last: Keyframe | None, renderer: Renderer, near: float) -> str | None:
@@ -71,50 +78,35 @@ class FrameGate:
 
     def _reason(self, frame: TrackedFrame, last: Keyframe | None, renderer: Renderer, near: float) -> str | None:
         glance = frame.rgba[::STRIDE, ::STRIDE]
-        picture, self._picture = self._picture, zlib.crc32(np.ascontiguousarray(glance))
+        picture, self._picture = self._picture, zlib.crc32(np.ascontiguousarray(glance).data)
         valid = glance[glance[..., 3] > 0][:, :3]
         if len(valid) == 0 or valid.std(axis=0).max() < self.settings.min_contrast:
             return "blank"
-        seen, self._seen = self._seen, (frame.index, frame.T_camera_world)
-        if picture == self._picture and not np.array_equal(seen[1] if seen else None, frame.T_camera_world):
+        seen, self._seen = self._seen, frame.index
+        if picture == self._picture and (
+            seen is None or not np.array_equal(self.trajectory[seen], frame.T_camera_world)
+        ):
             return "repeated"
         if last is None or seen is None or self._accepted is None:
             self._accepted = self._seen
             return None
         W = pixel_metric(last)
-        motion = min(_motion(W, before, frame) for before in (seen, self._accepted))
+        motion = min(_motion(W, before, self.trajectory[before], frame) for before in (seen, self._accepted))
         limit = max(
             self.settings.jump * float(np.median(self._motions)) if len(self._motions) >= LEAST else np.inf,
             self.settings.min_jump * float(np.hypot(frame.camera.width, frame.camera.height)),
         )
-        if motion > limit and self._map_disagrees(frame, last, renderer, near):
+        if motion > limit and _map_disagrees(frame, last, self.trajectory[self._accepted], renderer, near):
             return "jumped"
         self._motions.append(motion)
         self._accepted = self._seen
         return None
 
-    def _map_disagrees(self, frame: TrackedFrame, last: Keyframe, renderer: Renderer, near: float) -> bool:
-        """Whether the image matches the map better from the last accepted pose than from the frame's own pose."""
-        level = next((image for image in frame.pyramid[::-1] if _side(image.camera) >= ASKED_SIDE), frame.pyramid[0])
-        image, valid = level.rgba[..., :3] / 255.0, level.rgba[..., 3] > 0
-        errors = []
-        # The last keyframe's refinement is applied to both tracked poses, as it would be to a new keyframe.
-        for T in (self._accepted[1], frame.T_camera_world):
-            renderer.forward(level.camera, last.correction @ T, near)
-            errors.append(float(np.abs(renderer.images.colour_to_numpy() - image)[valid].mean()))
-        return errors[0] < errors[1]
-
-    def correct(self, motion: WorldMotion) -> None:
-        """Apply a tracker's correction to the poses of the previous and the last accepted frame."""
-        self._seen, self._accepted = (
-            None if before is None else (before[0], motion.of(*before)[0]) for before in (self._seen, self._accepted)
-        )
-
     # ---- snapshots -------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """Return the state as JSON-compatible values, for `restore`."""
-        before = [None if b is None else [b[0], b[1].tolist()] for b in (self._seen, self._accepted)]
+        before = [None if b is None else [b, self.trajectory[b].tolist()] for b in (self._seen, self._accepted)]
         return {
             "refused": dict(self.refused),
             "picture": self._picture,
@@ -123,18 +115,39 @@ class FrameGate:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state`."""
+        """Restore the result of `state`. The trajectory must have been restored before.
+
+        Raises:
+            KeyError, TypeError, ValueError: If the state does not fit.
+        """
         self.refused |= {name: int(count) for name, count in state["refused"].items()}
         self._picture = int(state["picture"])
-        self._seen, self._accepted = (None if b is None else (int(b[0]), np.array(b[1])) for b in state["before"])
+        self._seen, self._accepted = (None if b is None else int(b[0]) for b in state["before"])
+        for index in (self._seen, self._accepted):
+            if index is not None and index not in self.trajectory:
+                raise ValueError(f"frame {index} has no tracked pose")
         self._motions = deque(map(float, state["motions"]), maxlen=REMEMBERED)
 
 
-def _motion(W: NDArray[np.float64], before: tuple[int, NDArray[np.float64]], frame: TrackedFrame) -> float:
-    """Image motion [px per frame] from the earlier pose `before` = (index, T_camera_world) to `frame`."""
-    moved = np.linalg.solve(W, log_se3(frame.T_camera_world @ inverse_se3(before[1])))
-    return float(np.linalg.norm(moved)) / max(frame.index - before[0], 1)
+def _motion(W: NDArray[np.float64], index: int, T_camera_world: NDArray[np.float64], frame: TrackedFrame) -> float:
+    """Image motion [px per frame] from frame `index` at `T_camera_world` (4, 4) to a later `frame`."""
+    moved = np.linalg.solve(W, log_se3(frame.T_camera_world @ inverse_se3(T_camera_world)))
+    return float(np.linalg.norm(moved)) / max(frame.index - index, 1)
 
 
-def _side(camera) -> int:
+def _map_disagrees(
+    frame: TrackedFrame, last: Keyframe, T_accepted: NDArray[np.float64], renderer: Renderer, near: float
+) -> bool:
+    """Whether the image matches the map better from the last accepted pose than from the frame's own pose."""
+    level = next((image for image in frame.pyramid[::-1] if _side(image.camera) >= ASKED_SIDE), frame.pyramid[0])
+    image, valid = level.rgba[..., :3] / 255.0, level.rgba[..., 3] > 0
+    errors = []
+    # The last keyframe's refinement is applied to both tracked poses, as it would be to a new keyframe.
+    for T in (T_accepted, frame.T_camera_world):
+        renderer.forward(level.camera, last.correction @ T, near)
+        errors.append(float(np.abs(renderer.images.colour_to_numpy() - image)[valid].mean()))
+    return errors[0] < errors[1]
+
+
+def _side(camera: PinholeCamera) -> int:
     return min(camera.width, camera.height)

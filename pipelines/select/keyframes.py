@@ -11,7 +11,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from fields.map.keyframes import Keyframe
-from pipelines.corrections import WorldMotion
+from fields.map.trajectory import Trajectory
 from pipelines.select.sharpness import sharpness
 from pipelines.settings import KeyframeSettings
 
@@ -72,34 +72,37 @@ class KeyframeSelector:
     The paper rejects every frame that turned by more than 10 degrees since the previous one, as blurred. Here such a
     frame is rejected only if its image is blurred as well. In a collection of photographs, large rotations between
     sharp images are common, and rejecting them would leave parts of the scene unmapped.
+
+    Args:
+        settings: Settings of the selection.
+        trajectory: Tracked poses of the frames so far.
+
+    Attributes:
+        previous: Index of the previous frame; None before the first one.
     """
 
-    def __init__(self, settings: KeyframeSettings) -> None:
+    def __init__(self, settings: KeyframeSettings, trajectory: Trajectory) -> None:
         self.settings = settings
-        # Index and tracked T_camera_world of the previous frame.
-        self.previous: tuple[int, NDArray[np.float64]] | None = None
+        self.trajectory = trajectory
+        self.previous: int | None = None
 
     def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
         """Whether `frame` becomes a keyframe, given the latest keyframe `last`. Call it once per frame, in order."""
-        previous, self.previous = self.previous, (frame.index, frame.T_camera_world)
+        previous, self.previous = self.previous, frame.index
         if len(frame.points) < self.settings.min_points:
             return False
         if last is None or previous is None:
             return True
         if frame.index - last.index > self.settings.max_gap:
             return True
-        if rotation_per_frame(*previous, frame) > self.settings.max_rotation and self._is_blurred(frame, last):
+        if rotation_per_frame(
+            previous, self.trajectory[previous], frame
+        ) > self.settings.max_rotation and self._is_blurred(frame, last):
             return False
         moved = np.linalg.norm(camera_centre(frame.T_camera_world) - camera_centre(last.T_camera_world))
         if moved > self.settings.baseline * last.median_depth:
             return True
         return covisibility(SeenPoints.of(frame), SeenPoints.of(last)) < self.settings.covisibility
-
-    def correct(self, motion: WorldMotion) -> None:
-        """Apply a tracker's correction to the pose of the previous frame."""
-        if self.previous is not None:
-            index, T = self.previous
-            self.previous = index, motion.of(index, T)[0]
 
     def _is_blurred(self, frame: TrackedFrame, last: Keyframe) -> bool:
         return sharpness(frame.rgba) < self.settings.min_sharpness * sharpness(last.rgba)

@@ -25,7 +25,7 @@ def sharpness(rgb: NDArray[np.uint8]) -> float:
     if min(rgb.shape[:2]) < 6:
         return 0.0
     full = cv2.cvtColor(np.ascontiguousarray(rgb[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    half = cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    half = cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
     fine, coarse = _detail(full), _detail(half)
     return float((fine / coarse).min()) if coarse.min() > 0 else 0.0
 

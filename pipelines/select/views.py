@@ -18,9 +18,11 @@ class ViewSelection(Protocol):
 
     def begin(self, store: KeyframeStore) -> None:
         """Called before the steps on a new keyframe, which is the last of `store`."""
+        ...
 
     def select(self, store: KeyframeStore) -> list[int]:
         """Return the indices into `store` of the views of the next step, the current keyframe first."""
+        ...
 
 
 def global_probabilities(store: KeyframeStore, error_weight: float, recency_weight: float) -> np.ndarray:

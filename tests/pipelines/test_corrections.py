@@ -148,8 +148,8 @@ def everything(mapper: OnlineMapper) -> dict[str, np.ndarray]:
         state[name] = getattr(mapper.gaussians, name).to_numpy()[: len(mapper.gaussians)]
     for view in mapper.keyframes:
         state[f"pose {view.index}"], state[f"points {view.index}"] = view.T_camera_world, view.points.xyz
-    sizes = mapper.voxels.coarsest / 2.0 ** np.arange(mapper.voxels.levels)
-    state["occupied"] = np.stack([mapper.voxels.query(state["position"], size) for size in sizes])
+    sizes = mapper.densifier.voxels.coarsest / 2.0 ** np.arange(mapper.densifier.voxels.levels)
+    state["occupied"] = np.stack([mapper.densifier.voxels.query(state["position"], size) for size in sizes])
     state["draws"] = np.array(str(mapper.rng.bit_generator.state))
     return state
 
@@ -190,7 +190,7 @@ def test_small_corrections_add_up_until_they_count(mapped: OnlineMapper) -> None
     poses[1] = shift @ poses[1]
     assert mapped.correct(PoseCorrection(np.arange(5), poses)).moved
     way = mapped.gaussians.to_numpy()["position"] - before["position"]
-    mine = np.array([anchor.keyframe is moved for anchor in mapped.anchors])[mapped.gaussians.anchors()]
+    mine = np.array([anchor.keyframe is moved for anchor in mapped.densifier.anchors])[mapped.gaussians.anchors()]
     expected = T[:3, :3].T @ [-0.66 / CAMERA.focal * depth, 0, 0]
     np.testing.assert_allclose(way[mine], np.tile(expected, (mine.sum(), 1)), atol=1e-5)
     assert (way[~mine] == 0).all()
@@ -199,26 +199,26 @@ def test_small_corrections_add_up_until_they_count(mapped: OnlineMapper) -> None
 
 def test_a_world_that_moves_as_a_whole_looks_as_before_in_the_voxels_of_a_fresh_insertion(mapped: OnlineMapper) -> None:
     view = mapped.keyframes[3]
-    spacing = np.array([anchor.spacing for anchor in mapped.anchors])
-    coarsest = mapped.voxels.coarsest
+    spacing = np.array([anchor.spacing for anchor in mapped.densifier.anchors])
+    coarsest = mapped.densifier.voxels.coarsest
     before = mapped.renderer.render(view.camera, view.T_camera_world, mapped.near).colour
     assert mapped.correct(moving(mapped, S)).moved
     now = mapped.renderer.render(view.camera, view.T_camera_world, mapped.near).colour
     np.testing.assert_allclose(now, before, atol=5e-4)
 
-    assert mapped.voxels.coarsest == pytest.approx(1.2 * coarsest)
+    assert mapped.densifier.voxels.coarsest == pytest.approx(1.2 * coarsest)
     xyz = mapped.gaussians.to_numpy()["position"].astype(np.float64)
     sizes = 1.2 * spacing[mapped.gaussians.anchors()]
     # The oracle: sets of cells in Python.
-    widths = mapped.voxels.coarsest / 2.0 ** np.arange(mapped.voxels.levels)
-    cells = [np.floor((xyz - mapped.voxels.origin) / width).astype(int) for width in widths]
-    finest = mapped.voxels.level_of(sizes)
+    widths = mapped.densifier.voxels.coarsest / 2.0 ** np.arange(mapped.densifier.voxels.levels)
+    cells = [np.floor((xyz - mapped.densifier.voxels.origin) / width).astype(int) for width in widths]
+    finest = mapped.densifier.voxels.level_of(sizes)
     marked = [set(map(tuple, cells[k][finest >= k].tolist())) for k in range(len(widths))]
     asked = np.concatenate([xyz, xyz + np.random.default_rng(0).normal(size=xyz.shape) * sizes[:, None]])
     shares = []
     for k, width in enumerate(widths):
-        places = np.floor((asked - mapped.voxels.origin) / width).astype(int).tolist()
-        answer = mapped.voxels.query(asked, width)
+        places = np.floor((asked - mapped.densifier.voxels.origin) / width).astype(int).tolist()
+        answer = mapped.densifier.voxels.query(asked, width)
         assert answer.tolist() == [tuple(place) in marked[k] for place in places]
         shares.append(answer.mean())
     assert shares[0] > 0.9 and 0.3 < shares[4] < 0.7 and shares[7] == 0.0

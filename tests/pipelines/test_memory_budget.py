@@ -46,7 +46,7 @@ def mapped(memory: float | None, frames: int = FRAMES) -> Mapped:
     mapper.finish()
     images = sum(level.rgba.nbytes for view in mapper.keyframes for level in view.pyramid)
     points = sum(a.nbytes for v in mapper.keyframes for a in (v.points.xyz, v.points.pixels, v.points.ids))
-    bricks = len({tuple(place[:3]) for place in mapper.voxels.marks()[0].tolist()})
+    bricks = len({tuple(place[:3]) for place in mapper.densifier.voxels.marks()[0].tolist()})
     return Mapped(
         mapper.gaussians.to_numpy(),
         [view.index for view in mapper.keyframes],

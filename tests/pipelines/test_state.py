@@ -104,6 +104,7 @@ def test_a_refinement_goes_on_in_its_middle(states: dict[str, MapState]) -> None
         ("voxels.places", np.full((1, 4), 1 << 30, np.int32)),
         ("anchors.keyframe", np.full(1, 77)),
         ("keyframes.index", np.full(1, 77)),
+        ("previous.index", np.array(77)),
     ],
 )
 def test_a_state_that_does_not_fit_is_refused(states: dict[str, MapState], name: str, value: np.ndarray | None) -> None:

@@ -93,8 +93,8 @@ class Checkpointer:
         except OSError as error:
             self.failed += 1
             if self.failed == 1:
-                left = "the one before is kept" if self.path.exists() else "there is none"
-                self._say(f"{self.path}: no snapshot can be written: {error.strerror}; {left}, and the run goes on")
+                left = "the previous one is kept" if self.path.exists() else "there is none yet"
+                self._say(f"{self.path}: a snapshot cannot be written: {error.strerror}; {left}, and the run continues")
             return False
         self.written += 1
         self._last = position
@@ -104,7 +104,7 @@ class Checkpointer:
         """Return the part of an error message that says how to resume, or "" if the run cannot be resumed."""
         if not self.possible or not self.path.is_file():
             return ""
-        return f"; `modp-ti run --resume {self.path.parent}` goes on from its snapshot, once that is mended"
+        return f"; fix the cause, then continue from the snapshot with `modp-ti run --resume {self.path.parent}`"
 
     def remove(self) -> None:
         """Delete the snapshot of a finished run, and the partial file that a killed process may have left."""

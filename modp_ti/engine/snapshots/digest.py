@@ -39,4 +39,4 @@ class StreamDigest:
 
     def _take(self, *arrays: np.ndarray) -> None:
         for array in arrays:
-            self.value = zlib.crc32(np.ascontiguousarray(array), self.value)
+            self.value = zlib.crc32(np.ascontiguousarray(array).data, self.value)

@@ -68,11 +68,11 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
         raise InputError(f"{path}: the snapshot cannot be read: {error.strerror}") from None
     except (zipfile.BadZipFile, ValueError, KeyError, TypeError, NotImplementedError, RuntimeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: no snapshot, or a damaged one ({reason}); start the run from its scene") from None
+        raise InputError(f"{path}: not a snapshot, or a damaged one ({reason}); start the run from its scene") from None
     if version != VERSION:
         raise InputError(
-            f"{path}: a snapshot of version {version}, this program reads {VERSION}: resume it with the program that "
-            "wrote it, or start the run from its scene"
+            f"{path}: a snapshot of version {version}, but this program reads version {VERSION}; resume with the "
+            "program that wrote it, or start the run from its scene"
         )
     return arrays, about
 
@@ -83,9 +83,9 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
     for info in archive.infolist():
         total += info.file_size
         if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size or total > size:
-            raise ValueError(f"{info.filename} is not stored as it is")
+            raise ValueError(f"{info.filename} is compressed, or longer than the file")
         if not info.filename.endswith(".npy") or info.filename[:-4] in members:
-            raise ValueError(f"{info.filename} is no array, or is there twice")
+            raise ValueError(f"{info.filename} is not an array, or occurs twice")
         members[info.filename[:-4]] = info
     return members
 
@@ -101,5 +101,5 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int) -> NDArra
         raise ValueError(f"{info.filename} holds {dtype}, not plain numbers")
     start = stream.tell()
     if math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise ValueError(f"{info.filename} is not as long as it says")
+        raise ValueError(f"{info.filename} does not have the announced length")
     return np.frombuffer(data, dtype=dtype, offset=start).reshape(shape).copy()

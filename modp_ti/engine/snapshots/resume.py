@@ -49,12 +49,10 @@ def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> 
     file = output / FILE
     if not file.is_file():
         if not output.is_dir():
-            raise InputError(f"{output}: no such folder (--resume): it is the output folder of a run")
+            raise InputError(f"{output}: no such folder (--resume); give the output folder of an interrupted run")
         if (output / "metrics.json").is_file():
-            raise InputError(f"{output}: the run there is finished, there is nothing to resume")
-        raise InputError(
-            f"{file}: there is no snapshot: start the run from its scene, with `snapshot_every` for next time"
-        )
+            raise InputError(f"{output}: this run is finished; there is nothing to resume")
+        raise InputError(f"{file}: there is no snapshot; start the run from its scene, and set `snapshot_every`")
     snapshot = Snapshot.read(file)
     if scene is None:
         config = scene_from_data(snapshot.settings, str(file), overrides)
@@ -65,8 +63,8 @@ def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> 
     for key in [*now, *(key for key in before if key not in now)]:
         if before.get(key) != now.get(key) and not any(key == free or key.startswith(f"{free}.") for free in FREE):
             raise InputError(
-                f"{file}: is of another scene: its {key} is {as_yaml(before.get(key))}, here it is "
-                f"{as_yaml(now.get(key))}; resume with the settings that it was begun with"
+                f"{file}: the snapshot was made with {key}: {as_yaml(before.get(key))}, not {as_yaml(now.get(key))}; "
+                "resume with the settings of the interrupted run"
             )
     return config, snapshot
 
@@ -108,11 +106,11 @@ def replay(
         mapper.restore(snapshot.map, snapshot.frames(), frames(), position.finished)
         mapper.pipeline.stopwatch.seconds |= snapshot.numbers["watch"]
     if digest.value != position.digest:
-        raise _changed(snapshot, "its images, poses or points are others")
+        raise _changed(snapshot, "images, poses or points have changed")
 
 
 def _changed(snapshot: Snapshot, how: str) -> InputError:
     return InputError(
-        f"{snapshot.path}: the input is not what the snapshot was made of: {how}; put it back, or start the run from "
-        "its scene"
+        f"{snapshot.path}: the input differs from that of the snapshot: {how}; restore the input, or start the run "
+        "from its scene"
     )

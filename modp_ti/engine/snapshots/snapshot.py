@@ -107,7 +107,10 @@ class Snapshot:
             index=rows["index"].tolist(),
             name=list(state.numbers["name"]),
             timestamp=rows["timestamp"].tolist(),
-            camera=[PinholeCamera(*row[:4], int(row[4]), int(row[5])) for row in rows["camera"].tolist()],
+            camera=[
+                PinholeCamera(fx, fy, cx, cy, int(width), int(height))
+                for fx, fy, cx, cy, width, height in rows["camera"].tolist()
+            ],
             held_out=rows["held_out"].tolist(),
             T_tracked=list(rows["T_tracked"]),
             corrections=dict(state.numbers["corrections"]),
@@ -141,7 +144,7 @@ class Snapshot:
 
 def _unfit(path: Path, error: Exception) -> InputError:
     reason = " ".join(str(error).split()) or type(error).__name__
-    return InputError(f"{path}: does not fit together ({reason}); start the run from its scene")
+    return InputError(f"{path}: the parts of the snapshot do not fit together ({reason}); start the run from its scene")
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:

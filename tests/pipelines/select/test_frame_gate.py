@@ -90,14 +90,14 @@ def test_a_camera_that_jumps_with_its_picture_passes(mapper: OnlineMapper) -> No
 
 
 def test_refused_frames_leave_the_map_and_the_chance_alone(mapper: OnlineMapper) -> None:
-    before, frames, gate = mapper.state(), mapper._frames, mapper.gate.state()
+    before, frames, gate = mapper.state(), mapper.frame_count, mapper.gate.state()
     try:
         report = mapper.process(replace(walk(12), image=np.zeros((48, 64, 3), np.float32)))
         after = mapper.state()
         assert (report.is_keyframe, report.psnr) == (False, None)
         assert after.numbers["random"] == before.numbers["random"]
         assert mapper.gate.refused == {"blank": 1, "repeated": 0, "jumped": 0}
-        assert mapper._frames == frames + 1
+        assert mapper.frame_count == frames + 1
         for name, array in before.arrays.items():
             if not name.startswith("tracked"):
                 assert array.tobytes() == after.arrays[name].tobytes(), name

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
+from fields.map.trajectory import Trajectory
 from pipelines.select.keyframes import KeyframeSelector, SeenPoints, covisibility
 from pipelines.settings import KeyframeSettings
 
@@ -35,11 +37,13 @@ def frame(index: int, x: float = 0.0, yaw: float = 0.0, points: int = 30) -> Tra
     return TrackedFrame(index, index / 30, str(index), IMAGE, CAMERA, T, sparse)
 
 
-def decisions(frames: list[TrackedFrame], **settings: float) -> list[bool]:
+def decisions(frames: list[TrackedFrame], **settings: Any) -> list[bool]:
     """What becomes of every frame of a stream."""
-    selector, store = KeyframeSelector(KeyframeSettings(**settings)), KeyframeStore()
+    trajectory, store = Trajectory(), KeyframeStore()
+    selector = KeyframeSelector(KeyframeSettings(**settings), trajectory)
     result = []
     for f in frames:
+        trajectory.add(f)
         result.append(selector.is_keyframe(f, store[len(store) - 1] if len(store) else None))
         if result[-1]:
             store.append(f)
@@ -91,7 +95,7 @@ def test_moving_makes_a_keyframe_although_all_points_stay_in_view() -> None:
 
 def test_a_sudden_turn_is_no_keyframe_where_the_picture_is_blurred() -> None:
     rng = np.random.default_rng(0)
-    sharp = cv2.GaussianBlur(rng.uniform(0, 1, (20, 20, 3)).astype(np.float32), None, 0.7)
+    sharp = cv2.GaussianBlur(rng.uniform(0, 1, (20, 20, 3)).astype(np.float32), (0, 0), 0.7)
     blurred = cv2.blur(sharp, (5, 1))
     steady = [replace(frame(i, x=0.1 * i, yaw=i), image=sharp) for i in range(4)]
     for picture, becomes_one in ((sharp, True), (blurred, False)):

@@ -95,7 +95,8 @@ def test_a_full_disk_keeps_the_snapshot_before_and_says_so_once(run: Run, monkey
     assert run.checkpointer.failed > failed
     path = run.checkpointer.path
     assert run.said == [
-        f"{path}: no snapshot can be written: No space left on device; the one before is kept, and the run goes on"
+        f"{path}: a snapshot cannot be written: No space left on device; the previous one is kept, "
+        "and the run continues"
     ]
     assert path.read_bytes() == before and os.listdir(path.parent) == [FILE]
     monkeypatch.undo()
@@ -115,5 +116,5 @@ def test_another_input_is_refused(run: Run) -> None:
     image = events[0].image.copy()
     image[3, 4] = 0.0
     others = [replace(events[0], image=image), *events[1:]]
-    with pytest.raises(InputError, match="its images, poses or points are others"):
+    with pytest.raises(InputError, match="images, poses or points have changed"):
         replay(snapshot, Mapper(64, 48, SETTINGS), iter(others), StreamDigest())

@@ -1,0 +1,130 @@
+"""`Densifier`: adds Gaussians from a view, and remembers which view placed them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_se3
+from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.occupancy import OccupancyVoxels
+from pipelines.densify.depth import DepthEstimator
+from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
+from pipelines.memory_budget import MemoryBudget
+from pipelines.optimise.map_optimiser import MapOptimiser
+from pipelines.settings import MappingSettings
+from pipelines.stopwatch import Stopwatch
+
+__all__ = ["Anchor", "Densifier"]
+
+# A pixel whose rendered opacity is below this counts as a hole.
+HOLE = 0.5
+
+
+@dataclass(slots=True)
+class Anchor:
+    """A view that placed Gaussians.
+
+    Attributes:
+        keyframe: Keyframe that these Gaussians move with.
+        spacing: Target voxel size of the view [scene units].
+    """
+
+    keyframe: Keyframe
+    spacing: float
+
+
+class Densifier:
+    """Adds Gaussians at tracked points and at pixels of high error, both filtered by the occupancy voxels.
+
+    Each Gaussian stores the view that placed it (`GaussianField.anchor`, an index into `anchors`).
+
+    Args:
+        settings: Settings of the mapping.
+        optimiser: Optimiser of the map; its renderer draws the views.
+        keyframes: The keyframes of the map.
+        depth: Depth estimator.
+        rng: Random generator.
+        stopwatch: Stopwatch of the mapper.
+
+    Attributes:
+        voxels: Occupancy voxels; None if the settings disable them.
+        budget: Memory budget of the map.
+        anchors: The views that placed Gaussians.
+    """
+
+    def __init__(
+        self,
+        settings: MappingSettings,
+        optimiser: MapOptimiser,
+        keyframes: KeyframeStore,
+        depth: DepthEstimator,
+        rng: np.random.Generator,
+        stopwatch: Stopwatch,
+    ) -> None:
+        self.settings = settings
+        self.optimiser = optimiser
+        self.gaussians = optimiser.gaussians
+        self.keyframes = keyframes
+        self.depth = depth
+        v = settings.voxels
+        self.voxels = OccupancyVoxels(levels=v.levels, resolution=v.resolution) if v.enabled else None
+        limit = None if settings.memory is None else settings.memory * 1e9
+        self.budget = MemoryBudget(limit, self.gaussians, keyframes, self.voxels, optimiser.safeguards)
+        self.anchors: list[Anchor] = []
+        self._rng = rng
+        self._stopwatch = stopwatch
+
+    def add_tracked_points(self, view: Keyframe) -> None:
+        """Add Gaussians at the tracked points of a view, which becomes an anchor."""
+        self.anchors.append(Anchor(self.keyframes[-1], self.settings.voxels.target * view.view_scale))
+        self._grow(tracked_seeds(view), view)
+
+    def add_error_pixels(self, view: Keyframe, warming_up: bool) -> None:
+        """Add Gaussians at pixels of high error of the latest keyframe. Call `add_tracked_points` first.
+
+        Args:
+            view: The keyframe, or a level of it.
+            warming_up: Whether the map is too young to render; pixels are then drawn from the whole image.
+        """
+        with self._stopwatch.measure("depth"):
+            self.optimiser.compare(view, self.keyframes.scene_depth)
+            images = self.optimiser.renderer.images
+            error = None if warming_up else dissimilarity(images.colour_to_numpy(), view.rgba)
+            opacity = images.opacity_to_numpy()
+            pixels = error_pixels(view, error, self.settings.densify, self._rng)
+            column, row = np.floor(pixels).astype(int).T
+            depth = self.settings.depth
+            limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
+            last = len(self.keyframes) - 1
+            neighbours = [self.keyframes[j] for j in range(max(0, last - depth.neighbours), last)]
+            seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit)
+        self._grow(seeds, view)
+
+    def _grow(self, seeds: Seeds, view: Keyframe) -> None:
+        """Add Gaussians at the seeds that the voxels admit. The first seeds settle the voxels around the camera."""
+        with self._stopwatch.measure("occupancy"):
+            if self.voxels is not None and len(self.gaussians) == 0:
+                centre = inverse_se3(view.T_camera_world)[:3, 3]
+                self.voxels.settle(self.settings.voxels.coarsest * view.view_scale, centre)
+            spacing, anchor = self.anchors[-1].spacing, len(self.anchors) - 1
+            grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, anchor)
+
+    def restart_voxels(self, coarsest: float, origin: NDArray[np.float64]) -> None:
+        """Clear the voxels and mark those of all Gaussians, each down to the level of its anchor's spacing.
+
+        Args:
+            coarsest: New size of the coarsest voxels [scene units].
+            origin: New origin (3,) of the voxels in the world frame.
+        """
+        if self.voxels is None:
+            return
+        self.voxels.clear()
+        self.voxels.settle(coarsest, origin)
+        anchor = self.gaussians.anchors()
+        spacing = np.array([a.spacing for a in self.anchors] + [self.voxels.coarsest])[anchor]  # -1: the coarsest
+        position = self.gaussians.to_numpy()["position"]
+        order = np.argsort(spacing, kind="stable")  # on a GPU, `update` runs once per run of equal levels
+        self.voxels.update(position[order], spacing[order])

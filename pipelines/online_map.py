@@ -1,0 +1,100 @@
+"""`OnlineMap`: an online map and the objects that work on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import KeyframeStore
+from fields.map.trajectory import Trajectory
+from pipelines.corrections import MapCorrector
+from pipelines.densify.contribution import Contribution
+from pipelines.densify.densifier import Densifier
+from pipelines.densify.depth import DepthEstimator, build_depth
+from pipelines.optimise.map_optimiser import MapOptimiser
+from pipelines.optimise.safeguards import Safeguards
+from pipelines.pipeline import Pipeline
+from pipelines.render.renderer import Renderer
+from pipelines.select.frame_gate import FrameGate
+from pipelines.select.keyframes import KeyframeSelector
+from pipelines.select.views import LocalGlobalViews, ViewSelection
+from pipelines.settings import MappingSettings
+from pipelines.stopwatch import Stopwatch
+
+__all__ = ["OnlineMap"]
+
+
+class OnlineMap(Pipeline):
+    """An online map and the objects that work on it. `OnlineMapper` adds the loop.
+
+    Args:
+        settings: Settings of the mapping.
+        max_width: Largest image width [px].
+        max_height: Largest image height [px].
+        seed: Seed of the random generator.
+        depth: Depth estimator; None builds the one that `settings.depth` names.
+        views: View selection; None for `LocalGlobalViews`.
+
+    Attributes:
+        frame_count: Number of frames processed so far.
+    """
+
+    can_be_refined: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        settings: MappingSettings,
+        max_width: int,
+        max_height: int,
+        seed: int = 0,
+        depth: DepthEstimator | None = None,
+        views: ViewSelection | None = None,
+    ) -> None:
+        self.settings = settings
+        self.rng = np.random.default_rng(seed)
+        self.stopwatch = Stopwatch()
+        self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
+        self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
+        self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
+        self.loss = self.optimiser.loss
+        self.contribution = Contribution(self.gaussians, self.renderer)
+        self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side)
+        self.trajectory = Trajectory()
+        self.gate = FrameGate(settings.gate, self.trajectory)
+        self.selector = KeyframeSelector(settings.keyframes, self.trajectory)
+        depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
+        self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
+        self.budget = self.densifier.budget
+        self.views = views or LocalGlobalViews(settings.views, self.rng)
+        self.corrector = MapCorrector(self.keyframes, self.densifier, self.trajectory)
+        self.frame_count = 0
+
+    @property
+    def near(self) -> float:
+        """Depth [scene units] below which nothing is drawn."""
+        return self.settings.near * self.keyframes.scene_depth
+
+    def prune(self) -> int:
+        """Remove Gaussians whose opacity is below `densify.prune_opacity`.
+
+        Returns:
+            Number of Gaussians removed.
+        """
+        return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
+
+    def caught(self) -> Safeguards:
+        """Return the safeguards' counts so far. Waits for the device."""
+        return self.optimiser.caught()
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self.gate.refused
+
+    def takes_observations(self, count: int) -> bool:
+        return self.budget.takes_observations(count)
+
+    def count_beside(self, nbytes: int) -> None:
+        self.budget.beside = nbytes

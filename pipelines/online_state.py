@@ -1,0 +1,90 @@
+"""State of an online map between two steps: saving it, and restoring it into a new map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from fields.frames.tracked_frame import TrackedFrame
+from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
+from pipelines.densify.densifier import Anchor
+from pipelines.online_map import OnlineMap
+from pipelines.state import MapState
+
+__all__ = ["restore", "state_of"]
+
+
+def state_of(mapper: OnlineMap) -> MapState:
+    """Return everything that the next frame or step depends on, except the keyframes' images.
+
+    Call it between two steps.
+    """
+    mapper.optimiser.settle()
+    anchors, voxels = mapper.densifier.anchors, mapper.densifier.voxels
+    place = {view.index: row for row, view in enumerate(mapper.keyframes)}
+    groups = {
+        "gaussians": mapper.gaussians.to_numpy() | mapper.gaussians.history(),
+        "keyframes": keyframe_arrays(mapper.keyframes),
+        "tracked": mapper.trajectory.state(),
+        "anchors": {
+            "keyframe": np.array([place[anchor.keyframe.index] for anchor in anchors], dtype=np.int64),
+            "spacing": np.array([anchor.spacing for anchor in anchors]),
+        },
+    }
+    numbers: dict[str, Any] = {
+        "frames": mapper.frame_count,
+        "view_renders": mapper.renderer.view_renders,
+        "random": mapper.rng.bit_generator.state,
+        "gate": mapper.gate.state(),
+        "guards": mapper.optimiser.caught().counts(),
+    }
+    if voxels is not None:
+        places, words = voxels.marks()
+        groups["voxels"] = {"places": places, "words": words}
+        numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
+    if mapper.selector.previous is not None:
+        index = mapper.selector.previous
+        groups["previous"] = {"index": np.array(index), "T": mapper.trajectory[index]}
+    return MapState.of(groups, numbers)
+
+
+def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) -> None:
+    """Restore a saved state into a new map with the same settings.
+
+    Args:
+        mapper: The new map.
+        state: Result of `state_of`.
+        frames: The frames that the saved map had processed, without held-out ones. The keyframes take their images
+            from them.
+
+    Raises:
+        KeyError, TypeError, ValueError: If the state does not fit. The map is then unusable.
+    """
+    rows = KeyframeRows(state.group("keyframes"))
+    for frame in frames:
+        if frame.index in rows.rows:
+            rows.put(frame, mapper.keyframes)
+    if len(mapper.keyframes) != len(rows.rows):
+        raise ValueError(f"{len(mapper.keyframes)} of the {len(rows.rows)} keyframes are among the frames")
+    mapper.keyframes.take_in_depths()
+    mapper.gaussians.restore(state.group("gaussians"))
+    anchors = state.group("anchors")
+    pairs = zip(anchors["keyframe"].tolist(), anchors["spacing"].tolist(), strict=True)
+    mapper.densifier.anchors = [Anchor(mapper.keyframes[row], spacing) for row, spacing in pairs]
+    if len(mapper.gaussians) and mapper.gaussians.anchors().max() >= len(mapper.densifier.anchors):
+        raise ValueError("a Gaussian has an anchor that the state does not contain")
+    mapper.trajectory.restore(state.group("tracked"))
+    if mapper.densifier.voxels is not None:
+        mapper.densifier.voxels.settle(state.numbers["coarsest"], state.numbers["origin"])
+        mapper.densifier.voxels.restore(**state.group("voxels"))
+    previous = state.group("previous")
+    mapper.selector.previous = int(previous["index"]) if previous else None
+    if previous and mapper.selector.previous not in mapper.trajectory:
+        raise ValueError(f"frame {mapper.selector.previous} has no tracked pose")
+    mapper.frame_count = int(state.numbers["frames"])
+    mapper.renderer.view_renders = int(state.numbers["view_renders"])
+    mapper.rng.bit_generator.state = state.numbers["random"]
+    mapper.gate.restore(state.numbers["gate"])
+    mapper.optimiser.safeguards.restore(state.numbers["guards"])
