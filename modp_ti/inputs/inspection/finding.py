@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
-__all__ = ["Finding", "Severity", "verdict"]
+__all__ = ["Finding", "Severity", "note", "unusable", "verdict", "warning"]
 
 
 class Severity(Enum):
@@ -32,6 +33,11 @@ class Finding:
     code: str
     text: str
     mend: str = ""
+
+
+note = partial(Finding, Severity.NOTE)
+warning = partial(Finding, Severity.WARNING)
+unusable = partial(Finding, Severity.UNUSABLE)
 
 
 def verdict(findings: Iterable[Finding]) -> tuple[str, int]:

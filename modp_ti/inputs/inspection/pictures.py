@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.inspection.finding import Finding, Severity
+from modp_ti.inputs.inspection.finding import Finding, note, unusable, warning
 from modp_ti.inputs.inspection.survey import FrameRecord
 
 __all__ = ["blurred", "centres", "duplicates", "judge_sequence", "time_gaps"]
@@ -54,36 +54,30 @@ def centres(frames: Sequence[FrameRecord]) -> NDArray[np.float64]:
     return np.array([-f.T_camera_world[:3, :3].T @ f.T_camera_world[:3, 3] for f in frames])
 
 
-def judge_sequence(frames: Sequence[FrameRecord]) -> list[Finding]:
+def judge_sequence(frames: Sequence[FrameRecord]) -> Iterator[Finding]:
     """Judge image sizes, time stamps and image quality."""
-    findings = []
-    sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
+    sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
-        text = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
-        findings.append(
-            Finding(Severity.UNUSABLE, "sizes", f"images of several sizes: {text}", "all of a scene must have one size")
-        )
-    back = np.flatnonzero(np.diff([frame.timestamp for frame in frames]) <= 0)
+        text = ", ".join(f"{w}x{h}" for w, h in sizes)
+        yield unusable("sizes", f"images of several sizes: {text}", "all of a scene must have one size")
+    back = np.flatnonzero(np.diff([frame.timestamp for frame in frames]) <= 0) + 1
     if len(back):
-        text = f"time does not go on at {len(back)} frames: {_names(frames, back + 1)}"
-        findings.append(Finding(Severity.WARNING, "time_order", text, "sort the frames by time, or mend the times"))
+        text = f"time does not go on at {len(back)} frames: {_names(frames, back)}"
+        yield warning("time_order", text, "sort the frames by time, or mend the times")
     gaps = time_gaps(frames)
     if gaps:
-        text = f"{len(gaps)} gaps in time, before {_names(frames, gaps)}"
-        findings.append(Finding(Severity.NOTE, "time_gaps", text))
-    found = blurred(frames)
-    if found:
-        many = len(found) > MANY_BLURRED * len(frames)
-        text = f"{len(found)} of {len(frames)} frames are blurred: {_names(frames, found)}"
-        mend = "record slower or with more light, or leave these frames out" if many else ""
-        findings.append(Finding(Severity.WARNING if many else Severity.NOTE, "blurred", text, mend))
-    found = duplicates(frames)
-    if found:
-        many = len(found) > MANY_DUPLICATES * len(frames)
-        text = f"{len(found)} of {len(frames)} frames repeat the one before: {_names(frames, found)}"
-        mend = "take them out, or use source.step" if many else ""
-        findings.append(Finding(Severity.WARNING if many else Severity.NOTE, "duplicates", text, mend))
-    return findings
+        yield note("time_gaps", f"{len(gaps)} gaps in time, before {_names(frames, gaps)}")
+    slower = "record slower or with more light, or leave these frames out"
+    fewer = "take them out, or use source.step"
+    for code, found, most, what, mend in (
+        ("blurred", blurred(frames), MANY_BLURRED, "are blurred", slower),
+        ("duplicates", duplicates(frames), MANY_DUPLICATES, "repeat the one before", fewer),
+    ):
+        text = f"{len(found)} of {len(frames)} frames {what}: {_names(frames, found)}"
+        if len(found) > most * len(frames):
+            yield warning(code, text, mend)
+        elif found:
+            yield note(code, text)
 
 
 def _names(frames: Sequence[FrameRecord], places: Sequence[int] | NDArray[np.int64]) -> str:

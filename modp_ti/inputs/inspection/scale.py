@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from modp_ti.inputs.inspection.finding import Finding, Severity
+from fields.geometry.camera import PinholeCamera
+from modp_ti.inputs.inspection.finding import Finding, note, unusable, warning
 from modp_ti.inputs.inspection.pictures import centres
 from modp_ti.inputs.inspection.survey import FrameRecord
 
@@ -53,7 +54,7 @@ def measure_scale(frames: Sequence[FrameRecord]) -> Scale:
     return Scale(depth, float(np.median(steps)), float(steps.max()), extent)
 
 
-def judge_scale(frames: Sequence[FrameRecord], scale: Scale, min_points: int) -> list[Finding]:
+def judge_scale(frames: Sequence[FrameRecord], scale: Scale, min_points: int) -> Iterator[Finding]:
     """Judge the number of points, the camera's motion and its intrinsics.
 
     Args:
@@ -61,75 +62,41 @@ def judge_scale(frames: Sequence[FrameRecord], scale: Scale, min_points: int) ->
         scale: Depth of the scene and motion of the camera.
         min_points: Points that a keyframe needs.
     """
-    findings = []
     mapped = [frame for frame in frames if not frame.held_out]
     poor = [frame for frame in mapped if frame.points < min_points]
     if len(poor) == len(mapped):
-        findings.append(
-            Finding(
-                Severity.UNUSABLE,
-                "points",
-                f"no frame has {min_points} tracked points: none can become a keyframe",
-                "if poses or intrinsics are wrong, mend these first; else give a tracker with points, or lower "
-                "mapping.keyframes.min_points",
-            )
+        yield unusable(
+            "points",
+            f"no frame has {min_points} tracked points: none can become a keyframe",
+            "if poses or intrinsics are wrong, mend these first; else give a tracker with points, or lower "
+            "mapping.keyframes.min_points",
         )
     elif poor:
-        severity = Severity.WARNING if len(poor) > 0.5 * len(mapped) else Severity.NOTE
         text = f"{len(poor)} of {len(mapped)} frames have fewer than {min_points} tracked points"
-        findings.append(Finding(severity, "points", text))
+        yield (warning if len(poor) > 0.5 * len(mapped) else note)("points", text)
     if np.isfinite(scale.depth) and scale.extent < LEAST_WAY:
-        findings.append(
-            Finding(
-                Severity.WARNING,
-                "no_parallax",
-                f"the camera moves by only {scale.extent:.2g} of the scene's depth: nothing is seen from two sides",
-                "move the camera, not only turn it; if it did move, the poses' scale is not that of the points",
-            )
+        yield warning(
+            "no_parallax",
+            f"the camera moves by only {scale.extent:.2g} of the scene's depth: nothing is seen from two sides",
+            "move the camera, not only turn it; if it did move, the poses' scale is not that of the points",
         )
     if np.isfinite(scale.depth) and scale.longest > LONG_STEP:
-        findings.append(
-            Finding(
-                Severity.NOTE,
-                "long_steps",
-                f"the camera moves by up to {scale.longest:.2g} of the scene's depth between two frames",
-            )
-        )
-    findings += _judge_camera(frames[0])
-    return findings
+        text = f"the camera moves by up to {scale.longest:.2g} of the scene's depth between two frames"
+        yield note("long_steps", text)
+    yield from _judge_camera(frames[0].camera)
 
 
-def _judge_camera(frame: FrameRecord) -> list[Finding]:
-    c = frame.camera
-    findings = []
-    off = max(abs(c.cx / c.width - 0.5), abs(c.cy / c.height - 0.5))
-    if off > OFF_CENTRE:
-        findings.append(
-            Finding(
-                Severity.WARNING,
-                "principal_point",
-                f"the principal point ({c.cx:.1f}, {c.cy:.1f}) is far from the middle of {c.width}x{c.height} pixels",
-                "check that the intrinsics are of images of this size, and cx and cy not exchanged",
-            )
+def _judge_camera(c: PinholeCamera) -> Iterator[Finding]:
+    if max(abs(c.cx / c.width - 0.5), abs(c.cy / c.height - 0.5)) > OFF_CENTRE:
+        yield warning(
+            "principal_point",
+            f"the principal point ({c.cx:.1f}, {c.cy:.1f}) is far from the middle of {c.width}x{c.height} pixels",
+            "check that the intrinsics are of images of this size, and cx and cy not exchanged",
         )
     ratio = max(c.fx / c.fy, c.fy / c.fx)
     if ratio > ANAMORPHIC:
-        findings.append(
-            Finding(
-                Severity.WARNING,
-                "focal_lengths",
-                f"fx {c.fx:.1f} and fy {c.fy:.1f} differ by {100 * (ratio - 1):.0f} %",
-                "check that the images were not stretched",
-            )
-        )
+        text = f"fx {c.fx:.1f} and fy {c.fy:.1f} differ by {100 * (ratio - 1):.0f} %"
+        yield warning("focal_lengths", text, "check that the images were not stretched")
     view = 2 * np.degrees(np.arctan(0.5 * c.width / c.fx))
     if not FIELD_OF_VIEW[0] <= view <= FIELD_OF_VIEW[1]:
-        findings.append(
-            Finding(
-                Severity.WARNING,
-                "field_of_view",
-                f"the camera sees {view:.0f} degrees across",
-                "check the focal length",
-            )
-        )
-    return findings
+        yield warning("field_of_view", f"the camera sees {view:.0f} degrees across", "check the focal length")

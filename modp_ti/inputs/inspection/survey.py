@@ -13,7 +13,6 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, Convention
 from modp_ti.inputs.inspection.epipolar import MatchedPair, matched_pair
-from modp_ti.inputs.inspection.reprojection import reprojection_errors
 from modp_ti.inputs.multiview.features import Features, detect_features
 from pipelines.select.sharpness import sharpness
 
@@ -92,7 +91,7 @@ def survey(frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[in
         result.frames.append(_record(frame, rgb, thumbnail, before))
         before = thumbnail
         for convention in CONVENTIONS:
-            errors[convention].append(reprojection_errors(frame, convention))
+            errors[convention].append(_reprojection_errors(frame, convention))
 
         wanted = [a for a in range(max(place - GAPS[-1], 0), place + 1) if _is_anchor(a, anchors)]
         if any(place - a in (0, *GAPS) for a in wanted):
@@ -135,6 +134,16 @@ def _record(
         change=change,
         masked=0.0 if frame.mask is None else float(1.0 - frame.mask.mean()),
     )
+
+
+def _reprojection_errors(frame: TrackedFrame, convention: Convention) -> NDArray[np.float32]:
+    """Reprojection errors (N,) [px] of a frame's points under a convention; infinite for points behind the camera."""
+    T, camera = convention.pose(frame.T_camera_world), convention.camera(frame.camera)
+    p = frame.points.xyz @ T[:3, :3].T + T[:3, 3]
+    errors = np.full(len(p), np.inf, dtype=np.float32)
+    before = p[:, 2] > 1e-9
+    errors[before] = np.linalg.norm(camera.project(p[before]) - frame.points.pixels[before], axis=1)
+    return errors
 
 
 def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

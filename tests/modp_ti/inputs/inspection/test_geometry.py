@@ -106,7 +106,7 @@ def test_where_no_feature_matches_the_points_decide(convention: Convention) -> N
     geometry = measure_geometry(survey(frames(convention, 0.5), None, lambda _: None))
     assert geometry.epipolar[STATED].matches == 0
     assert geometry.points == 6 * 400
-    findings = judge_geometry(geometry)
+    findings = list(judge_geometry(geometry))
     if convention is STATED:
         assert findings == []
         return
