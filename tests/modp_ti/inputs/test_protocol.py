@@ -31,7 +31,7 @@ def test_what_few_trackers_can_do_has_a_default():
     assert [frame.name for frame in tracker.events()] == [frame.name for frame in tracker] == ["0", "1"]
     assert not tracker.reads_ahead
     assert tracker.frame_count is None and tracker.undistorter is None
-    assert tracker.ground_truth() == [] and not tracker.unreadable
+    assert not tracker.unreadable
     assert _lens(tracker) == ""
     tracker.close()
 
