@@ -340,6 +340,7 @@ def _write_tracker_server(folder: Path) -> None:
 
 
 EXPORT = ("export", "out", "--format", "points", "-o", "written.ply", "--quiet")
+RUN_MODEL = tuple(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D"))
 SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
     sample.reader: (sample, write)
     for sample, write in (
@@ -379,17 +380,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         ),
         (Sample("mask", (f"masks/{NAMES[1]}", "vignette.png")), _write_mask),
         (Sample("video", ("room.mp4",)), _write_video),
-        (
-            Sample(
-                "run",
-                (
-                    *("out/splats.ply", "out/trajectory.txt", "out/frames.json"),
-                    *(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D")),
-                ),
-                EXPORT,
-            ),
-            _write_run,
-        ),
+        (Sample("run", ("out/splats.ply", "out/trajectory.txt", "out/frames.json", *RUN_MODEL), EXPORT), _write_run),
         (Sample("weights", ("weights.pth", "older.pth")), _write_weights),
         (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
     )
