@@ -1,13 +1,18 @@
-"""SE(3): rigid motions and their tangents in NumPy, some of them also in PyTorch (`torch_`) and Taichi (`ti_`).
+"""SE(3): rigid motions and their tangents in NumPy, one of them also in PyTorch.
 
 The tangent is xi = (rho, omega): translation first, then rotation. Increments act on the left, T <- exp(xi) T, so that
 the tangent of a `T_camera_world` is expressed in the camera frame.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
-import taichi as ti
-import torch
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    import torch
 
 __all__ = [
     "exp_se3",
@@ -19,7 +24,6 @@ __all__ = [
     "matrix_from_quaternion",
     "orthonormalised",
     "quaternion_from_matrix",
-    "ti_rotation_from_quaternion",
     "torch_exp_se3",
 ]
 
@@ -127,21 +131,9 @@ def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
 
 def torch_exp_se3(xi: torch.Tensor) -> torch.Tensor:
     """PyTorch version of `exp_se3`: differentiable, for tangents (..., 6)."""
+    import torch  # here, because the readers of poses need this module and start without PyTorch
+
     zero = torch.zeros_like(xi[..., 0])
     a, b, c, x, y, z = xi.unbind(-1)
     rows = [(zero, -z, y, a), (z, zero, -x, b), (-y, x, zero, c), (zero, zero, zero, zero)]
     return torch.linalg.matrix_exp(torch.stack([torch.stack(row, -1) for row in rows], -2))
-
-
-@ti.func
-def ti_rotation_from_quaternion(q):
-    """Taichi version of `matrix_from_quaternion`, for a quaternion of any length but zero."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    s = 2.0 / (w * w + x * x + y * y + z * z)
-    return ti.Matrix(
-        [
-            [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
-            [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
-            [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
-        ]
-    )

@@ -1,4 +1,4 @@
-"""Products of 3-vectors as single expressions, for differentiated kernels.
+"""Products of 3-vectors as single expressions, and rotations, for differentiated kernels.
 
 Taichi's own `@` and `dot` accumulate into a mutable local variable. Reverse-mode differentiation keeps every state of
 such a variable on a stack, which made the gradient of the projection three times slower.
@@ -6,7 +6,7 @@ such a variable on a stack, which made the gradient of the projection three time
 
 import taichi as ti
 
-__all__ = ["cross", "dot", "rotate", "rotate_back"]
+__all__ = ["cross", "dot", "rotate", "rotate_back", "rotation_from_quaternion"]
 
 
 @ti.func
@@ -41,5 +41,19 @@ def rotate_back(m, v):
             m[0, 0] * v[0] + m[1, 0] * v[1] + m[2, 0] * v[2],
             m[0, 1] * v[0] + m[1, 1] * v[1] + m[2, 1] * v[2],
             m[0, 2] * v[0] + m[1, 2] * v[1] + m[2, 2] * v[2],
+        ]
+    )
+
+
+@ti.func
+def rotation_from_quaternion(q):
+    """Rotation matrix of a quaternion (w, x, y, z) of any length but zero."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    return ti.Matrix(
+        [
+            [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
+            [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
+            [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
         ]
     )

@@ -11,8 +11,7 @@ import torch
 
 from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.view import ViewField
-from fields.geometry.se3 import ti_rotation_from_quaternion
-from fields.geometry.vec3 import cross, dot, rotate, rotate_back
+from fields.geometry.vec3 import cross, dot, rotate, rotate_back, rotation_from_quaternion
 from fields.map.gaussians import SH_C0, GaussianField
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.compiled_kernel import CompiledLoop
@@ -218,7 +217,7 @@ class Projection:
             row_x = ti.Vector([1.0, 0.0, jx]) * (focal[0] * inv_z)
             row_y = ti.Vector([0.0, 1.0, jy]) * (focal[1] * inv_z)
             # u, v: rows of J exp(omega) W R S, since row . (a + omega x a) = (row + row x omega) . a
-            R = ti_rotation_from_quaternion(self.gaussians.quaternion[i])
+            R = rotation_from_quaternion(self.gaussians.quaternion[i])
             scale = ti.exp(self.gaussians.log_scale[i])
             u = rotate_back(R, rotate_back(W, row_x + cross(row_x, omega))) * scale
             v = rotate_back(R, rotate_back(W, row_y + cross(row_y, omega))) * scale

@@ -72,9 +72,10 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 
 def position(file: Path) -> tuple[int, int]:
     """Frames and corrections taken in, and steps of refinement, of the snapshot; (-1, -1) without one."""
-    if not file.exists():
+    try:
+        about = read_arrays(file)[1]["position"]
+    except InputError:  # there is none, or the run replaced it while it was read
         return -1, -1
-    about = read_arrays(file)[1]["position"]
     return about["events"], about["refined"]
 
 
@@ -97,7 +98,7 @@ def stop_midway(
         process.send_signal(by)
         said, errors = process.communicate(timeout=300)
         assert process.returncode in (0, 130, -by), errors
-        if process.returncode != 0 and position(out / FILE)[0] <= most:
+        if process.returncode != 0 and 0 <= position(out / FILE)[0] <= most:
             return said, errors
         shutil.rmtree(out, ignore_errors=True)
         if before.exists():

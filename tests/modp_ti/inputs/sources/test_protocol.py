@@ -41,5 +41,5 @@ def test_every_kind_that_lies_in_files_has_an_opener():
 
 
 def test_a_source_without_a_path_is_asked_for_one():
-    with pytest.raises(InputError, match=r"source\.path is missing: give the folder that holds the images"):
+    with pytest.raises(InputError, match=r"source\.path is missing: set it to the folder of the images"):
         open_source(SourceSettings())
