@@ -127,7 +127,8 @@ def _record_approx() -> None:
 
     def recording(self: object, actual: object) -> bool:
         equal = compare(self, actual)
-        if equal and isinstance(actual, int | float | np.number) and np.isfinite(self.tolerance):
+        # The tolerance of an expected NaN cannot be asked for.
+        if equal and isinstance(actual, int | float | np.number) and np.isfinite(self.expected):
             _keep((*_caller(), "approx"), 1.0 - _used(actual, self.expected, 0.0, self.tolerance))
         return equal
 

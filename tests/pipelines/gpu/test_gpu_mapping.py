@@ -16,8 +16,10 @@ from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings, OfflineSettings
 from tests.pipelines.wall import frame
 
-# Vulkan has no sparse fields: no voxels. Few steps: a software driver takes a quarter of a second for a view.
+# Vulkan has no sparse fields: no voxels. Few steps: a software driver takes a quarter of a second for a view. The draw of
+# views must not follow the errors, which are a step older on the GPU: both devices then take the same steps.
 SETTINGS = MappingSettings(
+    views={"error_weight": 0.0},
     optimise={"steps": 2, "last_steps": 2},
     densify={"warm_up": 2, "pixels": 3000},
     voxels={"enabled": False},
@@ -49,16 +51,16 @@ def mapped(on_both: Callable) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
 
 
 def test_what_comes_late_has_come_when_a_keyframe_is_done(mapped: tuple) -> None:
-    """Which views are drawn follows their errors, which on the GPU are a step older: not all numbers are the same."""
+    """Over ten seeds, PSNR differs by at most 4.5e-5 dB, errors by 2.1e-5 of themselves, all else by 2.1e-5."""
     cpu, gpu = mapped
-    assert gpu["reported"][0] == pytest.approx(cpu["reported"][0], abs=0.01)
-    np.testing.assert_allclose(gpu["errors"], cpu["errors"], rtol=0.3)
-    assert (gpu["pose_steps"] > 0).tolist() == (cpu["pose_steps"] > 0).tolist() == [False, True, True]
-    assert (gpu["exposure_steps"] == gpu["pose_steps"]).all()
-    assert np.abs(gpu["moved"][1:] - np.eye(4)).max() > 1e-4
-    np.testing.assert_allclose(gpu["moved"], cpu["moved"], atol=0.02)
-    np.testing.assert_allclose(gpu["exposure"], cpu["exposure"], atol=0.05)
-    assert gpu["count"] == pytest.approx(cpu["count"], rel=0.02)
+    np.testing.assert_allclose(gpu["reported"], cpu["reported"], atol=1e-3)
+    np.testing.assert_allclose(gpu["errors"], cpu["errors"], rtol=5e-4)
+    assert (gpu["pose_steps"] > 0).tolist() == [False, True, True]
+    assert gpu["pose_steps"].tolist() == cpu["pose_steps"].tolist() == gpu["exposure_steps"].tolist()
+    assert np.abs(gpu["moved"][1:] - np.eye(4)).max() > 1e-3
+    np.testing.assert_allclose(gpu["moved"], cpu["moved"], atol=5e-4)
+    np.testing.assert_allclose(gpu["exposure"], cpu["exposure"], atol=5e-4)
+    assert gpu["count"] == cpu["count"]
 
 
 def test_a_map_made_on_the_gpu_is_the_same_on_every_run(mapped: tuple, gpu: str) -> None:
