@@ -6,8 +6,10 @@ inputs that a test passes through `disturbed` move by one unit in the last place
 
 With `--spread-report FILE`, each assertion that compares numbers appends its slack to the file. The slack is the signed
 distance of the value from its bound; for `assert_allclose` and `approx`, it is one minus the used fraction of the
-tolerance. `python -m tests.spread FILE` reads the files of several disturbances and lists the assertions whose smallest
-slack is less than `MARGIN` times the spread of the slacks. Their thresholds could fail on another machine or draw.
+tolerance. Positive numbers also append the logarithm of the ratio of value and bound, because an error that varies by a
+factor of two is far from a bound of ten times its size. `python -m tests.spread FILE` reads the files of several
+disturbances and lists the assertions whose smallest slack is less than `MARGIN` times the spread, in both measures.
+Their thresholds could fail on another machine or draw.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ COMPARISON = re.compile(rf"(?<![\w.]){NUMBER} (<=|>=|<|>) {NUMBER}(?![\w.])")
 
 _number = 0
 _report: Path | None = None
-_slacks: dict[tuple[str, int, str], float] = {}
+_slacks: dict[tuple[str, int, str], tuple[float, float | None]] = {}  # plain and logarithmic
 
 
 def disturbance() -> int:
@@ -92,8 +94,12 @@ def _other_stream(seed: object = None) -> np.random.Generator:
 # ---- recording -----------------------------------------------------------------------------------------------
 
 
-def _keep(site: tuple[str, int, str], slack: float) -> None:
-    _slacks[site] = min(_slacks.get(site, np.inf), float(slack))
+def _keep(site: tuple[str, int, str], smaller: float, larger: float) -> None:
+    """Record that `smaller <= larger` was asserted."""
+    slack = float(larger) - float(smaller)
+    fold = float(np.log(larger / smaller)) if smaller > 0 and larger > 0 else None
+    if site not in _slacks or slack < _slacks[site][0]:
+        _slacks[site] = (slack, fold)
 
 
 def _caller() -> tuple[str, int]:
@@ -118,7 +124,7 @@ _assert_allclose = np.testing.assert_allclose
 
 def _recording_allclose(actual, desired, rtol=1e-7, atol=0, *arguments, **options) -> None:
     _assert_allclose(actual, desired, rtol, atol, *arguments, **options)
-    _keep((*_caller(), "assert_allclose"), 1.0 - _used(actual, desired, rtol, atol))
+    _keep((*_caller(), "assert_allclose"), _used(actual, desired, rtol, atol), 1.0)
 
 
 def _record_approx() -> None:
@@ -129,7 +135,7 @@ def _record_approx() -> None:
         equal = compare(self, actual)
         # The tolerance of an expected NaN cannot be asked for.
         if equal and isinstance(actual, int | float | np.number) and np.isfinite(self.expected):
-            _keep((*_caller(), "approx"), 1.0 - _used(actual, self.expected, 0.0, self.tolerance))
+            _keep((*_caller(), "approx"), _used(actual, self.expected, 0.0, self.tolerance), 1.0)
         return equal
 
     ApproxScalar.__eq__ = recording
@@ -147,10 +153,10 @@ def pytest_assertion_pass(item: pytest.Item, lineno: int, orig: str, expl: str) 
     site = (str(item.path).rpartition("/tests/")[2], lineno, orig)
     low = _lower_bound(orig)
     for left, operator, right in COMPARISON.findall(expl.partition("\n")[0]):
-        slack = float(right) - float(left)
-        _keep(site, slack if operator[0] == "<" else -slack)
+        smaller, larger = (left, right) if operator[0] == "<" else (right, left)
+        _keep(site, float(smaller), float(larger))
         if low is not None:  # in a chain, the explanation contains only the last comparison
-            _keep((*site[:2], f"{orig} [{low}]"), float(left) - low)
+            _keep((*site[:2], f"{orig} [{low}]"), low, float(left))
 
 
 def _lower_bound(source: str) -> float | None:
@@ -170,8 +176,9 @@ def pytest_runtest_teardown(item: pytest.Item) -> None:
     if _report is None or not _slacks:
         return
     with open(f"{_report}.{os.environ.get('PYTEST_XDIST_WORKER', 'main')}", "a") as file:
-        for (where, line, text), slack in _slacks.items():
-            about = {"test": item.nodeid, "site": f"{where}:{line}", "text": text, "draw": _number, "slack": slack}
+        for (where, line, text), (slack, fold) in _slacks.items():
+            about = {"test": item.nodeid, "site": f"{where}:{line}", "text": text, "draw": _number}
+            about |= {"slack": slack, "fold": fold}
             file.write(json.dumps(about) + "\n")
     _slacks.clear()
 
@@ -181,18 +188,22 @@ def pytest_runtest_teardown(item: pytest.Item) -> None:
 
 def table(files: list[Path]) -> list[tuple[float, str]]:
     """Return (smallest slack in spreads, row) of every assertion, the closest to failing first."""
-    slacks: dict[tuple[str, str, str], dict[int, float]] = defaultdict(dict)
+    slacks: dict[tuple[str, str, str], dict[int, tuple[float, float | None]]] = defaultdict(dict)
     for file in files:
         for line in file.read_text().splitlines():
             row = json.loads(line)
-            key = (row["test"], row["site"], row["text"])
-            slacks[key][row["draw"]] = min(slacks[key].get(row["draw"], np.inf), row["slack"])
+            found = slacks[row["test"], row["site"], row["text"]]
+            if row["draw"] not in found or row["slack"] < found[row["draw"]][0]:
+                found[row["draw"]] = (row["slack"], row["fold"])
     rows = []
     for (test, site, text), by_draw in slacks.items():
-        found = np.array(list(by_draw.values()))
+        found, folds = zip(*by_draw.values(), strict=True)
+        found = np.array(found)
         spread = float(np.ptp(found))
         if spread > 0 and np.isfinite(found).all():
             ratio = float(found.min()) / spread
+            if None not in folds:
+                ratio = max(ratio, min(folds) / max(float(np.ptp(folds)), 1e-12))
             of = test.partition("::")[2]
             rows.append(
                 (ratio, f"{ratio:8.2f} {found.min():12.4g} {spread:12.4g} {len(found):3d}  {site} {of}: {text}")

@@ -123,13 +123,17 @@ def folder(frames: list[TrackedFrame], tmp_path_factory: pytest.TempPathFactory)
     return out
 
 
-def test_a_run_writes_the_corrected_trajectory_and_counts_corrections(folder: Path) -> None:
+def test_a_run_writes_the_corrected_trajectory_and_counts_corrections(frames: list[TrackedFrame], folder: Path) -> None:
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["corrections"] == {"received": 1, "moved": 1}
-    # At most 0.011 over three seeds, and 0.031 or more in tracked poses without the correction.
-    assert metrics["ate_rmse"] < 0.015 and metrics["ate_rmse_tracked"] < 0.015
+    delivered = [event.T_camera_world for event in drifting(frames, 0.05) if isinstance(event, TrackedFrame)]
+    drift = absolute_trajectory_error(delivered, loop(len(frames)))
+    # Refinement moves poses by 0.007 to 0.014 here, in seven draws.
+    assert metrics["ate_rmse"] < 0.7 * drift and metrics["ate_rmse_tracked"] < 0.7 * drift
     times, poses = read_trajectory(folder / "trajectory.txt")
-    assert len(times) == 21 and absolute_trajectory_error(list(poses), loop(21), with_scale=False) < 0.015
+    assert len(times) == 21
+    drift = absolute_trajectory_error(delivered, loop(len(frames)), with_scale=False)
+    assert absolute_trajectory_error(list(poses), loop(21), with_scale=False) < 0.7 * drift
 
 
 def test_the_trajectory_errors_are_those_of_the_written_and_of_the_tracked_poses(

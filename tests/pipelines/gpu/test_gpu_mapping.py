@@ -16,8 +16,8 @@ from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings, OfflineSettings
 from tests.pipelines.wall import frame
 
-# Vulkan has no sparse fields: no voxels. Few steps: a software driver takes a quarter of a second for a view. The draw of
-# views must not follow the errors, which are a step older on the GPU: both devices then take the same steps.
+# Vulkan has no sparse fields: no voxels. Few steps: a software driver takes a quarter of a second for a view. The draw
+# of views must not follow the errors, which are a step older on the GPU: both devices then take the same steps.
 SETTINGS = MappingSettings(
     views={"error_weight": 0.0},
     optimise={"steps": 2, "last_steps": 2},

@@ -66,7 +66,7 @@ def without_near_thresholds(n: int, seed: int, degree: int) -> tuple[dict[str, N
 def test_float64_picture_is_that_of_the_reference(renderers: Callable[..., Renderer], degree: int) -> None:
     state = random_gaussians(60, seed=degree, degree=degree)
     picture = reference.render(state, CAMERA, POSE, NEAR, BACKGROUND)
-    assert picture.opacity.max() > 0.8  # the scene says something
+    assert picture.opacity.max() > 0.7  # the scene says something
     assert_same_picture(render(renderers(degree, ti.f64), state), picture, 1e-6)
 
 

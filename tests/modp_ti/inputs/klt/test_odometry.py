@@ -44,7 +44,7 @@ def errors(tracking: Tracking, views: dict[int, View], truth: dict[int, NDArray[
 def test_every_frame_of_a_walk_gets_its_pose_and_points_their_depth(box_room, box_walk):
     tracking, views = tracked(box_room, box_walk.grey)
     assert sorted(views) == list(range(60))  # those from before the map began too
-    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.01  # of 1.8 m
+    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.015  # of 1.8 m; 0.007 at most
 
     view = views[50]
     known = tracking.map.known[view.ids]

