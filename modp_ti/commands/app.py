@@ -47,12 +47,12 @@ def _options(
     pass
 
 
-app.command(epilog=run.EXAMPLES)(run.run)
-app.command(epilog=check.EXAMPLES)(check.check)
-app.command(epilog=render.EXAMPLES)(render.render)
-app.command(epilog=export.EXAMPLES)(export.export)
-app.command(epilog=view.EXAMPLES)(view.view)
-app.command(epilog=warmup.EXAMPLES)(warmup.warmup)
+app.command("run", epilog=run.EXAMPLES)(run.run)
+app.command("check", epilog=check.EXAMPLES)(check.check)
+app.command("render", epilog=render.EXAMPLES)(render.render)
+app.command("export", epilog=export.EXAMPLES)(export.export)
+app.command("view", epilog=view.EXAMPLES)(view.view)
+app.command("warmup", epilog=warmup.EXAMPLES)(warmup.warmup)
 
 
 if __name__ == "__main__":
