@@ -27,29 +27,33 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from modp_ti.version import __version__
+from modp_ti.version import __version__ as __version__
 
 # Only for type checkers and editors. At run time `__getattr__` imports these names on first access.
 if TYPE_CHECKING:
-    from fields.frames.pose_correction import PoseCorrection
-    from fields.frames.tracked_frame import SparsePoints, TrackedFrame
-    from fields.geometry.camera import PinholeCamera
-    from fields.geometry.se3 import torch_exp_se3
-    from fields.map.gaussians import GaussianField
-    from fields.map.occupancy import OccupancyVoxels
-    from fields.runtime.backend import initialise
-    from modp_ti.config.scene_file import load_scene
-    from modp_ti.config.settings import SceneConfig
-    from modp_ti.engine.mapper import Mapper
-    from modp_ti.engine.session import run_scene
-    from modp_ti.files.errors import InputError
-    from modp_ti.inputs.trackers import open_tracker
-    from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
-    from pipelines.online import OnlineMapper
-    from pipelines.refinement import refine
-    from pipelines.render.rasterize import RasterizedView, rasterize
-    from pipelines.render.renderer import Renderer
-    from pipelines.settings import MappingSettings, RefineSettings
+    from fields.frames.pose_correction import PoseCorrection as PoseCorrection
+    from fields.frames.tracked_frame import SparsePoints as SparsePoints
+    from fields.frames.tracked_frame import TrackedFrame as TrackedFrame
+    from fields.geometry.camera import PinholeCamera as PinholeCamera
+    from fields.geometry.se3 import torch_exp_se3 as torch_exp_se3
+    from fields.map.gaussians import GaussianField as GaussianField
+    from fields.map.occupancy import OccupancyVoxels as OccupancyVoxels
+    from fields.runtime.backend import initialise as initialise
+    from modp_ti.config.scene_file import load_scene as load_scene
+    from modp_ti.config.settings import SceneConfig as SceneConfig
+    from modp_ti.engine.mapper import Mapper as Mapper
+    from modp_ti.engine.session import run_scene as run_scene
+    from modp_ti.files.errors import InputError as InputError
+    from modp_ti.inputs.trackers import open_tracker as open_tracker
+    from modp_ti.outputs.formats.splats_ply import read_splats as read_splats
+    from modp_ti.outputs.formats.splats_ply import write_splats as write_splats
+    from pipelines.online import OnlineMapper as OnlineMapper
+    from pipelines.refinement import refine as refine
+    from pipelines.render.rasterize import RasterizedView as RasterizedView
+    from pipelines.render.rasterize import rasterize as rasterize
+    from pipelines.render.renderer import Renderer as Renderer
+    from pipelines.settings import MappingSettings as MappingSettings
+    from pipelines.settings import RefineSettings as RefineSettings
 
 _HOMES = {
     "GaussianField": "fields.map.gaussians",
@@ -76,36 +80,10 @@ _HOMES = {
     "torch_exp_se3": "fields.geometry.se3",
     "write_splats": "modp_ti.outputs.formats.splats_ply",
 }
-__all__ = [
-    "GaussianField",
-    "InputError",
-    "Mapper",
-    "MappingSettings",
-    "OccupancyVoxels",
-    "OnlineMapper",
-    "PinholeCamera",
-    "PoseCorrection",
-    "RasterizedView",
-    "RefineSettings",
-    "Renderer",
-    "SceneConfig",
-    "SparsePoints",
-    "TrackedFrame",
-    "__version__",
-    "initialise",
-    "load_scene",
-    "open_tracker",
-    "rasterize",
-    "read_splats",
-    "refine",
-    "run_scene",
-    "torch_exp_se3",
-    "write_splats",
-]
-
 
 # Hidden from type checkers, which would otherwise accept any attribute name of this module.
 if not TYPE_CHECKING:
+    __all__ = ["__version__", *_HOMES]
 
     def __getattr__(name: str) -> object:
         # Lazy, so that `modp-ti --help` does not wait for Taichi and the file readers to load.

@@ -264,7 +264,11 @@ class OptimiseSettings(StrictModel):
 
 
 class MappingSettings(StrictModel):
-    """The online loop."""
+    """The online loop.
+
+    Example:
+        mapper = modp_ti.Mapper(640, 480, modp_ti.MappingSettings(sh_degree=0))
+    """
 
     sh_degree: int = Field(default=1, ge=0, le=3, description="degree of the spherical harmonics of colour")
     max_gaussians: int = Field(
@@ -299,7 +303,11 @@ class MappingSettings(StrictModel):
 
 
 class RefineSettings(StrictModel):
-    """Post refinement of the finished map (Section 4.7)."""
+    """Post refinement of the finished map (Section 4.7).
+
+    Example:
+        mapper.refine(500, modp_ti.RefineSettings(views=2))
+    """
 
     steps: int = Field(default=1000, ge=0, description="steps over all keyframes after the last frame; 0 for none")
     views: int = Field(default=4, ge=1, description="views per step, drawn as the global views are")

@@ -25,6 +25,9 @@ class PoseCorrection:
     Raises:
         ValueError: If there is no pose, a value is not finite, the shapes disagree, or the indices are negative or not
             increasing.
+
+    Example:
+        mapper.correct(modp_ti.PoseCorrection(np.array([0, 5]), np.stack([np.eye(4), T_camera_world])))
     """
 
     index: NDArray[np.int64]

@@ -34,6 +34,9 @@ class SparsePoints:
 
     Raises:
         ValueError: If the shapes disagree or a value is not finite.
+
+    Example:
+        points = modp_ti.SparsePoints(np.array([[0.0, 0.0, 2.0]]), np.array([[320.0, 240.0]]), np.array([7]))
     """
 
     xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))

@@ -26,6 +26,9 @@ class PinholeCamera:
 
     Raises:
         ValueError: If the size or a focal length is not positive.
+
+    Example:
+        camera = modp_ti.PinholeCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
     """
 
     fx: float

@@ -130,7 +130,11 @@ def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
 
 
 def torch_exp_se3(xi: torch.Tensor) -> torch.Tensor:
-    """PyTorch version of `exp_se3`: differentiable, for tangents (..., 6)."""
+    """PyTorch version of `exp_se3`: differentiable, for tangents (..., 6).
+
+    Example:
+        T = modp_ti.torch_exp_se3(torch.zeros(6, requires_grad=True))  # the identity (4, 4)
+    """
     import torch  # here, because the readers of poses need this module and start without PyTorch
 
     zero = torch.zeros_like(xi[..., 0])

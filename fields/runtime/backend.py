@@ -50,6 +50,9 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
 
     Raises:
         RuntimeError: If "cuda" or "vulkan" was requested and does not start.
+
+    Example:
+        backend = modp_ti.initialise("auto", seed=1)
     """
     options = {"offline_cache": True, "log_level": ti.ERROR, "random_seed": seed, "default_fp": ti.f32}
     torch.set_num_threads(1)

@@ -6,19 +6,8 @@ from typing import Annotated
 
 import typer
 
-from modp_ti.commands.check import EXAMPLES as CHECK_EXAMPLES
-from modp_ti.commands.check import check
-from modp_ti.commands.export import EXAMPLES as EXPORT_EXAMPLES
-from modp_ti.commands.export import export
-from modp_ti.commands.render import EXAMPLES as RENDER_EXAMPLES
-from modp_ti.commands.render import render
-from modp_ti.commands.run import EXAMPLES as RUN_EXAMPLES
-from modp_ti.commands.run import run
+from modp_ti.commands import check, export, render, run, view, warmup
 from modp_ti.commands.shared import examples
-from modp_ti.commands.view import EXAMPLES as VIEW_EXAMPLES
-from modp_ti.commands.view import view
-from modp_ti.commands.warmup import EXAMPLES as WARMUP_EXAMPLES
-from modp_ti.commands.warmup import warmup
 from modp_ti.version import __version__
 
 __all__ = ["app"]
@@ -58,12 +47,12 @@ def _options(
     pass
 
 
-app.command("run", epilog=RUN_EXAMPLES)(run)
-app.command("check", epilog=CHECK_EXAMPLES)(check)
-app.command("render", epilog=RENDER_EXAMPLES)(render)
-app.command("export", epilog=EXPORT_EXAMPLES)(export)
-app.command("view", epilog=VIEW_EXAMPLES)(view)
-app.command("warmup", epilog=WARMUP_EXAMPLES)(warmup)
+app.command("run", epilog=run.EXAMPLES)(run.run)
+app.command("check", epilog=check.EXAMPLES)(check.check)
+app.command("render", epilog=render.EXAMPLES)(render.render)
+app.command("export", epilog=export.EXAMPLES)(export.export)
+app.command("view", epilog=view.EXAMPLES)(view.view)
+app.command("warmup", epilog=warmup.EXAMPLES)(warmup.warmup)
 
 
 if __name__ == "__main__":

@@ -53,15 +53,7 @@ def check(
 
 
 def inspect_scene(config: SceneConfig, console: Console) -> Report:
-    """Iterate over a scene's tracker once and judge its frames.
-
-    Args:
-        config: The scene.
-        console: Where progress is shown.
-
-    Raises:
-        InputError: If the input cannot be read at all.
-    """
+    """Iterate over a scene's tracker once and judge its frames. Raises InputError if the input cannot be read."""
     from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
     from modp_ti.inputs.inspection.pictures import judge_sequence
     from modp_ti.inputs.inspection.report import Report

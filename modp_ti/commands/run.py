@@ -8,14 +8,7 @@ from typing import Annotated
 
 import typer
 
-from modp_ti.commands.shared import (
-    AsJson,
-    Overrides,
-    Quiet,
-    examples,
-    outcome,
-    progress_console,
-)
+from modp_ti.commands.shared import AsJson, Overrides, Quiet, examples, outcome, progress_console
 from modp_ti.files.errors import InputError
 
 __all__ = ["EXAMPLES", "run"]
@@ -75,5 +68,4 @@ def _run(scene: Path | None, resume: Path | None, overrides: list[str], quiet: b
 
     from modp_ti.engine.session import run_scene
 
-    console = progress_console(quiet)
-    return run_scene(config, console) if snapshot is None else run_scene(config, console, snapshot)
+    return run_scene(config, progress_console(quiet), snapshot)

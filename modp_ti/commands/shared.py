@@ -27,6 +27,7 @@ __all__ = [
     "Overrides",
     "Quiet",
     "examples",
+    "matching_settings",
     "one_line",
     "outcome",
     "picture_size",
@@ -49,10 +50,23 @@ class Device(str, Enum):
     cuda = "cuda"
 
 
-def _settings(incomplete: str) -> list[tuple[str, str]]:
-    from modp_ti.commands.completion import matching_settings
+def matching_settings(incomplete: str) -> list[tuple[str, str]]:
+    """Complete `--set KEY=VALUE`: return completions with the meanings of their keys.
 
-    return matching_settings(incomplete)
+    Settings with a plain default are offered as `key=default`, others as `key=`. A key that several kinds of a section
+    have is offered once. A key that selects the kind is offered with each kind.
+    """
+    from modp_ti.config.keys import documented_keys
+    from modp_ti.config.settings import SceneConfig
+
+    found: dict[str, str] = {}
+    for entry in documented_keys(SceneConfig):
+        default = entry.variant if entry.selects else (entry.default or "").strip('"')
+        plain = default if re.fullmatch(r"[\w./:+-]*", default) else ""
+        offered = f"{entry.key}={plain}"
+        if (offered if entry.selects else entry.key).startswith(incomplete):
+            found.setdefault(offered, entry.description)
+    return list(found.items())
 
 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress and no notes; errors are said all the same")]
@@ -63,7 +77,7 @@ Overrides = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="sets a key of the scene file, for example --set source.scale=0.5; repeatable",
-        autocompletion=_settings,
+        autocompletion=matching_settings,
     ),
 ]
 
@@ -85,16 +99,10 @@ class Outcome:
 
 @contextmanager
 def outcome(as_json: bool) -> Iterator[Outcome]:
-    """Run a command's body, print its outcome, and exit with the codes of docs/commands.md.
+    """Run a command's body, which fills in the outcome; print it and exit with the codes of docs/commands.md.
 
-    An InputError is printed in one line, any other exception with its traceback.
-
-    Args:
-        as_json: Print the outcome as one JSON object. Everything else that is printed to standard output goes to
-            standard error.
-
-    Yields:
-        The outcome, which the body fills in.
+    An InputError is printed in one line, any other exception with its traceback. With `as_json`, the outcome is printed
+    as one JSON object, and everything else goes to standard error.
     """
     result = Outcome()
     try:

@@ -11,10 +11,7 @@ from modp_ti.commands.shared import Device, Quiet, examples, outcome, progress_c
 
 __all__ = ["EXAMPLES", "view"]
 
-EXAMPLES = examples(
-    "modp-ti view out/room",
-    "modp-ti view out/room --port 0 --max-splats 1000000",
-)
+EXAMPLES = examples("modp-ti view out/room", "modp-ti view out/room --port 0 --max-splats 1000000")
 
 
 def view(

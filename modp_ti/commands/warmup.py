@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["EXAMPLES", "compile_size", "warmup"]
 
-EXAMPLES = examples(
-    "modp-ti warmup scene.yaml",
-    "modp-ti warmup --size 640x480 --size 1280x720",
-)
+EXAMPLES = examples("modp-ti warmup scene.yaml", "modp-ti warmup --size 640x480 --size 1280x720")
 
 
 def warmup(
@@ -79,17 +76,10 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: b
 
 
 def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str, int, int]:
-    """Start Taichi and compile the kernels of a run.
+    """Start Taichi, compile the kernels of a run, and return the backend, the width and the height.
 
     Taichi finds a kernel in its cache only if the same fields were created before it, so everything is created in the
-    order of a run.
-
-    Args:
-        config: The scene.
-        size: (width, height) of the frames; None takes them from the tracker's first frame.
-
-    Returns:
-        The backend, the width and the height.
+    order of a run. Where `size` is None, the width and the height are those of the tracker's first frame.
 
     Raises:
         InputError: If the device or the input cannot be used, or a live tracker is given without a size.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 
 __all__ = [
     "KeyDoc",
@@ -22,6 +22,21 @@ __all__ = [
     "sections_of",
     "variants_of",
 ]
+
+TYPE_NAMES = {int: "integer", float: "number", str: "text", bool: "true or false", Path: "path", NoneType: "empty"}
+
+INTRODUCTION = """\
+# Settings
+
+This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`
+for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the
+nearest right one. Units are in square brackets. To override a key on the command line, use `--set`:
+
+```sh
+modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000
+```
+
+The tables are generated: `python -m modp_ti.config > docs/configuration.md`."""
 
 
 def as_yaml(value: Any) -> str:
@@ -51,7 +66,9 @@ class KeyDoc:
     selects: bool = False
 
 
-def documented_keys(model: type[BaseModel], prefix: str = "") -> Iterator[KeyDoc]:
+def documented_keys(
+    model: type[BaseModel], prefix: str = "", variant: str = "", kind_key: str = ""
+) -> Iterator[KeyDoc]:
     """Iterate over the settings of a model in the order of their definition.
 
     A section with several kinds lists the keys of one kind after the other.
@@ -59,44 +76,31 @@ def documented_keys(model: type[BaseModel], prefix: str = "") -> Iterator[KeyDoc
     Args:
         model: The settings model.
         prefix: Prefix of the dotted keys.
+        variant: The kind of the section that the model describes, if the section has several.
+        kind_key: The key of that section which selects the kind.
     """
-    return _keys(model, prefix, "", "")
-
-
-def _keys(model: type[BaseModel], prefix: str, variant: str, tells_kind: str) -> Iterator[KeyDoc]:
     for name, info in model.model_fields.items():
-        for tag, section in variants_of(info).items():
-            yield from _keys(section, f"{prefix}{name}.", tag, str(info.discriminator))
-        sections = sections_of(info.annotation)
-        if info.discriminator is None:
-            for section in sections:
-                yield from _keys(section, f"{prefix}{name}.", variant, "")
+        kinds = variants_of(info)
+        selecting = str(info.discriminator) if kinds else ""
+        sections = list(kinds.items()) or [(variant, section) for section in sections_of(info.annotation)]
+        for tag, section in sections:
+            yield from documented_keys(section, f"{prefix}{name}.", tag, selecting)
         if not sections:
-            yield _documented(prefix + name, info, variant, name == tells_kind)
+            selects, default = name == kind_key, None
+            if not selects and not info.is_required():
+                value = info.get_default(call_default_factory=True, validated_data={})
+                default = "" if value is None else as_yaml(value)
+            description = info.description or ""
+            yield KeyDoc(prefix + name, _type_name(info.annotation), default, description, variant, selects)
 
 
 def documented_values(settings: BaseModel) -> Iterator[tuple[KeyDoc, Any]]:
     """Iterate over the documentation and value of each setting, in the order of their definition."""
-    return _values(settings, "", "", "")
-
-
-def _values(section: BaseModel, prefix: str, variant: str, tells_kind: str) -> Iterator[tuple[KeyDoc, Any]]:
-    for name, value in section:
-        info = type(section).model_fields[name]
-        if not isinstance(value, BaseModel):
-            yield _documented(prefix + name, info, variant, name == tells_kind), value
-            continue
-        tag = next((tag for tag, section in variants_of(info).items() if section is type(value)), variant)
-        told_by = info.discriminator if isinstance(info.discriminator, str) else ""
-        yield from _values(value, f"{prefix}{name}.", tag, told_by)
-
-
-def _documented(key: str, info: FieldInfo, variant: str, selects: bool) -> KeyDoc:
-    default = None
-    if not selects and (info.default_factory is not None or info.default is not PydanticUndefined):
-        value = info.get_default(call_default_factory=True, validated_data={})
-        default = "" if value is None else as_yaml(value)
-    return KeyDoc(key, _type_name(info.annotation), default, info.description or "", variant, selects)
+    entries = list(documented_keys(type(settings)))
+    kinds = {entry.variant for entry in entries if entry.selects and attrgetter(entry.key)(settings) == entry.variant}
+    for entry in entries:
+        if entry.variant in kinds | {""}:
+            yield entry, attrgetter(entry.key)(settings)
 
 
 def variants_of(info: FieldInfo) -> dict[str, type[BaseModel]]:
@@ -121,16 +125,8 @@ def sections_of(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _type_name(annotation: Any) -> str:
-    names = {
-        int: "integer",
-        float: "number",
-        str: "text",
-        bool: "true or false",
-        Path: "path",
-        NoneType: "empty",
-    }
-    if annotation in names:
-        return names[annotation]
+    if annotation in TYPE_NAMES:
+        return TYPE_NAMES[annotation]
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return " or ".join(f"`{argument}`" for argument in arguments)
@@ -146,19 +142,7 @@ def markdown_of_keys(model: type[BaseModel]) -> str:
     sections: dict[str, dict[str, list[KeyDoc]]] = {}
     for entry in documented_keys(model):
         sections.setdefault(entry.key.rpartition(".")[0], {}).setdefault(entry.variant, []).append(entry)
-    text = [
-        "# Settings",
-        "",
-        "This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`",
-        "for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the",
-        "nearest right one. Units are in square brackets. To override a key on the command line, use `--set`:",
-        "",
-        "```sh",
-        "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
-        "```",
-        "",
-        "The tables are generated: `python -m modp_ti.config > docs/configuration.md`.",
-    ]
+    text = [INTRODUCTION]
     for section, variants in sections.items():
         text += ["", f"## {f'`{section}`' if section else 'Top level'}", ""]
         if "" in variants:
@@ -167,9 +151,8 @@ def markdown_of_keys(model: type[BaseModel]) -> str:
         selecting = [entry for entries in variants.values() for entry in entries if entry.selects]
         key = selecting[0].key
         text += [f"Its keys depend on `{key}`, which is required:", "", f"| `{key}` | meaning |", "|---|---|"]
-        text += [
-            f"| [`{entry.variant}`](#{section}-of-kind-{entry.variant}) | {entry.description} |" for entry in selecting
-        ]
+        for entry in selecting:
+            text.append(f"| [`{entry.variant}`](#{section}-of-kind-{entry.variant}) | {entry.description} |")
         for variant, entries in variants.items():
             text += ["", f"### `{section}` of kind `{variant}`", "", *_table(entries)]
     return "\n".join(text) + "\n"

@@ -37,22 +37,17 @@ FLAT_TRACKER: Mapping[str, Any] = {
     "correction": False,
 }
 
-REMOVED_KINDS: Mapping[str, str] = {
-    "synthetic": "the procedural room was replaced by demo/room.mp4; map demo/scene.yaml",
-}
-"""What to do instead of a tracker that this version no longer has, by kind."""
+# What to do instead of a tracker that this version no longer has, by kind.
+REMOVED_KINDS = {"synthetic": "the procedural room was replaced by demo/room.mp4; map demo/scene.yaml"}
 
 
 def refuse_removed_kind(settings: Mapping[str, Any], where: Mapping[str, str], name: str) -> None:
-    """Raise an error for a tracker of an older version.
+    """Raise InputError if this version no longer has the scene's `tracker.kind`.
 
     Args:
         settings: The settings of a scene as plain data.
         where: File and line, or the override, that set each dotted key.
         name: Place to name for keys that are not in `where`.
-
-    Raises:
-        InputError: If this version no longer has the scene's `tracker.kind`.
     """
     tracker = settings.get("tracker")
     if isinstance(tracker, Mapping) and (instead := REMOVED_KINDS.get(str(tracker.get("kind")))):
@@ -61,21 +56,14 @@ def refuse_removed_kind(settings: Mapping[str, Any], where: Mapping[str, str], n
 
 
 def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Drop tracker keys of other kinds that are empty or have their old default.
+    """Return a copy of a scene's settings without tracker keys of other kinds that are empty or have the old default.
 
     If the tracker's kind is missing or unknown, all keys are kept.
-
-    Args:
-        settings: The settings of a scene as plain data.
-
-    Returns:
-        A copy of the settings without these keys.
     """
     tracker = settings.get("tracker")
-    if not isinstance(tracker, Mapping):
-        return dict(settings)
-    model = variants_of(SceneConfig.model_fields["tracker"]).get(str(tracker.get("kind")))
-    if model is None:
+    kind = tracker.get("kind") if isinstance(tracker, Mapping) else None
+    model = variants_of(SceneConfig.model_fields["tracker"]).get(str(kind))
+    if model is None or not isinstance(tracker, Mapping):
         return dict(settings)
 
     def says_something(key: str, value: Any) -> bool:

@@ -71,17 +71,9 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
 
 
 def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = ()) -> SceneConfig:
-    """Build the settings from the plain data that a run has stored.
+    """Build the settings from the plain data that a run has stored in the file `name`.
 
-    Relative paths are resolved against the working directory.
-
-    Args:
-        data: The settings as plain data.
-        name: The file that they come from, for error messages.
-        overrides: As for `load_scene`.
-
-    Raises:
-        InputError: As for `load_scene`, and if this version does not have one of the settings.
+    Overrides and errors are as for `load_scene`. Relative paths are resolved against the working directory.
     """
     data = json.loads(json.dumps(data))
     return _with_absolute_paths(_resolved(data, {}, name, overrides), Path.cwd())
@@ -248,15 +240,10 @@ def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any
         return value[0] in "tT"
     if _INT.fullmatch(value) and len(value) <= MAX_DIGITS:
         return int(value)
-    number = None
-    if _FLOAT.fullmatch(value):
-        number = float(value)
-    elif value.lstrip("+-").lower() in (".inf", ".nan"):
-        number = math.inf
-    if number is not None:
-        if not math.isfinite(number):
-            raise InputError(f"{name}:{line}: {place or 'the value'}: must be a finite number, not {value}")
-        return number
+    if _FLOAT.fullmatch(value) and math.isfinite(float(value)):
+        return float(value)
+    if _FLOAT.fullmatch(value) or value.lstrip("+-").lower() in (".inf", ".nan"):
+        raise InputError(f"{name}:{line}: {place or 'the value'}: must be a finite number, not {value}")
     return value
 
 

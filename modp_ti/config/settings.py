@@ -102,8 +102,7 @@ class SourceSettings(StrictModel):
         "tracker `socket`",
     )
     stream: int | str | None = Field(
-        default=None,
-        description="instead of `path`: number of a camera or URL of a stream, for live frames",
+        default=None, description="instead of `path`: number of a camera or URL of a stream, for live frames"
     )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()

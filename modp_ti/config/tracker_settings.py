@@ -120,8 +120,7 @@ class TransformsSettings(RecordedSettings):
         default="transforms", description="a transforms.json of instant-ngp or nerfstudio"
     )
     path: Path | None = Field(
-        default=None,
-        description="the file or its folder; empty: `transforms.json` next to the images' folder or in it",
+        default=None, description="the file or its folder; empty: `transforms.json` next to the images' folder or in it"
     )
 
 
@@ -164,8 +163,7 @@ class StellaVslamSettings(TimedPosesSettings):
         default="stella_vslam", description="a map of stella_vslam and its trajectory of all frames"
     )
     path: Path | None = Field(
-        default=None,
-        description="the map or its folder; empty: `map.msg` next to the images' folder or in it",
+        default=None, description="the map or its folder; empty: `map.msg` next to the images' folder or in it"
     )
 
 

@@ -25,5 +25,9 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
 
     Raises:
         InputError: If the input is invalid.
+
+    Example:
+        for frame in modp_ti.open_tracker(modp_ti.load_scene("scene.yaml")):
+            print(frame.name, len(frame.points))
     """
     return OPENERS[type(config.tracker)](config.tracker, Opening(config.source, config.seed, progress))

@@ -39,6 +39,9 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
 
     Raises:
         OSError: If the file cannot be written.
+
+    Example:
+        modp_ti.write_splats("splats.ply", mapper.pipeline.gaussians.to_numpy())
     """
     n, sh_count, _ = state["sh"].shape
     table = np.concatenate(
@@ -71,6 +74,9 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
 
     Raises:
         InputError: If the file is not a 3DGS PLY file, is truncated or lacks a property. The message has one line.
+
+    Example:
+        centres = modp_ti.read_splats("out/room/splats.ply")["position"]  # (N, 3)
     """
     file = Path(path)
     try:

@@ -29,7 +29,7 @@ def session(monkeypatch):
     """Stands in for the mapping session: opens the tracker and keeps its configurations."""
     configs = []
 
-    def run_scene(config, console):
+    def run_scene(config, console, resumed=None):
         from modp_ti.inputs.trackers import open_tracker
 
         configs.append(config)
@@ -132,7 +132,7 @@ def test_message_of_several_lines_is_put_on_one(scene, monkeypatch):
 
     module = types.ModuleType("modp_ti.engine.session")
 
-    def run_scene(config, console):
+    def run_scene(config, console, resumed=None):
         raise InputError("first\n  second")
 
     module.run_scene = run_scene
@@ -205,7 +205,7 @@ def test_errors_are_said_to_people_and_to_programs_whatever_else_is_not(tmp_path
 def failing_with(error: BaseException, monkeypatch) -> None:
     module = types.ModuleType("modp_ti.engine.session")
 
-    def run_scene(config, console):
+    def run_scene(config, console, resumed=None):
         raise error
 
     module.run_scene = run_scene
@@ -229,7 +229,7 @@ def test_an_interrupted_command_says_so_and_ends_with_130(scene, monkeypatch):
 def test_ctrl_c_ends_a_real_process_with_130_and_leaves_nothing(scene):
     code = (
         "import os, sys, types, time; sys.argv[0] = 'modp-ti'; module = types.ModuleType('modp_ti.engine.session')\n"
-        "def run_scene(config, console):\n"
+        "def run_scene(config, console, resumed=None):\n"
         "    config.output.with_name('out.partial').mkdir()\n"
         "    try: os.write(1, b'begun\\n'); time.sleep(60)\n"
         "    finally: config.output.with_name('out.partial').rmdir()\n"
@@ -337,7 +337,7 @@ def test_the_shell_is_offered_commands_options_and_values_without_waiting(line, 
 
 
 def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):
-    from modp_ti.commands.completion import matching_settings
+    from modp_ti.commands.shared import matching_settings
     from modp_ti.config.keys import documented_keys
     from modp_ti.config.scene_file import load_scene
     from modp_ti.config.settings import SceneConfig
