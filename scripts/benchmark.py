@@ -2,8 +2,7 @@
 
 The tables contain: the time of a step by stage and by pixel-Gaussian pair; its share of the machine's float32
 throughput and memory bandwidth; how it grows; the cost of the voxels; and the frames per second of whole runs. Every
-measurement runs in its own process. Figures are medians after a warm-up. If gsplat and a GPU are available, gsplat
-renders the same scenes.
+measurement runs in its own process. Figures are medians after a warm-up.
 """
 
 from __future__ import annotations
@@ -13,13 +12,14 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.report import report
-from benchmarks.whole_runs import measure_runs, planned_runs
 from ending import documented_ending
-from experiments import command_line, parser, write_report
+from experiments import Job, command_line, execute, named_scenes, parser, write_report
 
 from modp_ti.files.errors import InputError
 
@@ -59,7 +59,7 @@ def collect(arguments: argparse.Namespace) -> dict[str, Any]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = [cores] if device == "cuda" else sorted({1, cores})
     on = {"device": device, "threads": cores}
-    figures: dict[str, Any] = {"device": device, "cores": cores, "steps": [], "gsplat": []}
+    figures: dict[str, Any] = {"device": device, "cores": cores, "steps": []}
     figures["machine"] = {str(n): in_process("machine", device=device, threads=n) for n in threads}
     for size in SIZES[:1] if arguments.quick else SIZES:
         row: dict[str, Any] = {"size": size, "threads": {}}
@@ -67,7 +67,6 @@ def collect(arguments: argparse.Namespace) -> dict[str, Any]:
             twin = size == SIZES[0] and n == 1
             row["threads"][str(n)] = in_process("step", device=device, threads=n, size=size, repeats=repeats, twin=twin)
         figures["steps"].append(row)
-        figures["gsplat"].append(in_process("gsplat", size=size, repeats=repeats))
     if arguments.quick:
         return figures
     figures["growth"] = in_process("growth", **on, repeats=repeats)
@@ -90,14 +89,11 @@ def in_process(kind: str, **arguments: Any) -> Any:
 
 def measure(kind: str, **arguments: Any) -> Any:
     """Run one measurement in this process."""
-    from benchmarks import growth, gsplat_renderer, machine, step, voxels
+    from benchmarks import growth, machine, step, voxels
     from benchmarks.scene import Size
 
     if "size" in arguments:
         arguments["size"] = Size(*arguments["size"])
-    if kind == "gsplat":
-        missing = gsplat_renderer.why_no_gsplat()
-        return {"missing": missing} if missing else gsplat_renderer.measure_gsplat(**arguments)
     if kind == "voxels":
         return {level: voxels.measure_voxels(**arguments, level=level) for level in voxels.LEVELS}
     kinds = {
@@ -107,6 +103,39 @@ def measure(kind: str, **arguments: Any) -> Any:
         "frames": growth.measure_frames,
     }
     return kinds[kind](**arguments)
+
+
+def planned_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str], folder: Path) -> list[Job]:
+    """Return a job for every scene file, without refinement, with output folders named after the scenes.
+
+    Args:
+        scenes: Scene files.
+        device: "cpu" or "cuda".
+        settings: Overrides by key.
+        folder: Parent of the output folders.
+
+    Raises:
+        InputError: If a scene cannot be run.
+    """
+    overrides = {"refine.steps": "0", "device": device, **settings}
+    jobs = [
+        Job(f"whole run of {name}", scene, folder / name, overrides) for name, scene in named_scenes(scenes).items()
+    ]
+    for job in jobs:
+        job.check()
+    return jobs
+
+
+def measure_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Run the scenes and return their figures of metrics.json by the scene's name. Raises InputError if a run fails."""
+    with tempfile.TemporaryDirectory() as folder:
+        jobs = planned_runs(scenes, device, settings, Path(folder))
+        results = execute(jobs)
+    kept = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "seconds", "breakdown_percent")
+    return {
+        job.folder.name: {key: metrics[key] for key in kept} | {"psnr": metrics["online"]["held_out"]["psnr"]}
+        for job, metrics in zip(jobs, results, strict=True)
+    }
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
-from browser import choose_mode, missing, open_page
 from ending import documented_ending
+from screenshot import choose_mode, missing, open_page
 
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import load_scene

@@ -16,8 +16,8 @@ __all__ = ["report"]
 def report(figures: Mapping[str, Any]) -> str:
     """Return the tables of all figures (see `collect` in benchmark.py)."""
     parts = [f"# Benchmark: {figures['device']}, {figures['cores']} cores", *_machine(figures["machine"])]
-    for row, other in zip(figures["steps"], figures["gsplat"], strict=True):
-        parts += _step(row, figures["machine"]) + _gsplat(row, other)
+    for row in figures["steps"]:
+        parts += _step(row, figures["machine"])
     if "growth" in figures:
         parts += _growth(figures["growth"], figures["frames"])
     if "voxels" in figures:
@@ -100,20 +100,6 @@ def _step(row: Mapping[str, Any], machine: Mapping[str, Figures]) -> list[str]:
         f"and channel of the loss; bytes: {ADAM_BYTES} a Gaussian of Adam, more than 100 % where the caches hold them."
     )
     return [*lines, "", markdown_table("share of the machine", columns, shares), "", about]
-
-
-def _gsplat(row: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    if "missing" in other:
-        return ["", f"Not compared: {other['missing']}."]
-    of = row["threads"][max(row["threads"], key=int)]
-    forward = sum(of[stage] for stage in ("projection", "binning", "compositing"))
-    backward = sum(of[stage] for stage in ("compositing backward", "projection backward"))
-    rows = {
-        name: {"here": here, "gsplat": other[name], "ratio": other[name] / here}
-        for name, here in (("forward", forward), ("forward and backward", forward + backward))
-    }
-    columns = {"here [ms]": ("here", ".2f"), "gsplat [ms]": ("gsplat", ".2f"), "times faster": ("ratio", ".2f")}
-    return ["", markdown_table("the same scene", columns, rows)]
 
 
 def _growth(growth: Mapping[str, Sequence[Figures]], frames: Sequence[Figures]) -> list[str]:

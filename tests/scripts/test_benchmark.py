@@ -72,8 +72,6 @@ def made_up(kind: str, **arguments: object) -> object:
     threads = arguments.get("threads", 1)
     if kind == "machine":
         return {"gflops": 100.0 * threads, "gigabytes_per_second": 20.0}
-    if kind == "gsplat":
-        return {"missing": "gsplat is not installed"}
     if kind == "growth":
         cases = {"pixels": PIXELS, "visible": VISIBLE, "hidden": HIDDEN}
         return {
@@ -118,7 +116,6 @@ def test_the_tables_say_what_was_measured(monkeypatch, two_cores, tmp_path: Path
     assert f"| compositing backward, 2 threads | {two:.1f} | {two / 2:.0f} | – | – |" in text
     rate = ADAM_BYTES * 1000 / 4e-3 / 1e9
     assert f"| Adam, 1 thread | – | – | {rate:.1f} | {5 * rate:.0f} |" in text
-    assert "Not compared: gsplat is not installed." in text
     assert "Growth" not in text
     figures = json.loads((tmp_path / "benchmark.json").read_text())
     assert figures["machine"]["2"]["gflops"] == 200.0

@@ -10,16 +10,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import browser
 import cv2
 import numpy as np
 import pytest
+import screenshot
 
 if TYPE_CHECKING:
     from tests.room import Room
 
-if browser.missing():
-    pytest.skip(browser.missing(), allow_module_level=True)
+if screenshot.missing():
+    pytest.skip(screenshot.missing(), allow_module_level=True)
 
 SCENE = """
 source:  {path: images, fps: 10}
@@ -85,7 +85,7 @@ def colourful(page) -> float:
 
 def test_the_page_shows_the_map_and_its_buttons_hold_the_run(run: tuple[subprocess.Popen, str]):
     process, url = run
-    with browser.open_page(url) as page:
+    with screenshot.open_page(url) as page:
         wait_until(page, lambda: frame_number(page) == 1)
         for number in (2, 3, 4):
             page.get_by_role("button", name="Step").click()
@@ -95,7 +95,7 @@ def test_the_page_shows_the_map_and_its_buttons_hold_the_run(run: tuple[subproce
         # Our renderer's opacity: grey, from where the browser looks.
         for box in ("Keyframes", "Current frame", "Tracked points"):
             page.get_by_role("checkbox", name=box).click()
-        browser.choose_mode(page, "opacity")
+        screenshot.choose_mode(page, "opacity")
         wait_until(page, lambda: drawn(page) > 0.01 and colourful(page) < 0.001)
 
         page.get_by_role("button", name="Resume").click()
