@@ -18,6 +18,7 @@ from tests.fault_injection.kills import KILLS_SCENE, Kills, kills_table
 from tests.fault_injection.runs import finished, run_until
 from tests.fault_injection.soak import Soak, soak_table
 from tests.fault_injection.stream import FAULTS, HOLDOUT, Stream, disturb, stream_table, write_recording
+from tests.patience import PATIENCE
 
 FRAMES = 60
 ROOT = Path(__file__).resolve().parents[2]
@@ -103,7 +104,7 @@ def test_the_tables_say_what_came_of_it() -> None:
 
 def test_an_unknown_part_gets_one_line_and_code_two(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.fault_injection.faults", "thunder", "-o", str(tmp_path / "out")]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert result.returncode == 2
     assert "thunder is none of kills, stream, soak" in result.stderr
     assert not (tmp_path / "out").exists()

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.patience import PATIENCE
+
 FILES = [
     "colmap",
     "config.yaml",
@@ -34,7 +36,7 @@ def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """A run on a machine whose torch has no weights in its cache."""
     command = [sys.executable, "-m", "modp_ti.run", str(scene), *arguments]
     environment = {**os.environ, "TORCH_HOME": str(scene.parent / "no-torch")}
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, env=environment)
 
 
 def finished_run(folder: Path, scene: str, said: str) -> Path:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE
+
 pytestmark = pytest.mark.slow
 PROJECT = Path(__file__).resolve().parents[2]
 # The wall of test_mapping.py: every stage, with a correction, pruning, pose refinement and post refinement.
@@ -47,7 +49,7 @@ def start(threads: int) -> subprocess.Popen[str]:
 
 def test_a_map_is_the_same_byte_for_byte_on_one_thread_and_on_three() -> None:
     runs = [start(1), start(3)]
-    count, digest = runs[0].communicate(timeout=200)[0].split()[-2:]
-    assert runs[1].communicate(timeout=200)[0].split()[-2:] == [count, digest]
+    count, digest = runs[0].communicate(timeout=PATIENCE)[0].split()[-2:]
+    assert runs[1].communicate(timeout=PATIENCE)[0].split()[-2:] == [count, digest]
     assert [run.returncode for run in runs] == [0, 0]
     assert int(count) > 300

@@ -11,6 +11,7 @@ import pytest
 from fields.map.keyframes import KeyframeStore
 from pipelines.offline import OfflineMapper, Schedule, scene_extent
 from pipelines.settings import OfflineSettings
+from tests.patience import PATIENCE
 from tests.pipelines.test_determinism import PROJECT
 from tests.pipelines.test_online import CAMERA, frame
 
@@ -149,7 +150,7 @@ print(len(m.gaussians), digest.hexdigest())
 def test_a_map_is_the_same_byte_for_byte_on_one_thread_and_on_three() -> None:
     command = [sys.executable, "-c", CODE]
     runs = [
-        subprocess.run([*command, str(n)], cwd=PROJECT, capture_output=True, text=True, timeout=200, check=True)
+        subprocess.run([*command, str(n)], cwd=PROJECT, capture_output=True, text=True, timeout=PATIENCE, check=True)
         for n in (1, 3)
     ]
     assert runs[0].stdout == runs[1].stdout

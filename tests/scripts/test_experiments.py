@@ -10,6 +10,7 @@ import pytest
 from experiments import Job, execute
 
 from modp_ti.files.errors import InputError
+from tests.patience import PATIENCE
 
 
 def jobs_of(scene: Path, folder: Path, **overrides: str) -> list[Job]:
@@ -114,7 +115,7 @@ def test_the_scripts_explain_themselves_and_end_with_one_line_for_bad_input(scri
 
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(file), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
     assert "--fresh" in call("--help").stdout
     result = call(str(tmp_path / "none.yaml"), "-o", str(tmp_path / "out"))

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE
+
 pytestmark = pytest.mark.slow
 
 PROJECT = Path(__file__).resolve().parents[3]
@@ -23,7 +25,7 @@ def has_cuda_driver() -> bool:
 def python(code: str) -> subprocess.CompletedProcess[str]:
     """In a process of its own: starting Taichi takes the fields of every other test away."""
     return subprocess.run(
-        [sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, timeout=PATIENCE, check=False
     )
 
 

@@ -20,6 +20,7 @@ import modp_ti
 from modp_ti.commands import app as cli
 from modp_ti.commands import run as run_module
 from modp_ti.commands import shared as command_line
+from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
 
@@ -244,7 +245,7 @@ def test_ctrl_c_ends_a_real_process_with_130_and_leaves_nothing(scene):
     )
     assert process.stderr.readline() == "begun\n"  # what a library writes past Python goes there as well
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     assert json.loads(out) == {"exit_code": 130, "error": "interrupted"}
     assert err == "error: interrupted\n"

@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from modp_ti.commands import app as cli
+from tests.patience import PATIENCE
 
 SCENE = """
 source: {path: images}
@@ -51,7 +52,7 @@ def test_a_run_after_the_warm_up_compiles_nothing(plane_scene, tmp_path) -> None
 
     def kernels_after(*arguments: str) -> tuple[set[str], str]:
         command = [sys.executable, "-m", *arguments]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
         assert done.returncode == 0, done.stderr
         return {file.name for file in cache.iterdir() if file.suffix == ".tic"}, done.stdout
 

@@ -21,6 +21,7 @@ from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
 from tests.modp_ti.runs import finished_run
+from tests.patience import PATIENCE
 from tests.room import Room, RoomRecording, pinhole
 from tests.simulated_tracker import drifting, loop, noisy_poses, tracked
 
@@ -94,7 +95,7 @@ refine:  {steps: 2}
 
 def send(events: list[TrackedFrame | PoseCorrection], address: Path) -> None:
     """Send frames and corrections to the run that listens at the address."""
-    sender = Sender(str(address), wait=300)
+    sender = Sender(str(address), wait=PATIENCE)
     c = next(event for event in events if isinstance(event, TrackedFrame)).camera
     sender.hello(c.width, c.height, (c.fx, c.fy, c.cx, c.cy), RGBA8)
     for event in events:

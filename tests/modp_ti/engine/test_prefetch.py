@@ -15,6 +15,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.files.errors import InputError
+from tests.patience import PATIENCE
 
 CAMERA = PinholeCamera(300.0, 300.0, 120.0, 100.0, 240, 200)
 
@@ -51,14 +52,14 @@ def test_the_frames_come_in_their_order_and_end(ahead: int) -> None:
 def test_frames_and_their_pyramids_are_ready_before_they_are_asked_for_but_no_more_than_wanted() -> None:
     source = Source(50, waits_for=3)
     with FramesAhead(source, 3) as frames:
-        assert source.reached.wait(timeout=30)
+        assert source.reached.wait(timeout=PATIENCE)
         assert not source.read[3:]
         source.waits_for = 4
         source.reached.clear()
         first = next(frames)
         assert "pyramid" in vars(first)
         assert [level.rgba.shape for level in first.pyramid] == [(200, 240, 4), (100, 120, 4), (50, 60, 4), (25, 30, 4)]
-        assert source.reached.wait(timeout=30)
+        assert source.reached.wait(timeout=PATIENCE)
         assert len(source.read) == 4
 
 
@@ -130,6 +131,6 @@ def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scen
         "mapping: {optimise: {steps: 2, last_steps: 3}, densify: {pixels: 400}}\nrefine: {steps: 2}\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", RUNS, str(scene)], capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, "-c", RUNS, str(scene)], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert done.returncode == 0, done.stderr

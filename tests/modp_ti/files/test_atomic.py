@@ -15,6 +15,7 @@ from modp_ti.files import atomic
 from modp_ti.files.atomic import replace_file, replace_text, replacing, write_picture
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.map_folder import appearing
+from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
 
@@ -52,7 +53,12 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
         "try:\n    replace_file(sys.argv[1], bytes(5000))\nexcept OSError as error:\n    print(error.errno)\n"
     )
     result = subprocess.run(
-        [sys.executable, "-c", code, str(target)], cwd=PROJECT, capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code, str(target)],
+        cwd=PROJECT,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=True,
     )
     assert int(result.stdout) == errno.EFBIG
     assert target.read_bytes() == b"first"

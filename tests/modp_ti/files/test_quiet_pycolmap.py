@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE
+
 pytestmark = pytest.mark.slow
 
 TERMINATED = """
@@ -51,7 +53,7 @@ def run(code: str, folder: Path, **environment: str) -> subprocess.CompletedProc
     """The code in a process of its own, whose folder for temporary files is `folder`."""
     inherited = {key: value for key, value in os.environ.items() if not key.startswith("GLOG_")}
     variables = {**inherited, "TMPDIR": str(folder), **environment}
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables, timeout=120)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables, timeout=PATIENCE)
 
 
 @pytest.mark.parametrize("load", [IN_MAIN, IN_THREAD], ids=["in the main thread", "in another"])

@@ -20,6 +20,7 @@ from modp_ti.engine.snapshots import load_resumed
 from modp_ti.engine.snapshots.file import FILE, read_arrays, write_arrays
 from modp_ti.files.errors import InputError
 from tests.modp_ti.runs import finished_run
+from tests.patience import PATIENCE
 
 if TYPE_CHECKING:
     from tests.room import Room
@@ -96,7 +97,7 @@ def stop_midway(
         while process.poll() is None and not reached():
             time.sleep(0.002)
         process.send_signal(by)
-        said, errors = process.communicate(timeout=300)
+        said, errors = process.communicate(timeout=PATIENCE)
         assert process.returncode in (0, 130, -by), errors
         if process.returncode != 0 and 0 <= position(out / FILE)[0] <= most:
             return said, errors
@@ -117,7 +118,7 @@ def assert_the_same(out: Path, peace: Path) -> None:
 
 def assert_resumed_ends_the_same(out: Path, peace: Path) -> None:
     process = start("--resume", str(out))
-    _, errors = process.communicate(timeout=300)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     assert_the_same(out, peace)
 

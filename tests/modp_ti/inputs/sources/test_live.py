@@ -23,10 +23,9 @@ from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.sources.live import WAITING, LiveSource
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
-
-PATIENCE = 30.0  # seconds until a test gives up
 
 
 @pytest.fixture(autouse=True)

@@ -14,6 +14,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.inputs.tracker_server import TrackerServer, open_tracker_server
+from tests.patience import PATIENCE
 
 HELLO, FRAME, POSE, CORRECTION, END = 1, 2, 3, 4, 5
 WELCOME, DONE, ERROR = 64, 65, 66
@@ -31,7 +32,7 @@ def opened(path: Path, patience: float = 20.0, **source: object) -> Iterator[Tra
 
 def connect(path: Path) -> socket.socket:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    connection.settimeout(20.0)
+    connection.settimeout(PATIENCE)
     connection.connect(str(path))
     return connection
 

@@ -20,7 +20,7 @@ def frame(number: int, state: int = 1, x: float = 0.0) -> bytes:
 
 def connected() -> socket.socket:
     server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    server.settimeout(60.0)
+    server.settimeout(1200.0)
     server.connect(sys.argv[1])
     return server
 

@@ -14,6 +14,7 @@ import pytest
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.inputs.tracker_server import open_tracker_server
+from tests.patience import PATIENCE
 
 PAGE = (Path(__file__).parents[4] / "docs" / "tracker_server.md").read_text()
 
@@ -22,7 +23,7 @@ def received(command: list[str]) -> list:
     tracker = open_tracker_server(SourceSettings(prefetch=16), SocketSettings(address="127.0.0.1:0"))
     try:
         port = tracker.address.rpartition(":")[2]
-        sender = subprocess.run([*command, port], capture_output=True, text=True, timeout=60, check=False)
+        sender = subprocess.run([*command, port], capture_output=True, text=True, timeout=PATIENCE, check=False)
         assert (sender.returncode, sender.stdout, sender.stderr) == (0, "10 frames taken\n", "")
         return list(tracker)
     finally:
@@ -52,7 +53,7 @@ def test_the_c_sender(tmp_path: Path) -> None:
     (tmp_path / "tracker.cpp").write_text(code)
     program = str(tmp_path / "tracker")
     build = [compiler, "-std=c++17", "-Wall", "-Wextra", "-Werror", str(tmp_path / "tracker.cpp"), "-o", program]
-    subprocess.run(build, check=True, timeout=120)
+    subprocess.run(build, check=True, timeout=PATIENCE)
     frames = received([program])
     assert [int(f.rgba[3, 3, 0]) for f in frames] == [20 * i for i in range(10)]
     for i, frame in enumerate(frames):

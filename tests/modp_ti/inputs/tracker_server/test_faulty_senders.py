@@ -37,6 +37,7 @@ from tests.modp_ti.inputs.tracker_server.clients import (
     point,
     pose,
 )
+from tests.patience import PATIENCE
 
 NAN = np.full((4, 4), np.nan)
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
@@ -232,7 +233,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 def test_a_sender_that_dies_in_mid_message_leaves_what_it_had_sent(tmp_path: Path) -> None:
     root = str(Path(__file__).parents[4])
     with opened(tmp_path / "s") as tracker:
-        died = subprocess.run([sys.executable, "-c", DYING, str(tmp_path / "s"), root], timeout=60, check=False)
+        died = subprocess.run([sys.executable, "-c", DYING, str(tmp_path / "s"), root], timeout=PATIENCE, check=False)
         assert died.returncode == -signal.SIGKILL
         assert colours(list(tracker)) == [1]
         early, without = tracker.notes[-2:]

@@ -26,6 +26,7 @@ from tests.modp_ti.inputs.tracker_server.clients import (
     message,
     opened,
 )
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +54,7 @@ def served(tracker, path: Path) -> list[int]:
 
 def test_bad_starts_are_counted_in_one_note_and_the_next_tracker_is_served(tmp_path: Path) -> None:
     with opened(tmp_path / "s", prefetch=8) as tracker:
-        assert peer(tmp_path / "s", "bad starts").wait(timeout=120) == 0
+        assert peer(tmp_path / "s", "bad starts").wait(timeout=PATIENCE) == 0
         assert served(tracker, tmp_path / "s") == [1, 2]
         dropped = [note for note in tracker.notes if "dropped" in note]
     assert len(dropped) == 1
@@ -66,7 +67,7 @@ def test_who_says_nothing_keeps_nobody_out(tmp_path: Path) -> None:
         silent = peer(tmp_path / "s", "silent")
         assert silent.stdout.readline() == "waiting\n"
         assert served(tracker, tmp_path / "s") == [1, 2]
-        silent.communicate("", timeout=60)
+        silent.communicate("", timeout=PATIENCE)
 
 
 def test_whoever_is_silent_for_too_long_is_sent_away(tmp_path: Path) -> None:
@@ -79,7 +80,7 @@ def test_whoever_is_silent_for_too_long_is_sent_away(tmp_path: Path) -> None:
 def test_a_message_that_trickles_in_has_a_deadline_as_a_whole(tmp_path: Path) -> None:
     with opened(tmp_path / "s", patience=1.0) as tracker:
         trickling = peer(tmp_path / "s", "trickle")
-        assert trickling.wait(timeout=120) == 0
+        assert trickling.wait(timeout=PATIENCE) == 0
         assert served(tracker, tmp_path / "s") == [1, 2]
     assert any("was silent for 1 s in mid-message" in note for note in tracker.notes)
 
@@ -96,7 +97,7 @@ def test_a_flood_ends_the_stream_with_what_came_before(how: str, said: str, tmp_
     with opened(tmp_path / "s", prefetch=200) as tracker:
         flooding = peer(tmp_path / "s", how)
         frames = list(tracker)
-        told, _ = flooding.communicate("", timeout=60)
+        told, _ = flooding.communicate("", timeout=PATIENCE)
         assert len(os.listdir(tracker._spool.path)) < 60
     assert [int(f.rgba[0, 0, 0]) for f in frames] == [1]
     assert said in told

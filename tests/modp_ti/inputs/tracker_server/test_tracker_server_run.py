@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.modp_ti.runs import SHORT_RUN, finished_run
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[4]
 LIVE = """
@@ -27,7 +28,7 @@ def test_a_run_on_sent_frames_gives_the_same_map_byte_for_byte(finished: Path, t
     sender = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         sent = finished_run(tmp_path, LIVE + SHORT_RUN.partition("output:  out\n")[2], "9 frames, ")
-        assert sender.communicate(timeout=60)[0] == "9 frames taken\n"
+        assert sender.communicate(timeout=PATIENCE)[0] == "9 frames taken\n"
     finally:
         sender.kill()
     for name in ("splats.ply", "trajectory.txt"):

@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 import screenshot
 
+from tests.patience import PATIENCE
+
 if TYPE_CHECKING:
     from tests.room import Room
 
@@ -30,7 +32,6 @@ mapping: {optimise: {steps: 3, last_steps: 4}}
 refine:  {steps: 0}
 view:    {port: 0, paused: true}
 """
-PATIENCE = 240.0
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]

@@ -7,6 +7,7 @@ import threading
 import numpy as np
 
 from modp_ti.outputs.viewer.handover import MAX_BROWSERS, BrowserCamera, Gate, Latest, Requests
+from tests.patience import PATIENCE
 
 
 def camera(client: int, x: float = 0.0) -> BrowserCamera:
@@ -42,7 +43,7 @@ def test_whoever_waits_for_a_value_gets_it_and_is_let_go_at_the_end():
     while not got:
         pass
     box.close()
-    thread.join(timeout=30)
+    thread.join(timeout=PATIENCE)
     assert not thread.is_alive()
     assert got == ["picture", None]
 

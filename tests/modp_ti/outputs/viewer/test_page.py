@@ -16,6 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.viewer.page import DEPTH_ON_PAGE, KEYFRAME_SIZE, Page, ShownFrame, frustum_lines
 from modp_ti.outputs.viewer.splats import Splats
+from tests.patience import PATIENCE
 
 CAMERA = PinholeCamera(100.0, 100.0, 60.0, 40.0, 120, 80)
 
@@ -28,17 +29,17 @@ def page() -> Iterator[Page]:
 
 
 def test_the_page_is_served_to_this_machine_alone(page: Page):
-    assert b"<html" in urlopen(page.url, timeout=30).read()
+    assert b"<html" in urlopen(page.url, timeout=PATIENCE).read()
     port = urlparse(page.url).port
     # Whoever listens at all addresses listens at this one too.
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.2", port), timeout=30)
+        socket.create_connection(("127.0.0.2", port), timeout=PATIENCE)
 
 
 def test_asked_for_it_is_served_to_all():
     page = Page("0.0.0.0", 0)
     try:
-        socket.create_connection(("127.0.0.2", urlparse(page.url).port), timeout=30).close()
+        socket.create_connection(("127.0.0.2", urlparse(page.url).port), timeout=PATIENCE).close()
     finally:
         page.close()
 
