@@ -103,7 +103,7 @@ def placed_anew(
 def surest_points(
     poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], solves: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], Observations]:
-    """Select points with a parallax of at least SURE_ANGLE, and others where a frame has fewer than ENOUGH points.
+    """Select points with a parallax of at least SURE_ANGLE, and others where a solving frame has fewer than ENOUGH.
 
     With less parallax, errors of the given poses cause larger errors in depth.
 
@@ -111,7 +111,7 @@ def surest_points(
         poses: (F, 4, 4) T_camera_world.
         seen: Observations.
         xyz: (P, 3) positions.
-        solves: (F,) False for held-out frames, whose rays do not count.
+        solves: (F,) False for held-out frames, whose rays and numbers of points do not count.
 
     Returns:
         The selected positions and their observations.
@@ -119,7 +119,7 @@ def surest_points(
     angle = _widest_angle(poses, seen.where(solves[seen.frame]), xyz)
     kept = angle >= SURE_ANGLE
     have = np.bincount(seen.frame[kept[seen.point]], minlength=len(poses))
-    unsure = seen.where(~kept[seen.point])
+    unsure = seen.where(~kept[seen.point] & solves[seen.frame])
     unsure = unsure.where(np.lexsort((unsure.point, -angle[unsure.point], unsure.frame)))
     first = np.searchsorted(unsure.frame, unsure.frame)
     kept[unsure.point[have[unsure.frame] + np.arange(len(unsure)) - first < ENOUGH]] = True
