@@ -70,7 +70,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
         if first is None:
             raise InputError("the tracker delivered no frame: nothing to check")
         total = tracker.frame_count
-        line.start_mapping(total, "checking")
+        line.start("checking", total)
         try:
             seen = survey(chain([first], frames), total, lambda _: line.frame(None))
         finally:

@@ -6,8 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, fields
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +15,10 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.observer import Observer
 from modp_ti.outputs.viewer.budget import CostLimit, ThreadClock
 from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Latest
-from modp_ti.outputs.viewer.modes import (
-    SPLATS,
-    Photograph,
-    error_picture,
-    nearest_photograph,
-    picture_of,
-    pinhole_of,
-)
+from modp_ti.outputs.viewer.modes import SPLATS, Photograph, nearest_photograph, painter, pinhole_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from modp_ti.outputs.viewer.splats import splats_of
 from pipelines.pipeline import FrameReport
@@ -70,15 +63,10 @@ class Update:
 
     def over(self, waiting: Update) -> Update:
         """Return this update, with missing parts taken from the older update `waiting`."""
-        return Update(
-            *(
-                getattr(waiting, part.name) if getattr(self, part.name) is None else getattr(self, part.name)
-                for part in fields(self)
-            )
-        )
+        return replace(waiting, **{name: part for name, part in vars(self).items() if part is not None})
 
 
-class LiveViewer:
+class LiveViewer(Observer):
     """An `Observer` that serves a page with the growing map.
 
     It never waits for a browser, and keeps its cost below `settings.max_cost` percent of the mapping time. Only the
@@ -267,20 +255,17 @@ class LiveViewer:
             return
         camera, T = seen_from
         size = images.width, images.height
+
+        def photograph() -> Photograph:
+            k = store[nearest_photograph(np.stack([view.T_camera_world for view in store]), T, store.scene_depth)]
+            return Photograph(k.rgba, k.camera, k.T_camera_world.copy(), copy(k.exposure), k.vignette)
+
         try:
-            view = self._mapper.render(camera, T)
-            finish = partial(picture_of, view, mode, store.scene_depth)
-            if mode == "error":
-                j = nearest_photograph(np.stack([view.T_camera_world for view in store]), T, store.scene_depth)
-                k = store[j]
-                photograph = Photograph(k.rgba, k.camera, k.T_camera_world.copy(), copy(k.exposure), k.vignette)
-                seen = self._mapper.render(k.camera, k.T_camera_world)
-                finish = partial(error_picture, view, camera, T, photograph, seen)
-        except ValueError:
-            return  # a viewpoint inside large Gaussians can exceed the renderer's capacity
+            paint = painter(mode, camera, T, store.scene_depth, self._mapper.render, photograph)
         finally:
             images.resize(*size)  # also clears the buffers, so that the mapper's next step does not pay for it
-        self._updates.put(Update(picture=(browser.client, finish)))
+        if paint is not None:
+            self._updates.put(Update(picture=(browser.client, paint)))
 
     # ---- the publishing thread -------------------------------------------------------------------------------
 
@@ -306,7 +291,7 @@ class LiveViewer:
         if update.splats is not None:
             page.show_splats(splats_of(update.splats, page.units, self.settings.max_splats))
         if update.picture is not None:
-            client, finish = update.picture
-            page.show_picture(client, finish())
+            client, paint = update.picture
+            page.show_picture(client, paint())
         if update.numbers is not None:
             page.show_numbers(update.numbers)

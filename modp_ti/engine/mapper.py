@@ -45,6 +45,13 @@ class Mapper:
     Attributes:
         pipeline: The online or offline mapper, with its Gaussians, keyframes and renderer.
         frames: Metadata and tracked points of all frames so far, without their images.
+
+    Example:
+        modp_ti.initialise("cpu")
+        mapper = modp_ti.Mapper(width=640, height=480)
+        for frame in frames:  # of class `TrackedFrame`
+            mapper.add(frame)
+        mapper.save("out/room")
     """
 
     def __init__(
@@ -60,15 +67,10 @@ class Mapper:
         self._finished = True
 
     def add(self, frame: TrackedFrame) -> FrameReport | None:
-        """Process the next frame.
-
-        Frames must come in increasing order of their indices.
-
-        Args:
-            frame: The frame with its pose and points. A held-out frame does not change the map.
+        """Process the next frame. Frames must come in increasing order of their indices.
 
         Returns:
-            What the frame did to the map, or None if it is held out.
+            What the frame did to the map, or None if it is held out and hence does not change the map.
 
         Raises:
             ValueError: If the frame is out of order or larger than the mapper's images.
@@ -82,20 +84,14 @@ class Mapper:
         if self.frames.index and frame.index <= self.frames.index[-1]:
             raise ValueError(f"{frame.name} has index {frame.index}, the frame before it {self.frames.index[-1]}")
         report = None if frame.held_out else self.pipeline.process(frame)
-        self._keep(frame)
+        # The frame's metadata are kept, and its points as far as the memory budget allows.
+        self.frames.add(frame, with_points=self.pipeline.takes_observations(len(frame.points)))
+        self.pipeline.count_beside(self.frames.points.nbytes)
         self._finished = False
         return report
 
-    def _keep(self, frame: TrackedFrame) -> None:
-        """Store the frame's metadata, and its points as far as the memory budget allows."""
-        self.frames.add(frame, with_points=self.pipeline.takes_observations(len(frame.points)))
-        self.pipeline.count_beside(self.frames.points.nbytes)
-
     def correct(self, correction: PoseCorrection) -> None:
         """Apply poses and points that the tracker has revised, for example after a loop closure.
-
-        Args:
-            correction: The revised poses and points.
 
         Raises:
             InputError: If the correction refers to a frame that has not been added yet.
@@ -166,9 +162,7 @@ class Mapper:
             finished: The other mapper's `finished`.
 
         Raises:
-            KeyError: If the state does not fit this mapper.
-            TypeError: If the state does not fit this mapper.
-            ValueError: If the state does not fit this mapper.
+            KeyError, TypeError, ValueError: If the state does not fit this mapper.
         """
         self.pipeline.restore(state, again)
         self.frames = frames

@@ -1,18 +1,16 @@
-"""`Observer`: the interface of objects that are notified while a scene is mapped."""
+"""`Observer`: the base class of objects that are notified while a scene is mapped."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.engine.mapper import Mapper
 from pipelines.pipeline import FrameReport
 
-__all__ = ["Observer", "Unobserved"]
+__all__ = ["Observer"]
 
 
-class Observer(Protocol):
-    """Receives events of a run, such as finished frames and steps.
+class Observer:
+    """Receives events of a run, such as finished frames and steps. This base class ignores them.
 
     The mapping thread makes the calls and waits for them to return. No other thread may access the map.
 
@@ -21,7 +19,7 @@ class Observer(Protocol):
             time.
     """
 
-    waited: float
+    waited = 0.0
 
     def begin(self, mapper: Mapper, frames: int | None) -> None:
         """Called before the first frame.
@@ -51,17 +49,3 @@ class Observer(Protocol):
 
     def on_stage(self, stage: str) -> None:
         """Called when the map is finished and another stage begins. The map must not be accessed from here on."""
-
-
-class Unobserved:
-    """An observer that does nothing."""
-
-    waited = 0.0
-
-    def begin(self, mapper: Mapper, frames: int | None) -> None: ...
-
-    def on_frame(self, frame: TrackedFrame, report: FrameReport | None) -> None: ...
-
-    def on_step(self, stage: str, step: int, steps: int, psnr: float) -> None: ...
-
-    def on_stage(self, stage: str) -> None: ...

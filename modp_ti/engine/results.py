@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +30,6 @@ __all__ = ["Results", "metrics_of"]
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
 MAPS = ("online", "refined", "offline")
-
-
 # Files that are only written for a finished map.
 FIGURES = ("metrics.json", "scores.csv", "report.html")
 
@@ -57,8 +54,7 @@ class Results:
     def writing(self) -> Iterator[None]:
         """Move the files that are written inside this context to the output folder together, if no error occurred.
 
-        Raises:
-            InputError: If the files cannot be written.
+        It raises InputError if the files cannot be written.
         """
         with appearing(self.config.output) as self.folder:
             (self.folder / "renders").mkdir()
@@ -66,28 +62,21 @@ class Results:
             dump_scene(self.config, self.folder / "config.yaml")
 
     def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> MapVersion:
-        """Write the map with `formats.map_folder.write_map`.
-
-        Returns:
-            The map with its Gaussians as read back from `splats.ply`.
-        """
+        """Write the map, and return it with its Gaussians as read back from `splats.ply`."""
         write_map(self.folder, version, self.frames, self._names, keyframes, near)
         return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
 
     def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
-        """Write the pictures of a frame and keep those that the report may show.
+        """Write the pictures of a frame, given its render (H, W, 3), and keep those that the report may show.
 
         The image is written if `export.images` is set. A held-out frame also gets a picture of image and render side by
         side.
-
-        Args:
-            frame: The frame.
-            render: (H, W, 3) render from the frame's pose.
         """
         if self.config.export.images:
             write_image(self.folder / "colmap", self._names[frame.index], frame)
         if frame.held_out:
-            _write_pair(self.folder / "renders" / f"{frame.index:06d}.png", frame.image, render)
+            pair = np.round(np.hstack([frame.image, render]) * 255.0).astype(np.uint8)
+            write_picture(self.folder / "renders" / f"{frame.index:06d}.png", pair)
         if self.config.export.report:
             self._album.keep(frame.index, frame.image, render)
 
@@ -110,15 +99,7 @@ class Results:
         keyframes: KeyframeStore,
         truth: list[NDArray[np.float64]],
     ) -> str | None:
-        """Write `report.html`.
-
-        Args:
-            record: Notes taken during the run.
-            metrics: Content of `metrics.json`.
-            scores: Scores of all frames in all versions.
-            versions: Map versions by name; the last one is the final map.
-            keyframes: The map's keyframes.
-            truth: Ground-truth T_camera_world (4, 4) of all frames, or an empty list.
+        """Write `report.html` from the parts of a `ReportedRun`.
 
         Returns:
             None, or one line that says why there is no report.
@@ -155,17 +136,18 @@ def metrics_of(
         frames: All frames, with their tracked points.
         seconds: Time of each stage and `total` [s].
     """
-    points, last = frames.points, list(versions.values())[-1]
+    points, camera = frames.points, frames.camera
+    trajectories = {"": list(versions.values())[-1].trajectory, "_tracked": frames.T_tracked}
+    as_tracked = {name: points.reprojection_error(camera, poses) for name, poses in trajectories.items()}
     anew = {
-        name: points.reprojection_error(frames.camera, poses, points.placed_anew(frames.camera, poses))
-        for name, poses in (("", last.trajectory), ("_tracked", frames.T_tracked))
+        name: points.reprojection_error(camera, poses, points.placed_anew(camera, poses))
+        for name, poses in trajectories.items()
     }
     return {
         "frames": len(frames),
         "corrections": frames.corrections,
         **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
-        "reprojection_error": _rounded(points.reprojection_error(frames.camera, last.trajectory)),
-        "reprojection_error_tracked": _rounded(points.reprojection_error(frames.camera, frames.T_tracked)),
+        **{f"reprojection_error{name}": _rounded(error) for name, error in as_tracked.items()},
         **{f"reprojection_error_anew{name}": _rounded(error) for name, error in anew.items()},
         "seconds": _seconds(seconds),
     }
@@ -180,12 +162,6 @@ def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[
         "gaussians": len(version.gaussians["position"]),
         "view_renders": version.view_renders,
     }
-
-
-def _write_pair(path: Path, image: NDArray[np.float32], render: NDArray[np.float32]) -> None:
-    """Write a PNG with the frame on the left and the render on the right."""
-    pair = np.hstack([image, render])
-    write_picture(path, np.round(pair * 255.0).astype(np.uint8))
 
 
 def _seconds(stages: dict[str, float]) -> dict[str, float]:

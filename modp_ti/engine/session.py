@@ -20,7 +20,7 @@ from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.observer import Observer, Unobserved
+from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock
@@ -35,6 +35,8 @@ from modp_ti.outputs.report.record import RunRecord
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
+
+Event = TrackedFrame | PoseCorrection
 
 
 def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
@@ -54,6 +56,12 @@ def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snap
         InputError: If the input cannot be used.
         KeyboardInterrupt: After Ctrl-C, with a message. If mapping has begun, the current step is finished, and a
             snapshot and the map so far are written first.
+
+    Example:
+        Map a scene and read its scores:
+
+            output = modp_ti.run_scene(modp_ti.load_scene("scene.yaml"))
+            print((output / "metrics.json").read_text())
     """
     with ExitStack() as held:
         return _Session(config, console or Console(quiet=True), held).run(resumed)
@@ -64,20 +72,19 @@ class _Session:
 
     def __init__(self, config: SceneConfig, console: Console, held: ExitStack) -> None:
         self.config = config
-        self.console = console
         self.held = held
         self.clock = RunClock()
         self.record = RunRecord()
         self.line = ProgressLine(console)
         self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
         self.observer = self._open_observer()  # opened first, as what follows may take minutes
-        self.stop = Interruption(lambda: self._print("stopping after this step; Ctrl-C again stops at once"))
+        self.stop = Interruption(lambda: self.line.note("stopping after this step; Ctrl-C again stops at once"))
         try:
             self.backend = initialise(config.device, config.threads, config.seed)
         except RuntimeError as error:
             raise InputError(str(error)) from None
         self.record.device = describe(self.backend)
-        self._print(f"device: {self.record.device}")
+        self.line.note(f"device: {self.record.device}")
         # Set once the first frame has arrived.
         self.tracker: Tracker
         self.mapper: Mapper
@@ -108,14 +115,15 @@ class _Session:
             if isinstance(first, PoseCorrection):
                 raise InputError("the tracker corrects poses before its first frame")
             prepared = time.perf_counter() - tick
-            self._open_lpips(first.camera)
+            side = min(first.camera.width, first.camera.height)
+            self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes)
             self.mapper = build_mapper(self.config, first.camera)
             self.mapper.pipeline.stopwatch.seconds["track"] = prepared
             with self.line.working("compiling kernels (the first time on this machine takes longest)"):
                 self.mapper.pipeline.compile()
-            rest: Iterator[TrackedFrame | PoseCorrection] = chain([first], arriving)
+            rest: Iterator[Event] = chain([first], arriving)
             self._open_keeper(resumed, rest)
             self.observer.begin(self.mapper, self.tracker.frame_count)
             self.held.enter_context(self.stop)
@@ -128,11 +136,7 @@ class _Session:
         # A live tracker adds notes at its end.
         self._say(*(note for note in self.tracker.notes if note not in notes))
 
-    def _open_lpips(self, camera: PinholeCamera) -> None:
-        side = min(camera.width, camera.height)
-        self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
-
-    def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
+    def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[Event]) -> None:
         """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""
         self.checkpointer = checkpointer = Checkpointer(self.config, self.mapper, self.record, self.clock, self._say)
         if resumed is not None:
@@ -142,10 +146,10 @@ class _Session:
         elif checkpointer.path.exists():
             self._say(f"{checkpointer.path} is of an earlier run: the first one of this run takes its place")
 
-    def _map(self, arriving: Iterator[TrackedFrame | PoseCorrection]) -> None:
+    def _map(self, arriving: Iterator[Event]) -> None:
         """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
         mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
-        line.start_mapping(self.tracker.frame_count, "reading" if offline else "mapping", len(mapper.frames))
+        line.start("reading" if offline else "mapping", self.tracker.frame_count, len(mapper.frames))
         size = None
         self.record.begin()
         try:
@@ -154,11 +158,11 @@ class _Session:
                 if isinstance(frame, PoseCorrection):
                     mapper.correct(frame)
                     continue
-                size = size or (frame.camera.width, frame.camera.height)
-                if (frame.camera.width, frame.camera.height) != size:
+                this = f"{frame.camera.width}x{frame.camera.height}"
+                size = size or this
+                if this != size:
                     raise InputError(
-                        f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
-                        f"{size[0]}x{size[1]}: all images of a scene must have one size"
+                        f"{frame.name} is {this}, the first frame {size}: all images of a scene must have one size"
                     )
                 report = mapper.add(frame)
                 line.frame(report)
@@ -166,7 +170,7 @@ class _Session:
                 self.observer.on_frame(frame, report)
                 self.checkpointer.after_frame()
             if offline:
-                line.start_offline(self.config.offline.steps)
+                line.start("optimising", self.config.offline.steps)
                 mapper.finish(self._optimised)
             else:
                 mapper.finish()
@@ -176,7 +180,7 @@ class _Session:
 
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Callback after a step of the offline optimisation."""
-        self.line.optimised(step, gaussians, psnr)
+        self.line.step(step, psnr, gaussians)
         self.record.optimised(step, gaussians, psnr)
         self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
         self.stop.check()
@@ -214,7 +218,7 @@ class _Session:
     def _refine(self) -> None:
         """Refine the map, or continue its refinement. Raises RunStopped between two steps."""
         refine = self.config.refine
-        self.line.start_refining(refine.steps, self.checkpointer.refined)
+        self.line.start("refining", refine.steps, self.checkpointer.refined)
         try:
             self.mapper.refine(refine.steps, refine, self._refined, self.checkpointer.refined)
         finally:
@@ -223,7 +227,7 @@ class _Session:
     def _refined(self, step: int, psnr: float) -> None:
         """Callback after a step of refinement."""
         steps = self.config.refine.steps
-        self.line.refined(step, psnr)
+        self.line.step(step, psnr)
         self.record.refined(step, psnr)
         self.observer.on_step("refining", step, steps, psnr)
         self.checkpointer.after_step(step, steps)
@@ -256,11 +260,11 @@ class _Session:
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
             self.stop.check()
-            self.line.evaluated()
+            self.line.advance()
             if stage == last:
                 results.write_frame(frame, render)
 
-        self.line.start_evaluating(len(self.mapper.frames) * len(versions))
+        self.line.start("evaluating the saved map", len(self.mapper.frames) * len(versions))
         pipeline = self.mapper.pipeline
         try:
             with pipeline.stopwatch.measure("evaluate"), FramesAhead(self.tracker, self.ahead) as again:
@@ -334,23 +338,20 @@ class _Session:
     def _open_observer(self) -> Observer:
         """Start the live viewer if the settings ask for it."""
         if not self.config.view.enabled:
-            return Unobserved()
+            return Observer()
         # Imported here because viser is an optional dependency.
         from modp_ti.engine.live_viewer import LiveViewer
 
         viewer = LiveViewer(self.config.view, self._say)
         self.held.callback(viewer.close)
-        self._print(f"viewer: {viewer.url}")
+        self.line.note(f"viewer: {viewer.url}")
         return viewer
 
     def _say(self, *notes: str) -> None:
         """Print notes, and keep them for the report."""
         for note in notes:
-            self._print(f"note: {note}")
+            self.line.note(f"note: {note}")
             self.record.notes.append(note)
-
-    def _print(self, text: str) -> None:
-        self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
@@ -366,9 +367,7 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
         raise InputError(str(error)) from None
 
 
-def _timed(
-    frames: Iterator[TrackedFrame | PoseCorrection], watch: Stopwatch, stop: Interruption
-) -> Iterator[TrackedFrame | PoseCorrection]:
+def _timed(frames: Iterator[Event], watch: Stopwatch, stop: Interruption) -> Iterator[Event]:
     """Yield the frames and corrections, counting the time that the mapper waits for each of them as `read`."""
     while True:
         with watch.measure("read"), stop.waiting():

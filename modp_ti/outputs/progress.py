@@ -38,92 +38,28 @@ class ProgressLine:
 
     def note(self, text: str) -> None:
         """Print a note for the user."""
-        self.console.print(text, highlight=False, soft_wrap=True)
+        self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
     def prepare(self, what: str, done: int, total: int) -> None:
         """Show the progress of a tracker's preparation. Trackers take this method as their `Progress` callback."""
         if self._progress is None:
-            self._begin(what, total)
+            self.start(what, total)
         self._update(description=what, completed=done, total=total)
         if done >= total:
             self.stop()
 
     def through(self, what: str, items: Iterable[T], total: int) -> Iterator[T]:
         """Yield the items, showing how many are done."""
-        self._begin(what, total)
+        self.start(what, total)
         try:
             for item in items:
                 yield item
-                self._update(advance=1)
+                self.advance()
         finally:
             self.stop()
 
-    def start_mapping(self, frames: int | None, what: str = "mapping", done: int = 0) -> None:
-        self._begin(what, frames, done)
-
-    def frame(self, report: FrameReport | None) -> None:
-        """Count a finished frame; `report` is None if it is held out."""
-        if report is not None:
-            psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
-            gaussians = f"  {report.gaussians:,} Gaussians" if report.gaussians else ""
-            self._state = f"{report.keyframes} keyframes{gaussians}{psnr}"
-        frame_rate = self._progress.tasks[0].speed if self._progress is not None else None
-        speed = f"  {frame_rate:.2f} frames/s" if frame_rate else ""
-        self._update(advance=1, state=self._state + speed)
-
-    def start_refining(self, steps: int, done: int = 0) -> None:
-        self._begin("refining", steps, done)
-
-    def refined(self, step: int, psnr: float) -> None:
-        self._update(completed=step, state=f"{psnr:.2f} dB")
-
-    def start_offline(self, steps: int) -> None:
-        self._begin("optimising", steps)
-
-    def optimised(self, step: int, gaussians: int, psnr: float) -> None:
-        """Show a finished step of the offline optimisation."""
-        self._update(completed=step, state=f"{gaussians:,} Gaussians  {psnr:.2f} dB")
-
-    def start_evaluating(self, renders: int) -> None:
-        self._begin("evaluating the saved map", renders)
-
-    def evaluated(self) -> None:
-        """Count a frame that was compared with a map."""
-        self._update(advance=1)
-
-    def stop(self) -> None:
-        """End the line and leave its last state on the screen."""
-        if self._progress is not None:
-            self._progress.stop()
-            self._progress = None
-
-    def summary(self, metrics: dict) -> None:
-        """Print the run's result in one line."""
-        scores = metrics["refined"] or metrics["online"] or metrics["offline"]
-        which = "held_out" if scores["held_out"]["count"] else "all"
-        lpips = scores[which]["lpips"]
-        self.console.print(
-            f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {metrics['gaussians']:,} Gaussians, "
-            f"{metrics['frames_per_second']:.2f} frames/s; {which.replace('_', '-')} "
-            f"PSNR {scores[which]['psnr']:.2f} dB, SSIM {scores[which]['ssim']:.3f}"
-            + ("" if lpips is None else f", LPIPS {lpips:.3f}"),
-            highlight=False,
-            soft_wrap=True,
-        )
-
-    def _update(self, **changes: Any) -> None:
-        if self._progress is None:
-            raise RuntimeError("no progress is shown: call one of the `start_` methods first")
-        task = self._progress.tasks[0]
-        self._progress.update(task.id, **changes)
-        if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
-            return
-        self._logged = time.monotonic()
-        total = "" if task.total is None else f"/{task.total:.0f}"
-        line = f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}"
-        self.console.print(line, highlight=False, soft_wrap=True)
-
-    def _begin(self, what: str, total: int | None, done: int = 0) -> None:
+    def start(self, what: str, total: int | None, done: int = 0) -> None:
+        """Begin the line of a stage: its name, the number of its items (None if unknown), and how many are done."""
         self.stop()
         self._state = ""
         self._logged = time.monotonic()
@@ -137,3 +73,51 @@ class ProgressLine:
         )
         self._progress.add_task(what, total=total, completed=done, state="")
         self._progress.start()
+
+    def frame(self, report: FrameReport | None) -> None:
+        """Count a finished frame; `report` is None if it is held out."""
+        if report is not None:
+            psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
+            gaussians = f"  {report.gaussians:,} Gaussians" if report.gaussians else ""
+            self._state = f"{report.keyframes} keyframes{gaussians}{psnr}"
+        frame_rate = self._progress.tasks[0].speed if self._progress is not None else None
+        speed = f"  {frame_rate:.2f} frames/s" if frame_rate else ""
+        self._update(advance=1, state=self._state + speed)
+
+    def step(self, step: int, psnr: float, gaussians: int | None = None) -> None:
+        """Show a finished step of refinement or, with the number of Gaussians, of offline optimisation."""
+        size = "" if gaussians is None else f"{gaussians:,} Gaussians  "
+        self._update(completed=step, state=f"{size}{psnr:.2f} dB")
+
+    def advance(self) -> None:
+        """Count a finished item of the current stage."""
+        self._update(advance=1)
+
+    def stop(self) -> None:
+        """End the line and leave its last state on the screen."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def summary(self, metrics: dict) -> None:
+        """Print the run's result in one line."""
+        scores = metrics["refined"] or metrics["online"] or metrics["offline"]
+        which = "held_out" if scores["held_out"]["count"] else "all"
+        lpips = scores[which]["lpips"]
+        self.note(
+            f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {metrics['gaussians']:,} Gaussians, "
+            f"{metrics['frames_per_second']:.2f} frames/s; {which.replace('_', '-')} "
+            f"PSNR {scores[which]['psnr']:.2f} dB, SSIM {scores[which]['ssim']:.3f}"
+            + ("" if lpips is None else f", LPIPS {lpips:.3f}")
+        )
+
+    def _update(self, **changes: Any) -> None:
+        if self._progress is None:
+            raise RuntimeError("no progress is shown: call `start` first")
+        task = self._progress.tasks[0]
+        self._progress.update(task.id, **changes)
+        if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
+            return
+        self._logged = time.monotonic()
+        total = "" if task.total is None else f"/{task.total:.0f}"
+        self.note(f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}")

@@ -8,9 +8,15 @@ from pathlib import Path
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.run_clock import RunClock
-from modp_ti.engine.snapshots.digest import StreamDigest
 from modp_ti.engine.snapshots.file import FILE
-from modp_ti.engine.snapshots.snapshot import Position, Snapshot, frames_state, record_state, version_state
+from modp_ti.engine.snapshots.snapshot import (
+    Position,
+    Snapshot,
+    StreamDigest,
+    frames_state,
+    record_state,
+    version_state,
+)
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import RunRecord
 
@@ -64,24 +70,16 @@ class Checkpointer:
             self.keep()
 
     def after_step(self, step: int, steps: int) -> None:
-        """Record a finished refinement step, and write a snapshot if one is due.
+        """Record the finished refinement step `step`, which counts from 1, and write a snapshot if one is due.
 
         A snapshot is due after as many steps as `snapshot_every` keyframes take, and after the last step.
-
-        Args:
-            step: Number of the step, from 1.
-            steps: Total number of steps.
         """
         self.refined = step
         if self._every and (step == steps or step % (self._every * self.config.mapping.optimise.steps) == 0):
             self.keep()
 
     def keep(self) -> bool:
-        """Write a snapshot of the current state. If that fails, the previous snapshot is kept.
-
-        Returns:
-            Whether a snapshot of the current state exists.
-        """
+        """Write a snapshot of the current state, or keep the previous one; return whether there is a current one."""
         if not self.possible:
             return False
         position = Position(self.digest.events, self.digest.value, self._mapper.finished, self.refined)
@@ -112,11 +110,7 @@ class Checkpointer:
             self.path.with_name(name).unlink(missing_ok=True)
 
     def go_on_from(self, snapshot: Snapshot) -> None:
-        """Restore what a snapshot holds besides the map.
-
-        Raises:
-            InputError: If the snapshot is incomplete.
-        """
+        """Restore what a snapshot holds besides the map. Raises InputError if the snapshot is incomplete."""
         with snapshot.fitting():
             self.online = snapshot.online()
             self.refined = snapshot.position.refined

@@ -31,15 +31,9 @@ KINDS = "biuf"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) -> None:
-    """Write named arrays of numbers and a JSON object. The previous file is replaced only once the new one is on disk.
+    """Write named arrays of numbers and the JSON object `about`. Raises OSError if the file cannot be written.
 
-    Args:
-        path: The file.
-        arrays: Arrays by name.
-        about: Content of the JSON object.
-
-    Raises:
-        OSError: If the file cannot be written.
+    The previous file is replaced only once the new one is on disk.
     """
     text = json.dumps({"version": VERSION, **about}).encode("utf-8")
     with replacing(path) as file:
@@ -47,13 +41,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, 
 
 
 def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Read a file that `write_arrays` wrote.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The arrays by name, and the JSON object.
+    """Read the arrays by name and the JSON object of a file that `write_arrays` wrote.
 
     Raises:
         InputError: If the file is missing, damaged, not a snapshot, or of another version. The message has one line.

@@ -13,23 +13,14 @@ from modp_ti.config.old_settings import without_leftovers
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.snapshots.digest import StreamDigest
 from modp_ti.engine.snapshots.file import FILE
-from modp_ti.engine.snapshots.snapshot import Snapshot
+from modp_ti.engine.snapshots.snapshot import Snapshot, StreamDigest
 from modp_ti.files.errors import InputError
 
 __all__ = ["load_resumed", "replay"]
 
 # Settings that may change on resuming, since the map does not depend on them.
-FREE = (
-    "output",
-    "threads",
-    "snapshot_every",
-    "source.prefetch",
-    "evaluation",
-    "export",
-    "view",
-)
+FREE = ("output", "threads", "snapshot_every", "source.prefetch", "evaluation", "export", "view")
 
 
 def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> tuple[SceneConfig, Snapshot]:
@@ -47,17 +38,14 @@ def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> 
         InputError: If there is no usable snapshot, or a setting that the map depends on has changed.
     """
     file = output / FILE
+    if not output.is_dir():
+        raise InputError(f"{output}: no such folder (--resume); give the output folder of an interrupted run")
     if not file.is_file():
-        if not output.is_dir():
-            raise InputError(f"{output}: no such folder (--resume); give the output folder of an interrupted run")
         if (output / "metrics.json").is_file():
             raise InputError(f"{output}: this run is finished; there is nothing to resume")
         raise InputError(f"{file}: there is no snapshot; start the run from its scene, and set `snapshot_every`")
     snapshot = Snapshot.read(file)
-    if scene is None:
-        config = scene_from_data(snapshot.settings, str(file), overrides)
-    else:
-        config = load_scene(scene, overrides)
+    config = load_scene(scene, overrides) if scene else scene_from_data(snapshot.settings, str(file), overrides)
     config = config.model_copy(update={"output": output.resolve()})
     before, now = _leaves(without_leftovers(snapshot.settings)), _leaves(config.model_dump(mode="json"))
     for key in [*now, *(key for key in before if key not in now)]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -11,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.engine.snapshots.file import read_arrays, write_arrays
 from modp_ti.files.errors import InputError
@@ -19,9 +22,39 @@ from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
 from pipelines.state import MapState
 
-__all__ = ["Position", "Snapshot"]
+__all__ = ["Position", "Snapshot", "StreamDigest", "frames_state", "record_state", "version_state"]
 
 UNKNOWN = np.full((3, 4), np.nan)
+
+
+class StreamDigest:
+    """Checksum of the tracker's frames and corrections, by which a resumed run knows that its input is the same.
+
+    Attributes:
+        value: CRC-32 of all frames and corrections so far, in order.
+        events: Their number.
+    """
+
+    def __init__(self) -> None:
+        self.value = 0
+        self.events = 0
+
+    def add(self, event: TrackedFrame | PoseCorrection) -> None:
+        """Add a frame or correction. The image of a held-out frame is left out, as it does not affect the map."""
+        self.events += 1
+        if isinstance(event, PoseCorrection):
+            self._take(event.index, event.T_camera_world, event.ids, event.xyz)
+            return
+        camera, points = event.camera, event.points
+        self.value = zlib.crc32(event.name.encode("utf-8"), self.value)
+        numbers = [event.index, event.timestamp, camera.fx, camera.fy, camera.cx, camera.cy]
+        self._take(np.array(numbers, dtype=np.float64), event.T_camera_world, points.xyz, points.pixels, points.ids)
+        if not event.held_out:
+            self._take(event.rgba)
+
+    def _take(self, *arrays: np.ndarray) -> None:
+        for array in arrays:
+            self.value = zlib.crc32(np.ascontiguousarray(array).data, self.value)
 
 
 @dataclass(frozen=True)
@@ -64,21 +97,13 @@ class Snapshot:
         return MapState(self.arrays, self.numbers["map"])
 
     def write(self) -> None:
-        """Write the file, replacing the previous snapshot.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
+        """Write the file, replacing the previous snapshot. Raises OSError if it cannot be written."""
         about = {"settings": self.settings, "position": asdict(self.position), "numbers": self.numbers}
         write_arrays(self.path, self.arrays, about)
 
     @classmethod
     def read(cls, path: Path) -> Snapshot:
-        """Read a snapshot.
-
-        Raises:
-            InputError: If the file cannot be used. The message has one line.
-        """
+        """Read a snapshot. Raises InputError with one line if the file cannot be used."""
         arrays, about = read_arrays(path)
         try:
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
@@ -95,12 +120,7 @@ class Snapshot:
             raise _unfit(self.path, error) from None
 
     def frames(self) -> DeliveredFrames:
-        """Return the metadata of the frames.
-
-        Raises:
-            KeyError: If it is incomplete.
-            ValueError: If it is inconsistent.
-        """
+        """Return the metadata of the frames. Raises KeyError if it is incomplete, ValueError if inconsistent."""
         state = MapState(self.arrays, self.numbers["frames"])
         rows, points = state.group("frames"), state.group("points")
         frames = DeliveredFrames(
@@ -137,8 +157,7 @@ class Snapshot:
         psnr = [None if np.isnan(value) else float(value) for value in rows["psnr"]]
         record.frames = [FrameNote(*row) for row in zip(*columns, psnr, strict=True)]
         steps = state.group("record_steps")
-        pairs = zip(steps["step"].tolist(), steps["psnr"].tolist(), strict=True)
-        record.steps = [StepNote(step, value) for step, value in pairs]
+        record.steps = [StepNote(*row) for row in zip(steps["step"].tolist(), steps["psnr"].tolist(), strict=True)]
         record.started = float(self.numbers["started"])
 
 
@@ -181,7 +200,7 @@ def record_state(record: RunRecord) -> MapState:
         "is_keyframe": np.array([note.is_keyframe for note in notes], dtype=bool),
         "done": np.array([note.done for note in notes], dtype=np.float64),
         "gaussians": np.array([note.gaussians for note in notes], dtype=np.int64),
-        "psnr": np.array([np.nan if note.psnr is None else note.psnr for note in notes], dtype=np.float64),
+        "psnr": np.array([note.psnr for note in notes], dtype=np.float64),  # None becomes NaN
     }
     steps = {
         "step": np.array([note.step for note in record.steps], dtype=np.int64),

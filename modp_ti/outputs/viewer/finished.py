@@ -19,15 +19,7 @@ from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
-from modp_ti.outputs.viewer.modes import (
-    MODES,
-    SPLATS,
-    Photograph,
-    error_picture,
-    nearest_photograph,
-    picture_of,
-    pinhole_of,
-)
+from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, nearest_photograph, painter, pinhole_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from modp_ti.outputs.viewer.splats import splats_of
 
@@ -102,19 +94,15 @@ class FinishedViewer:
         seen_from = pinhole_of(browser, self.page.units, images.max_width, images.max_height)
         if seen_from is None:
             return
-        try:
-            view = self._renderer.view(*seen_from)
-            if mode == "error":
-                mapped = np.array(self.run.mapped)
-                nearest = nearest_photograph(self.run.poses[mapped], seen_from[1], self.run.record.scene_depth)
-                photograph = self._photograph(int(mapped[nearest]))
-                seen = self._renderer.view(photograph.camera, photograph.T_camera_world)
-                picture = error_picture(view, *seen_from, photograph, seen)
-            else:
-                picture = picture_of(view, mode, self.run.record.scene_depth)
-        except ValueError:
-            return  # a viewpoint inside large Gaussians can exceed the renderer's capacity
-        self.page.show_picture(browser.client, picture)
+        scene_depth = self.run.record.scene_depth
+
+        def photograph() -> Photograph:
+            mapped = np.array(self.run.mapped)
+            return self._photograph(int(mapped[nearest_photograph(self.run.poses[mapped], seen_from[1], scene_depth)]))
+
+        paint = painter(mode, *seen_from, scene_depth, self._renderer.view, photograph)
+        if paint is not None:
+            self.page.show_picture(browser.client, paint())
 
     def _photograph(self, index: int) -> Photograph:
         """Return the kept image of a frame. Raises InputError if it is missing or damaged."""

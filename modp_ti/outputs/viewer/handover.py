@@ -46,14 +46,7 @@ class Latest(Generic[T]):
             self._changed.notify_all()
 
     def take(self, timeout: float | None = None) -> T | None:
-        """Fetch the value, waiting until there is one.
-
-        Args:
-            timeout: Longest time to wait [s], None for no limit.
-
-        Returns:
-            The value, or None after the timeout and after `close`.
-        """
+        """Wait for a value and fetch it; None after `timeout` seconds (None for no limit) and after `close`."""
         with self._changed:
             self._changed.wait_for(lambda: self._value is not None or self._closed, timeout)
             value, self._value = self._value, None
@@ -103,15 +96,7 @@ class Gate:
             self._changed.notify_all()
 
     def hold(self, meanwhile: Callable[[], None], every: float = 0.05) -> float:
-        """Block while the gate is closed.
-
-        Args:
-            meanwhile: Called repeatedly while blocked.
-            every: Time between the calls [s].
-
-        Returns:
-            The time spent [s].
-        """
+        """Block while the gate is closed, calling `meanwhile` `every` so many seconds; return the time spent [s]."""
         started = time.perf_counter()
         while True:
             with self._changed:
@@ -199,11 +184,7 @@ class Requests:
             self._changed.notify_all()
 
     def next(self, timeout: float = 0.0) -> BrowserCamera | None:
-        """Return the camera of the browser that has waited longest, or None if no picture is needed.
-
-        Args:
-            timeout: Longest time to wait for a request [s].
-        """
+        """Return the camera of the browser that has waited longest; None if none waits in `timeout` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._due, timeout)
             return self._cameras[self._due.pop(0)] if self._due else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,16 +15,7 @@ from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from pipelines.render.renderer import RenderedView
 
-__all__ = [
-    "MODES",
-    "SPLATS",
-    "Photograph",
-    "error_picture",
-    "image_error",
-    "nearest_photograph",
-    "picture_of",
-    "pinhole_of",
-]
+__all__ = ["MODES", "SPLATS", "Photograph", "image_error", "nearest_photograph", "painter", "picture_of", "pinhole_of"]
 
 # The browser draws splats itself. The other modes are background pictures from this program's renderer.
 SPLATS = "splats"
@@ -62,18 +54,10 @@ class Photograph:
 def pinhole_of(
     camera: BrowserCamera, units: float, max_width: int, max_height: int
 ) -> tuple[PinholeCamera, NDArray[np.float64]] | None:
-    """Convert a browser's camera to a pinhole camera and pose.
+    """Return a browser's camera as a pinhole camera and T_camera_world (4, 4), or None if its numbers are invalid.
 
-    The picture has the canvas's aspect ratio and the largest size that fits.
-
-    Args:
-        camera: The browser's camera.
-        units: Page units per world unit.
-        max_width: Largest width [px].
-        max_height: Largest height [px].
-
-    Returns:
-        The camera and T_camera_world (4, 4), or None if the browser's numbers are invalid.
+    The picture has the canvas's aspect ratio and the largest size that fits into `max_width` x `max_height` pixels.
+    `units` is the number of page units per world unit.
     """
     numbers = np.concatenate([camera.wxyz, camera.position, [camera.fov]])
     if not np.isfinite(numbers).all() or np.linalg.norm(camera.wxyz) < 1e-6:
@@ -95,6 +79,39 @@ def pinhole_of(
     return pinhole, inverse_se3(T)
 
 
+def painter(
+    mode: str,
+    camera: PinholeCamera,
+    T_camera_world: NDArray[np.float64],
+    scene_depth: float,
+    render: Callable[[PinholeCamera, NDArray[np.float64]], RenderedView],
+    photograph: Callable[[], Photograph],
+) -> Callable[[], NDArray[np.uint8]] | None:
+    """Render what a display mode needs.
+
+    Args:
+        mode: One of MODES, except for SPLATS.
+        camera: The camera to show the map from.
+        T_camera_world: (4, 4) its pose.
+        scene_depth: The scene's depth [scene units].
+        render: Renders the map from a camera and pose. It may raise ValueError.
+        photograph: Returns the nearest photograph, for the error mode.
+
+    Returns:
+        A function that computes the picture (H, W, 3) and does not use the map any more; None if the renderer's
+        capacity does not suffice, as can happen inside large Gaussians.
+    """
+    try:
+        view = render(camera, T_camera_world)
+        if mode != "error":
+            return lambda: picture_of(view, mode, scene_depth)
+        taken = photograph()
+        seen = render(taken.camera, taken.T_camera_world)
+    except ValueError:
+        return None
+    return lambda: error_picture(image_error(view, camera, T_camera_world, taken, seen))
+
+
 def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.uint8]:
     """Return colour, depth or opacity of a view as a picture (H, W, 3)."""
     if mode == "depth":
@@ -105,18 +122,10 @@ def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.
 
 
 def nearest_photograph(poses: NDArray[np.float64], T_camera_world: NDArray[np.float64], scene_depth: float) -> int:
-    """Find the pose that shares most of its view with a given pose.
+    """Return the index of the pose among (N, 4, 4) T_camera_world, N > 0, that shares most of its view with a pose.
 
     The measure adds the distance between the points at the scene's depth on both optical axes and half the distance
     between the camera centres.
-
-    Args:
-        poses: (N, 4, 4) T_camera_world of the candidates, at least one.
-        T_camera_world: (4, 4) pose to compare with.
-        scene_depth: The scene's depth [scene units].
-
-    Returns:
-        Index of the pose.
     """
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     centre = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
@@ -174,17 +183,10 @@ def image_error(
     return np.where(before.reshape(z.shape) & same & valid, error, np.nan).astype(np.float32)
 
 
-def error_picture(
-    view: RenderedView,
-    camera: PinholeCamera,
-    T_camera_world: NDArray[np.float64],
-    photograph: Photograph,
-    seen: RenderedView,
-) -> NDArray[np.uint8]:
+def error_picture(error: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return `image_error` as colours (H, W, 3): blue for 0, red for LARGEST_ERROR and more, dark grey for NaN."""
     import cv2
 
-    error = image_error(view, camera, T_camera_world, photograph, seen)
     known = np.isfinite(error)
     scaled = eight_bits(np.where(known, error, 0.0) / LARGEST_ERROR)
     colours = cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO)[..., ::-1]

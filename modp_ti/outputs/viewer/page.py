@@ -121,11 +121,9 @@ class Page:
         return self._units or 1.0
 
     def settle(self, scene_depth: float, T_camera_world: NDArray[np.float64]) -> None:
-        """Set the page's scale and the initial view. Later calls have no effect.
+        """Set the page's scale by the scene's depth [scene units], and the initial view by its pose (4, 4).
 
-        Args:
-            scene_depth: The scene's depth [scene units].
-            T_camera_world: (4, 4) pose of the first view, which also defines the up direction.
+        The pose also defines the up direction. Later calls have no effect.
         """
         if self._units is not None:
             return
@@ -171,10 +169,9 @@ class Page:
             "wxyz": quaternion_from_matrix(T_world_camera[:3, :3]),
             "position": T_world_camera[:3, 3] * self.units,
         }
-        scene = self._server.scene
         self._frame = frame
         add = partial(
-            scene.add_camera_frustum,
+            self._server.scene.add_camera_frustum,
             "/frame",
             fov=_vertical(frame.camera),
             aspect=frame.camera.width / frame.camera.height,
@@ -188,15 +185,9 @@ class Page:
         self._show(FRAME, add, image=frame.picture, **pose)
 
     def show_keyframes(self, poses: NDArray[np.float64], camera: PinholeCamera) -> None:
-        """Show keyframes as frustums.
-
-        Args:
-            poses: (N, 4, 4) T_camera_world.
-            camera: Camera that defines the shape of all frustums.
-        """
-        scene = self._server.scene
+        """Show keyframes, given their T_camera_world (N, 4, 4), as frustums that all have the shape of `camera`."""
         style = {"colors": KEYFRAME_COLOUR, "thickness": 1.5, "thickness_units": "screen"}
-        add = partial(scene.add_line_segments, "/keyframes", **style)
+        add = partial(self._server.scene.add_line_segments, "/keyframes", **style)
         self._show(KEYFRAMES, add, points=frustum_lines(poses, camera, self.units))
 
     def show_points(self, xyz: NDArray[np.float64]) -> None:

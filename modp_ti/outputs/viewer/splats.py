@@ -34,14 +34,10 @@ class Splats:
 
 
 def splats_of(state: Mapping[str, NDArray], units: float, limit: int) -> Splats:
-    """Convert Gaussians to splats with their constant (degree 0) colours.
+    """Convert Gaussians, named as in `GaussianField.to_numpy`, to splats with their constant (degree 0) colours.
 
     If there are more than `limit`, every n-th Gaussian is kept and enlarged to cover the area of those left out.
-
-    Args:
-        state: Gaussians by name, as from `GaussianField.to_numpy`.
-        units: Page units per world unit.
-        limit: Maximum number of splats.
+    `units` is the number of page units per world unit.
     """
     count = len(state["position"])
     chosen = np.arange(count) if count <= limit else np.arange(limit) * count // limit

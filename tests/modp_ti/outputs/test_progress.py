@@ -14,12 +14,12 @@ def written(terminal: bool) -> str:
     """What a run of three frames and two steps writes."""
     console = Console(file=io.StringIO(), force_terminal=terminal, width=100)
     line = ProgressLine(console)
-    line.start_mapping(3)
+    line.start("mapping", 3)
     line.frame(FrameReport(0, True, 1, 1200, 20.5))
     line.frame(None)
     line.frame(FrameReport(2, True, 2, 2400, 21.5))
-    line.start_refining(2)
-    line.refined(1, 25.25)
+    line.start("refining", 2)
+    line.step(1, 25.25)
     line.stop()
     return console.file.getvalue()
 

@@ -16,8 +16,8 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.run_clock import RunClock
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.engine.snapshots import file as snapshot_file
-from modp_ti.engine.snapshots.digest import StreamDigest
 from modp_ti.engine.snapshots.file import FILE
+from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.report.record import RunRecord
