@@ -201,18 +201,18 @@ def _tracker_server(file: Path) -> None:
     ordering = Ordering()
     try:
         while True:
-            header, payload = connection.receive(hello)
-            if header.kind is messages.Kind.END:
+            kind, payload = connection.receive(hello)
+            if kind is messages.Kind.END:
                 break
-            if header.kind is messages.Kind.HELLO:
+            if kind is messages.Kind.HELLO:
                 hello = messages.parse_hello(payload)
                 hello.intrinsics.undistorter(1.0)
                 spool = Spool(hello)
-            elif header.kind is messages.Kind.CORRECTION:
+            elif kind is messages.Kind.CORRECTION:
                 ordering.add_correction(messages.parse_correction(payload))
             else:
-                frame = messages.parse_frame(payload, header.kind)
-                if header.kind is messages.Kind.POSE:
+                frame = messages.parse_frame(payload, kind)
+                if kind is messages.Kind.POSE:
                     ordering.add_pose(frame)
                 else:
                     ordering.require_next(frame)

@@ -6,7 +6,7 @@ import socket
 import time
 from threading import Event
 
-from modp_ti.inputs.tracker_server.messages import HEADER, Header, Hello, Kind, ProtocolError, encoded, parse_header
+from modp_ti.inputs.tracker_server.messages import HEADER, Hello, Kind, ProtocolError, encoded, parse_header
 
 __all__ = ["GLANCE", "Connection", "SenderGoneError"]
 
@@ -39,14 +39,14 @@ class Connection:
         self._closed = closed
         self._reset = False
 
-    def receive(self, hello: Hello | None) -> tuple[Header, bytes]:
+    def receive(self, hello: Hello | None) -> tuple[Kind, bytes]:
         """Read the next message. Its header is checked before the payload is read.
 
         Args:
             hello: The connection's HELLO; None before it.
 
         Returns:
-            The header and the payload.
+            The message's kind and payload.
 
         Raises:
             ProtocolError: If the header is invalid.
@@ -54,8 +54,8 @@ class Connection:
         """
         patience = self._patience if hello else min(self._patience, FIRST_PATIENCE)
         deadline = time.monotonic() + patience
-        header = parse_header(self._read(HEADER.size, deadline, patience, begun=False), hello)
-        return header, self._read(header.length, deadline, patience, begun=True)
+        kind, length = parse_header(self._read(HEADER.size, deadline, patience, begun=False), hello)
+        return kind, self._read(length, deadline, patience, begun=True)
 
     def _read(self, size: int, deadline: float, patience: float, begun: bool) -> bytes:
         data = bytearray()

@@ -24,7 +24,6 @@ __all__ = [
     "Correction",
     "Encoding",
     "Frame",
-    "Header",
     "Hello",
     "Kind",
     "ProtocolError",
@@ -123,19 +122,6 @@ class State(IntEnum):
 
 
 @dataclass(frozen=True)
-class Header:
-    """The header of a message.
-
-    Attributes:
-        kind: The kind of the message.
-        length: Size of the payload in bytes.
-    """
-
-    kind: Kind
-    length: int
-
-
-@dataclass(frozen=True)
 class Hello:
     """The first message: camera, image encoding and name of the tracker."""
 
@@ -194,8 +180,8 @@ def encoded(kind: Kind, payload: bytes) -> bytes:
     return HEADER.pack(MAGIC, VERSION, kind, len(payload), 0) + payload
 
 
-def parse_header(data: bytes, hello: Hello | None) -> Header:
-    """Parse a message header.
+def parse_header(data: bytes, hello: Hello | None) -> tuple[Kind, int]:
+    """Parse a message header, and return the kind of the message and the size of its payload in bytes.
 
     Args:
         data: The 16 bytes of the header.
@@ -231,7 +217,7 @@ def parse_header(data: bytes, hello: Hello | None) -> Header:
     }[kind]
     if not least <= length <= most:
         raise ProtocolError(f"a {kind.name} of {length} bytes: its payload has {least} to {most}")
-    return Header(kind, length)
+    return kind, length
 
 
 def parse_hello(payload: bytes) -> Hello:
@@ -288,10 +274,11 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
     what = f"{kind.name} {number}"
     if count > MAX_POINTS:
         raise ProtocolError(f"{what}: {count} points, at most {MAX_POINTS} are taken")
-    if FRAME.size + count * POINT.itemsize + length != len(payload):
+    middle = FRAME.size + count * POINT.itemsize
+    size = middle + length
+    if size != len(payload):
         raise ProtocolError(
-            f"{what}: {count} points and {length} bytes of image make {FRAME.size + count * POINT.itemsize + length} "
-            f"bytes of payload, it has {len(payload)}"
+            f"{what}: {count} points and {length} bytes of image make {size} bytes of payload, it has {len(payload)}"
         )
     if (length > 0) != (kind is Kind.FRAME):
         raise ProtocolError(f"{what}: {'has no image' if kind is Kind.FRAME else 'must have no image'}")
@@ -306,19 +293,15 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
         raise ProtocolError(f"{what}: has points and no pose: they come with it")
     try:
         pose = _pose(np.array(matrix).reshape(4, 4), what) if state is State.KNOWN else None
-        points = parse_points(payload[FRAME.size : FRAME.size + count * POINT.itemsize], what)
+        points = parse_points(payload[FRAME.size : middle], what)
     except UnfitError as error:
         raise UnfitError(str(error), number) from None
-    return Frame(number, state, timestamp, pose, points, payload[FRAME.size + count * POINT.itemsize :])
+    return Frame(number, state, timestamp, pose, points, payload[middle:])
 
 
 def parse_points(block: bytes, what: str) -> SparsePoints:
     """Parse the points of a frame. Raises UnfitError, whose message begins with `what`, if they are invalid."""
-    table = np.frombuffer(block, dtype=POINT)
-    if not all((np.abs(table[name]) <= FARTHEST).all() for name in ("xyz", "pixel")):
-        raise UnfitError(f"{what}: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
-    if len(np.unique(table["id"])) != len(table):
-        raise UnfitError(f"{what}: a point stands twice: ids are unique in a frame")
+    table = _points(block, POINT, what)
     xyz, pixels = (table[name].astype(np.float64) for name in ("xyz", "pixel"))
     return SparsePoints(xyz, pixels, table["id"].astype(np.int64))
 
@@ -336,16 +319,22 @@ def parse_correction(payload: bytes) -> Correction:
     if poses == 0 or size != len(payload):
         raise ProtocolError(f"CORRECTION: {poses} poses and {points} points make {size} bytes, it has {len(payload)}")
     frames = np.frombuffer(payload[CORRECTION.size : middle], dtype=MOVED_POSE)
-    moved = np.frombuffer(payload[middle:], dtype=MOVED_POINT)
     numbers = frames["number"].astype(np.int64)
     if (np.diff(numbers) <= 0).any():
         raise UnfitError("CORRECTION: frames must be named once each, in their order")
     matrices = [_pose(row["T"], f"CORRECTION of frame {row['number']}") for row in frames]
-    if not (np.abs(moved["xyz"]) <= FARTHEST).all():
-        raise UnfitError(f"CORRECTION: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
-    if len(np.unique(moved["id"])) != len(moved):
-        raise UnfitError("CORRECTION: a point stands twice")
+    moved = _points(payload[middle:], MOVED_POINT, "CORRECTION")
     return Correction(numbers, np.stack(matrices), moved["id"].astype(np.int64), moved["xyz"].astype(np.float64))
+
+
+def _points(block: bytes, layout: np.dtype, what: str) -> NDArray:
+    """Read a table of points, whose ids must be unique and whose coordinates must be finite."""
+    table = np.frombuffer(block, dtype=layout)
+    if not all((np.abs(table[name]) <= FARTHEST).all() for name in layout.fields or () if name != "id"):
+        raise UnfitError(f"{what}: its points hold NaN or infinite numbers, or such beyond {FARTHEST:g}")
+    if len(np.unique(table["id"])) != len(table):
+        raise UnfitError(f"{what}: a point stands twice: send each id once")
+    return table
 
 
 def _pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:

@@ -48,11 +48,6 @@ class Ordering:
         """Whether a frame has arrived."""
         return self._last is not None
 
-    @property
-    def undecided(self) -> int:
-        """Number of frames whose pose has not arrived."""
-        return len(self._undecided)
-
     def require_next(self, frame: Frame) -> None:
         """Raise UnfitError unless the frame's number and time stamp exceed those of the last frame."""
         if self._last is None:

@@ -19,8 +19,7 @@ from modp_ti.inputs.replay import is_held_out, points_inside, unmasked
 from modp_ti.inputs.sources import FrameReader, Undistorter
 from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, SenderGoneError
 from modp_ti.inputs.tracker_server.history import Delivered, History
-from modp_ti.inputs.tracker_server.listening import listen, open_to_others
-from modp_ti.inputs.tracker_server.lobby import Lobby
+from modp_ti.inputs.tracker_server.listening import Lobby, listen, open_to_others
 from modp_ti.inputs.tracker_server.messages import (
     Correction,
     Frame,
@@ -207,17 +206,17 @@ class TrackerServer(Tracker):
         problem = None
         try:
             while True:
-                header, payload = connection.receive(hello)
-                if header.kind is Kind.END:
+                kind, payload = connection.receive(hello)
+                if kind is Kind.END:
                     break
-                if header.kind is Kind.HELLO:
+                if kind is Kind.HELLO:
                     hello = parse_hello(payload)
                     self._prepare(hello)
                     self._name = hello.name
                     connection.say(Kind.WELCOME)
                 else:
                     try:
-                        self._take(header.kind, payload, ordering)
+                        self._take(kind, payload, ordering)
                     except UnfitError as error:
                         self._leave_out(error, ordering)
                     self._deliver(ordering)
