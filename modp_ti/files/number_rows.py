@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import LARGEST, text_lines
+from modp_ti.files import LARGEST, input_lines
 from modp_ti.files.errors import InputError
 
 __all__ = ["NumberRows", "read_number_rows"]
@@ -41,17 +40,6 @@ class NumberRows:
         return f"{self.path}:{self.lines[row]}"
 
 
-def _lines(path: Path, setting: str) -> Iterator[str]:
-    """Lines of a text file. Raises InputError, which names the key `setting`, if it cannot be read."""
-    try:
-        yield from text_lines(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file ({setting})") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
-        raise InputError(f"{path}: cannot be read as text: {reason} ({setting})") from None
-
-
 def read_number_rows(
     path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False, few: float = 0.0
 ) -> NumberRows:
@@ -71,7 +59,7 @@ def read_number_rows(
     """
     values, lines = array("d"), array("q")
     bad: list[int] = []
-    for number, line in enumerate(_lines(path, setting), start=1):
+    for number, line in enumerate(input_lines(path, f" ({setting})"), start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
         if not words:
             continue
