@@ -41,7 +41,13 @@ class NumberRows:
 
 
 def read_number_rows(
-    path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False, few: float = 0.0
+    path: Path,
+    columns: int,
+    meaning: str,
+    setting: str = "tracker.path",
+    more: bool = False,
+    few: float = 0.0,
+    least: int = 1,
 ) -> NumberRows:
     """Read a text table whose rows have `columns` finite numbers each.
 
@@ -52,6 +58,7 @@ def read_number_rows(
         setting: The configuration key that names the file, for error messages.
         more: Accept and ignore further columns.
         few: Largest share of the rows that may contain NaN or Inf; these rows are skipped.
+        least: Least number of rows, 0 or 1.
 
     Raises:
         InputError: With file and line, if a row has another number of columns, text, too many rows contain NaN or Inf,
@@ -78,7 +85,7 @@ def read_number_rows(
         lines.append(number)
     if len(bad) > few * (len(lines) + len(bad)):
         raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers; take the line out")
-    if not lines:
+    if len(lines) < least:
         raise InputError(f"{path}: holds no row of {meaning} ({setting})")
     rows = np.frombuffer(values).reshape(-1, columns)
     return NumberRows(path, rows, np.frombuffer(lines, dtype=np.int64), len(bad))

@@ -21,9 +21,9 @@ FARTHEST = 1e12
 MAX_LENGTH_ERROR = 1e-2
 
 
-def read_tum_rows(path: Path, few: float = 0.0) -> NumberRows:
+def read_tum_rows(path: Path, setting: str = "tracker.path", few: float = 0.0, least: int = 1) -> NumberRows:
     """Read the lines `time tx ty tz qx qy qz qw` of a TUM trajectory, camera to world; see `read_number_rows`."""
-    return read_number_rows(path, 8, "time tx ty tz qx qy qz qw", few=few)
+    return read_number_rows(path, 8, "time tx ty tz qx qy qz qw", setting, few=few, least=least)
 
 
 def tum_poses(rows: NumberRows) -> NDArray[np.float64]:

@@ -52,7 +52,7 @@ def read_trajectory_file(path: Path) -> TimedPoses:
         InputError: If a line has the wrong number of columns or a quaternion that is not of unit length, or if too many
             lines are faulty. The message names file and line.
     """
-    rows = read_tum_rows(path, FEW)
+    rows = read_tum_rows(path, few=FEW)
     rising, left_out = _rising(rows.values[:, 0]), rows.left_out
     if len(rows) - len(rising) <= FEW * len(rows):
         left_out += len(rows) - len(rising)

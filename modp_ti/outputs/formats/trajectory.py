@@ -53,7 +53,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], 
     Raises:
         InputError: If the file is not a TUM trajectory. The message names the line.
     """
-    rows = read_tum_rows(Path(path))
+    rows = read_tum_rows(Path(path), "a trajectory in TUM's format", least=0)
     return rows.values[:, 0], tum_poses(rows)
 
 
