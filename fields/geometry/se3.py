@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     import torch
 
 __all__ = [
+    "camera_centres",
     "exp_se3",
     "hat",
     "interpolate_se3",
+    "inverse_poses",
     "inverse_se3",
     "log_se3",
     "matrices_from_unit_quaternions",
@@ -77,6 +79,20 @@ def inverse_se3(T: ArrayLike) -> NDArray[np.float64]:
     inverse = np.eye(4)
     inverse[:3, :3] = T[:3, :3].T
     inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
+def camera_centres(poses: ArrayLike) -> NDArray[np.float64]:
+    """World positions (N, 3) of cameras with T_camera_world (N, 4, 4)."""
+    T_camera_world = np.asarray(poses)
+    return -np.einsum("nji,nj->ni", T_camera_world[:, :3, :3], T_camera_world[:, :3, 3])
+
+
+def inverse_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Invert rigid motions (N, 4, 4)."""
+    inverse = np.tile(np.eye(4), (len(poses), 1, 1))
+    inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    inverse[:, :3, 3] = camera_centres(poses)
     return inverse
 
 

@@ -1,7 +1,7 @@
 """The `tracker` section of a scene: one model per `tracker.kind`, with only the keys of that kind.
 
-To add a kind, write its model here, add it to `AnyTrackerSettings`, and register its opener in
-`modp_ti.inputs.trackers.openers`.
+To add a kind, write its model here, add it to `AnyTrackerSettings`, and open it in
+`modp_ti.inputs.trackers.open_tracker`.
 """
 
 from __future__ import annotations

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from modp_ti.files.json_text import parse_json, read_json
-from modp_ti.files.reading import LARGEST, exists, is_file, limited_lines, open_file, read_bytes, read_text, text_lines
+from modp_ti.files.reading import (
+    LARGEST,
+    exists,
+    input_lines,
+    is_file,
+    limited_lines,
+    open_file,
+    read_bytes,
+    read_text,
+    readable,
+    text_lines,
+)
 
 __all__ = [
     "LARGEST",
     "exists",
+    "input_lines",
     "is_file",
     "limited_lines",
     "open_file",
@@ -15,5 +27,6 @@ __all__ = [
     "read_bytes",
     "read_json",
     "read_text",
+    "readable",
     "text_lines",
 ]

@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import LARGEST, limited_lines, open_file
+from modp_ti.files import LARGEST, limited_lines, open_file, readable
 from modp_ti.files.errors import InputError
 
 __all__ = ["read_csv_blocks"]
@@ -39,17 +39,13 @@ def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[in
         InputError: With file and line, if a column is missing from the header, a row has the wrong length, or a value
             is not a finite number; with the file, if it is truncated or cannot be read.
     """
-    try:
-        with open_file(path) as stored:
-            unpacked = _Unpacked(path, stored) if path.suffix == ".gz" else stored
+    with readable(path), open_file(path) as stored:
+        unpacked = _Unpacked(path, stored) if path.suffix == ".gz" else stored
+        try:
             with io.TextIOWrapper(unpacked, encoding="utf-8") as file:
                 yield from _blocks(path, limited_lines(file), columns)
-    except (EOFError, zlib.error, gzip.BadGzipFile):
-        raise InputError(f"{path}: the gzip file is cut off or damaged; copy it again") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: holds bytes that are no text") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        except (EOFError, zlib.error, gzip.BadGzipFile):
+            raise InputError(f"{path}: the gzip file is cut off or damaged; copy it again") from None
 
 
 class _Unpacked(gzip.GzipFile):

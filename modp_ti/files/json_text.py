@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from modp_ti.files.errors import InputError
-from modp_ti.files.reading import read_text
+from modp_ti.files.reading import read_text, readable
 
 __all__ = ["parse_json", "read_json"]
 
@@ -31,11 +31,8 @@ def read_json(path: Path, setting: str) -> Any:
     Raises:
         InputError: If the file cannot be read as text or is not valid JSON.
     """
-    try:
+    with readable(path, f" ({setting})"):
         text = read_text(path, "utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
-        raise InputError(f"{path}: cannot be read as text: {reason} ({setting})") from None
     return parse_json(text, str(path))
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import LARGEST, text_lines
+from modp_ti.files import LARGEST, input_lines
 from modp_ti.files.errors import InputError
 
 __all__ = ["NumberRows", "read_number_rows"]
@@ -41,19 +40,14 @@ class NumberRows:
         return f"{self.path}:{self.lines[row]}"
 
 
-def _lines(path: Path, setting: str) -> Iterator[str]:
-    """Lines of a text file. Raises InputError, which names the key `setting`, if it cannot be read."""
-    try:
-        yield from text_lines(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file ({setting})") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
-        raise InputError(f"{path}: cannot be read as text: {reason} ({setting})") from None
-
-
 def read_number_rows(
-    path: Path, columns: int, meaning: str, setting: str = "tracker.path", more: bool = False, few: float = 0.0
+    path: Path,
+    columns: int,
+    meaning: str,
+    setting: str = "tracker.path",
+    more: bool = False,
+    few: float = 0.0,
+    least: int = 1,
 ) -> NumberRows:
     """Read a text table whose rows have `columns` finite numbers each.
 
@@ -64,6 +58,7 @@ def read_number_rows(
         setting: The configuration key that names the file, for error messages.
         more: Accept and ignore further columns.
         few: Largest share of the rows that may contain NaN or Inf; these rows are skipped.
+        least: Least number of rows, 0 or 1.
 
     Raises:
         InputError: With file and line, if a row has another number of columns, text, too many rows contain NaN or Inf,
@@ -71,7 +66,7 @@ def read_number_rows(
     """
     values, lines = array("d"), array("q")
     bad: list[int] = []
-    for number, line in enumerate(_lines(path, setting), start=1):
+    for number, line in enumerate(input_lines(path, f" ({setting})"), start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
         if not words:
             continue
@@ -90,7 +85,7 @@ def read_number_rows(
         lines.append(number)
     if len(bad) > few * (len(lines) + len(bad)):
         raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers; take the line out")
-    if not lines:
+    if len(lines) < least:
         raise InputError(f"{path}: holds no row of {meaning} ({setting})")
     rows = np.frombuffer(values).reshape(-1, columns)
     return NumberRows(path, rows, np.frombuffer(lines, dtype=np.int64), len(bad))

@@ -1,6 +1,6 @@
 """Bounded reading of regular files. Pipes, devices and files too large for the memory are refused.
 
-Failures raise OSError with a readable `strerror`, from which each reader builds its own message.
+Failures raise OSError with a readable `strerror`. Readers report it through `readable`.
 """
 
 from __future__ import annotations
@@ -10,20 +10,24 @@ import io
 import os
 import stat
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from modp_ti.files.memory import available_memory
+from modp_ti.files.errors import InputError
 
 __all__ = [
     "LARGEST",
     "MAX_LINE",
+    "available_memory",
     "exists",
+    "input_lines",
     "is_file",
     "limited_lines",
     "open_file",
     "read_bytes",
     "read_text",
+    "readable",
     "text_lines",
 ]
 
@@ -35,6 +39,12 @@ LARGEST = 1e30
 
 # Share of the available memory that one file may take.
 SHARE = 0.25
+# Bytes of memory assumed where the system does not report its memory.
+ASSUMED = 4 << 30
+CGROUP_LIMITS = (
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
 
 
 def is_file(path: Path) -> bool:
@@ -45,6 +55,24 @@ def is_file(path: Path) -> bool:
 def exists(path: Path) -> bool:
     """Whether `path` exists. Invalid paths give False."""
     return os.path.exists(path)
+
+
+@contextmanager
+def readable(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
+    """Report a file that cannot be read within the block as an InputError that names it.
+
+    Args:
+        path: The file.
+        hint: End of the message, for example the configuration key that names the file.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file{hint}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: cannot be read as text: it holds bytes that are no text{hint}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}{hint}") from None
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:
@@ -106,6 +134,12 @@ def text_lines(path: str | os.PathLike[str], encoding: str = "utf-8-sig", longes
         yield from limited_lines(text, longest)
 
 
+def input_lines(path: Path, hint: str = "", longest: int = MAX_LINE) -> Iterator[str]:
+    """Iterate over the lines of the user's file as `text_lines` does. Failures are reported as by `readable`."""
+    with readable(path, hint):
+        yield from text_lines(path, longest=longest)
+
+
 def limited_lines(text: io.TextIOBase, longest: int = MAX_LINE) -> Iterator[str]:
     """Iterate over the lines of an open text stream. Raises OSError for one with more than `longest` characters."""
     number = 0
@@ -114,3 +148,38 @@ def limited_lines(text: io.TextIOBase, longest: int = MAX_LINE) -> Iterator[str]
         if len(line) > longest:
             raise OSError(errno.EFBIG, f"line {number} has more than {longest:,} characters")
         yield line
+
+
+def available_memory() -> int:
+    """Approximate bytes that this process can still allocate: the least that machine, container and rlimit allow."""
+    return max(0, min(_of_machine(), *(_of_container(*files) for files in CGROUP_LIMITS), _of_process()))
+
+
+def _of_machine() -> int:
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) << 10
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError, IndexError):
+        return ASSUMED
+
+
+def _of_container(limit: str, used: str) -> int:
+    try:
+        return int(Path(limit).read_text(encoding="ascii")) - int(Path(used).read_text(encoding="ascii"))
+    except (OSError, ValueError):  # no such cgroup file, or its limit is "max"
+        return 1 << 62
+
+
+def _of_process() -> int:
+    try:
+        import resource
+
+        soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if soft == resource.RLIM_INFINITY:
+            return 1 << 62
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        return soft - pages * resource.getpagesize()
+    except (ImportError, OSError, ValueError):
+        return 1 << 62

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.association import MAX_DIFFERENCE, associate
-from modp_ti.inputs.trackers.trajectory import Trajectory, read_trajectory_file
+from modp_ti.inputs.trackers.trajectory import TimedPoses, read_trajectory_file
 
 __all__ = ["open_ground_truth", "true_poses"]
 
@@ -18,7 +18,7 @@ __all__ = ["open_ground_truth", "true_poses"]
 LEAST_FRAMES = 3
 
 
-def open_ground_truth(path: Path | None) -> Trajectory | None:
+def open_ground_truth(path: Path | None) -> TimedPoses | None:
     """Read `source.ground_truth`, a trajectory in TUM format. None if the scene has none.
 
     Raises:
@@ -31,7 +31,7 @@ def open_ground_truth(path: Path | None) -> Trajectory | None:
     return read_trajectory_file(path)
 
 
-def true_poses(truth: Trajectory, timestamps: Sequence[float]) -> tuple[list[NDArray[np.float64]], str | None]:
+def true_poses(truth: TimedPoses, timestamps: Sequence[float]) -> tuple[list[NDArray[np.float64]], str | None]:
     """Associate a trajectory with frames by time, within `MAX_DIFFERENCE`.
 
     Args:

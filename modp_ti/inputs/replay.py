@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import FEW, InputError, UnreadableImageError
+from modp_ti.files.trajectory import FARTHEST
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 
 __all__ = [
-    "FARTHEST",
     "PosedImage",
     "ReplayedTracker",
     "checked_pose",
@@ -30,9 +30,6 @@ __all__ = [
 
 # Largest deviation of R^T R from the identity. Rounding in text files stays below it.
 MAX_ROTATION_DEFECT = 1e-2
-
-FARTHEST = 1e12
-"""Largest valid coordinate [scene units]. Squared coordinates must fit the map's float32."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def _tum(file: Path) -> None:
 
 
 def _points(file: Path) -> None:
-    from modp_ti.inputs.trackers.point_file import read_point_file
+    from modp_ti.inputs.trackers.point_cloud import read_point_file
 
     read_point_file(file)
 
@@ -115,7 +115,7 @@ def _stella(file: Path) -> None:
 
 
 def _image(file: Path) -> None:
-    from modp_ti.inputs.sources.exif import focal_length_35mm
+    from modp_ti.inputs.sources.image_header import focal_length_35mm
     from modp_ti.inputs.sources.listed_images import ListedImages
     from modp_ti.inputs.sources.vignette import read_vignette
 

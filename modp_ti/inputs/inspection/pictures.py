@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from modp_ti.inputs.inspection.finding import Finding, note, unusable, warning
 from modp_ti.inputs.inspection.survey import FrameRecord
 
-__all__ = ["blurred", "centres", "duplicates", "judge_sequence", "time_gaps"]
+__all__ = ["blurred", "duplicates", "judge_sequence", "time_gaps"]
 
 # A frame is blurred if its sharpness is below this factor of the median of the AROUND frames on each side. The factor
 # is the default of keyframe selection.
@@ -47,11 +47,6 @@ def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
     if len(steps) == 0 or np.median(steps) <= 0:
         return []
     return (np.flatnonzero(steps > GAP * np.median(steps)) + 1).tolist()
-
-
-def centres(frames: Sequence[FrameRecord]) -> NDArray[np.float64]:
-    """Camera centres (N, 3) in the world."""
-    return np.array([-f.T_camera_world[:3, :3].T @ f.T_camera_world[:3, 3] for f in frames])
 
 
 def judge_sequence(frames: Sequence[FrameRecord]) -> Iterator[Finding]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import camera_centres
 from modp_ti.inputs.inspection.finding import Finding, note, unusable, warning
-from modp_ti.inputs.inspection.pictures import centres
 from modp_ti.inputs.inspection.survey import FrameRecord
 
 __all__ = ["Scale", "judge_scale", "measure_scale"]
@@ -46,7 +46,7 @@ def measure_scale(frames: Sequence[FrameRecord]) -> Scale:
     """Measure depth and camera motion. There must be at least one frame."""
     depths = np.array([frame.depth for frame in frames])
     depth = float(np.nanmedian(depths)) if np.isfinite(depths).any() else float("nan")
-    places = centres(frames)
+    places = camera_centres([frame.T_camera_world for frame in frames])
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1) / depth
     extent = float(np.linalg.norm(np.ptp(places, axis=0)) / depth)
     if len(steps) == 0:

@@ -22,7 +22,7 @@ from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import is_held_out, require_few, unmasked, unreadable_note
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
-from modp_ti.inputs.sources.exif import focal_length_35mm
+from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 __all__ = ["ArrivingNames", "KltTracker", "open_klt"]
 

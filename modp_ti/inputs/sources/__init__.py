@@ -5,18 +5,22 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.data_sets import (
+    RELEASE_IMAGES,
+    find_replica_images,
+    find_sevenscenes_images,
+    open_release,
+    open_replica,
+    open_sevenscenes,
+)
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.frame_reader import FrameReader, Picture
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.intrinsics import Intrinsics, given_intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource, require_intrinsics
-from modp_ti.inputs.sources.recognition import recognised_kind
-from modp_ti.inputs.sources.release import open_release
-from modp_ti.inputs.sources.replica import open_replica
-from modp_ti.inputs.sources.sevenscenes import open_sevenscenes
 from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
 from modp_ti.inputs.sources.undistortion import Undistorter
-from modp_ti.inputs.sources.video_file import VideoFile
+from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,6 +39,7 @@ __all__ = [
     "Undistorter",
     "VideoFile",
     "open_source",
+    "recognised_kind",
     "require_intrinsics",
 ]
 
@@ -63,6 +68,40 @@ def open_source(source: SourceSettings) -> ImageSource:
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
         images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
     return _with_camera(images, source)
+
+
+def recognised_kind(path: Path) -> str:
+    """Return the `source.kind` of a file or folder.
+
+    Folders of unknown layout and paths that do not exist give `images`.
+
+    Args:
+        path: The file or folder.
+
+    Raises:
+        InputError: If the path is a file of an unknown type.
+    """
+    suffix = path.suffix.lower()
+    if not path.is_dir():
+        if suffix == ".vrs":
+            return "vrs"
+        if suffix in VIDEO_SUFFIXES:
+            return "video"
+        if path.exists():
+            raise InputError(
+                f"{path}: is neither a folder of images nor a file that {suffix or 'its missing suffix'} tells to be a "
+                "video or a VRS recording; where it is a video, set source.kind: video"
+            )
+        return "images"
+    if (path / "rgb.txt").is_file():
+        return "tum_rgbd"
+    if find_replica_images(path):
+        return "replica"
+    if find_sevenscenes_images(path):
+        return "sevenscenes"
+    if (path / RELEASE_IMAGES).is_dir():
+        return "release"
+    return "images"
 
 
 def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:

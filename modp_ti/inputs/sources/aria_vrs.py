@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.known_frames import KnownFrames
+from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.vignette import read_vignette
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ __all__ = ["AriaRecording"]
 RGB = "camera-rgb"
 
 
-class AriaRecording(KnownFrames):
+class AriaRecording(ImageSource):
     """An `ImageSource` of the stream `camera-rgb` of a VRS file. Frame n is called `<file stem>_<n, six digits>`.
 
     Images are resampled to a pinhole camera with the position and axes of the fisheye camera. Aria's RGB camera is
@@ -61,35 +61,16 @@ class AriaRecording(KnownFrames):
                 f"{path}: reading a VRS recording needs projectaria-tools ({error}): pip install 'modp-ti[aria]'"
             ) from None
         self._lock = Lock()
-        if not path.is_file():
-            raise InputError(f"{path}: no such VRS file (source.path)")
-        try:
-            with _quiet():
-                provider = data_provider.create_vrs_data_provider(str(path))
-        except RuntimeError:  # for example, the file ends before its configuration
-            provider = None
-        if provider is None:
-            raise InputError(f"{path}: not a VRS recording, or it is cut off before its first image; copy it again")
+        provider, self._stream = _opened(data_provider, path)
         self._provider: Any = provider
-        labels = [provider.get_label_from_stream_id(stream) for stream in provider.get_all_streams()]
-        self._stream = provider.get_stream_id_from_label(RGB) if RGB in labels else None
-        if self._stream is None:
-            raise InputError(
-                f"{path}: holds no stream {RGB}, which the map is made of; it holds {', '.join(labels) or 'none'}: "
-                "record with a profile that has RGB"
-            )
-        if provider.get_num_data(self._stream) == 0:
-            raise InputError(f"{path}: holds no image of {RGB}, which the map is made of; is the file cut off?")
         device = provider.get_device_calibration()
         fisheye = None if device is None else device.get_camera_calib(RGB)
         if fisheye is None:
             raise InputError(f"{path}: holds no calibration of {RGB}, without which its images cannot be undistorted")
-        T_device_camera = np.asarray(fisheye.get_transform_device_camera().to_matrix())
-
         nanoseconds = provider.get_timestamps_ns(self._stream, sensor_data.TimeDomain.DEVICE_TIME)
         times = np.array(nanoseconds, dtype=np.float64) * 1e-9
         super().__init__(path, [f"{path.stem}_{i:06d}" for i in range(len(times))], times)
-        self.T_device_camera = T_device_camera
+        self.T_device_camera = np.asarray(fisheye.get_transform_device_camera().to_matrix())
 
         raw = self._recorded(0)
         width, height = (int(value) for value in fisheye.get_image_size())
@@ -187,6 +168,29 @@ class _Rectification:
         image = cv2.remap(image, self._x, self._y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         image[~self.covered] = 0
         return image
+
+
+def _opened(data_provider: Any, path: Path) -> tuple[Any, Any]:
+    """Open a recording with the library's module. Returns its data provider and the id of the RGB stream."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such VRS file (source.path)")
+    try:
+        with _quiet():
+            provider = data_provider.create_vrs_data_provider(str(path))
+    except RuntimeError:  # for example, the file ends before its configuration
+        provider = None
+    if provider is None:
+        raise InputError(f"{path}: not a VRS recording, or it is cut off before its first image; copy it again")
+    labels = [provider.get_label_from_stream_id(stream) for stream in provider.get_all_streams()]
+    stream = provider.get_stream_id_from_label(RGB) if RGB in labels else None
+    if stream is None:
+        raise InputError(
+            f"{path}: holds no stream {RGB}, which the map is made of; it holds {', '.join(labels) or 'none'}: "
+            "record with a profile that has RGB"
+        )
+    if provider.get_num_data(stream) == 0:
+        raise InputError(f"{path}: holds no image of {RGB}, which the map is made of; is the file cut off?")
+    return provider, stream
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from PIL import BmpImagePlugin, PpmImagePlugin
 from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
 
-from modp_ti.files.memory import available_memory
+from modp_ti.files.reading import available_memory
 from modp_ti.inputs.sources.image_header import HEADER_ERRORS, JpegHeader, bounded, read_tiff_directory
 
 __all__ = ["MAX_IMAGE_PIXELS", "why_undecodable"]

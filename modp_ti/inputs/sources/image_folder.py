@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.known_frames import IMAGE_SUFFIXES
 from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES
 
 __all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key", "times_of_names"]
 

@@ -14,11 +14,22 @@ import io
 import struct
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, BinaryIO
 
-from PIL import JpegImagePlugin, TiffImagePlugin
+from PIL import ExifTags, JpegImagePlugin, TiffImagePlugin
 
-__all__ = ["HEADER_ERRORS", "ImageHeader", "JpegHeader", "bounded", "read_image_header", "read_tiff_directory"]
+from modp_ti.files import open_file
+
+__all__ = [
+    "HEADER_ERRORS",
+    "ImageHeader",
+    "JpegHeader",
+    "bounded",
+    "focal_length_35mm",
+    "read_image_header",
+    "read_tiff_directory",
+]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"IEND\xaeB`\x82"
@@ -140,3 +151,15 @@ def _ends_with(file: BinaryIO, marker: bytes) -> bool:
         return True
     file.seek(here)
     return marker in file.read()
+
+
+def focal_length_35mm(path: Path) -> float | None:
+    """Read the focal length in 35 mm equivalent [mm] from a JPEG file, or return None if it is not stated."""
+    try:
+        with open_file(path) as file:
+            tiff = JpegHeader(bounded(file)).info["exif"].removeprefix(b"Exif\0\0")
+        inner = read_tiff_directory(tiff)[ExifTags.IFD.Exif]
+        value = read_tiff_directory(tiff, inner)[ExifTags.Base.FocalLengthIn35mmFilm]
+    except HEADER_ERRORS:  # also raised if EXIF or the tag is missing
+        return None
+    return float(value) if isinstance(value, int) and value > 0 else None

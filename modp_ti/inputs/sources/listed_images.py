@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -14,12 +15,12 @@ from modp_ti.files.errors import UnreadableImageError
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.known_frames import IMAGE_SUFFIXES, KnownFrames
+from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 
-__all__ = ["ListedImages", "decoded", "decoded_as"]
+__all__ = ["ListedImages", "decoded", "decoded_as", "quiet_opencv"]
 
 
-class ListedImages(KnownFrames):
+class ListedImages(ImageSource):
     """An `ImageSource` of files in one folder.
 
     Args:
@@ -127,10 +128,20 @@ def decoded_as(data: bytes, flags: int) -> NDArray | None:
     """Decode an image file's bytes with OpenCV's flags, BGR and silently; None if that fails."""
     import cv2
 
+    with quiet_opencv():
+        try:
+            return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error:
+            return None
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Silence OpenCV on the terminal within the block. Errors are reported by the caller."""
+    import cv2
+
     log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        return None
+        yield
     finally:
         cv2.utils.logging.setLogLevel(log_level)

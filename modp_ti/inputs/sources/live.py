@@ -14,15 +14,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.known_frames import find_frame
-from modp_ti.inputs.sources.listed_images import decoded
+from modp_ti.inputs.sources.listed_images import decoded, quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
 
 __all__ = ["LiveSource"]
@@ -58,9 +56,6 @@ class LiveSource(ImageSource):
             stream = int(stream)
         super().__init__(Path(_shown(stream)))
         self.dropped = 0
-        self._names: list[str] = []
-        self._position: dict[str, int] = {}
-        self._times: list[float] = []
         self._waiting: deque[tuple[float, NDArray[np.uint8]]] = deque()
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
@@ -97,29 +92,8 @@ class LiveSource(ImageSource):
             )
         return notes
 
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the frames delivered so far."""
-        return self._names
-
-    def position(self, name: str) -> int:
-        """Return the position of the frame among those delivered, from 0."""
-        return self._position[name]
-
-    def timestamp(self, name: str) -> float:
-        """Return the time at which the frame arrived [s], on the Unix clock."""
-        return self._times[self._position[name]]
-
-    def find(self, name: str) -> str | None:
-        """Find the frame of that name, ignoring folders and an image suffix, or return None."""
-        return find_frame(name, self._position)
-
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
-        """Return the names of delivered frames at positions start, start + step, ... before stop.
-
-        Raises:
-            InputError: If there are none, which is always the case before the first frame is delivered.
-        """
+        """Return the names of delivered frames; see `ImageSource`. There are none before the first is delivered."""
         names = self._names[start:stop:step]
         if not names:
             raise InputError(f"{self.path}: a live source has no past frames: take a tracker that follows it")
@@ -227,10 +201,7 @@ class LiveSource(ImageSource):
                 f"{self._kept.name}: frames of the live source cannot be kept there: {error.strerror}; "
                 "make room, or set TMPDIR to a folder that has some"
             ) from None
-        name = f"live_{number:06d}"
-        self._times.append(arrived)
-        self._position[name] = number
-        self._names.append(name)
+        self._append(f"live_{number:06d}", arrived)
 
     def _file(self, number: int) -> Path:
         return Path(self._kept.name) / f"{number:06d}.png"
@@ -264,7 +235,8 @@ def _open(stream: int | str):
 
     if isinstance(stream, str) and Path(stream).is_file():
         raise InputError(f"{stream}: is a file (source.stream): give it as source.path")
-    with _quiet_decoder():
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first stream is opened
+    with quiet_opencv():
         try:
             if isinstance(stream, int) or "://" not in stream:  # a camera, by number or device path
                 capture = cv2.VideoCapture(stream)
@@ -278,16 +250,3 @@ def _open(stream: int | str):
         what = "no such camera, or it is in use" if isinstance(stream, int) else "no stream that can be opened"
         raise InputError(f"{_shown(stream)}: {what} (source.stream)")
     return capture
-
-
-@contextmanager
-def _quiet_decoder() -> Iterator[None]:
-    """Silence OpenCV and its FFmpeg on the terminal. Errors are reported by the caller."""
-    import cv2
-
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first stream is opened
-    log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(log_level)

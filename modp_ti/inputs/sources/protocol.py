@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,18 @@ from numpy.typing import NDArray
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 
-__all__ = ["ImageSource", "require_intrinsics"]
+__all__ = ["IMAGE_SUFFIXES", "ImageSource", "require_intrinsics"]
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 
 class ImageSource(ABC):
     """Base class of image sources: images by name, in the order in which they were taken, decoded on demand.
+
+    Args:
+        path: Location of the images.
+        names: Names of the images that are known at the start, in order.
+        times: Time of each of them [s].
 
     Attributes:
         path: Location of the images, for messages.
@@ -27,12 +34,23 @@ class ImageSource(ABC):
             for a camera alone.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, names: Iterable[str] = (), times: Iterable[float] = ()) -> None:
         self.path = path
         self.intrinsics: Intrinsics | None = None
         self.vignette: NDArray[np.float32] | None = None
         self.T_device_camera: NDArray[np.float64] | None = None
         self._notes: list[str] = []
+        self._names: list[str] = []
+        self._times: list[float] = []
+        self._position: dict[str, int] = {}
+        for name, time in zip(names, times, strict=True):
+            self._append(name, time)
+
+    def _append(self, name: str, time: float) -> None:
+        """Add an image and the time at which it was taken [s]. Live sources do so while they run."""
+        self._times.append(float(time))
+        self._position[name] = len(self._names)
+        self._names.append(name)
 
     @property
     def notes(self) -> list[str]:
@@ -44,32 +62,44 @@ class ImageSource(ABC):
         self._notes.insert(0 if first else len(self._notes), note)
 
     @property
-    @abstractmethod
     def names(self) -> Sequence[str]:
-        """Names of all images. The names of a live source grow while it runs."""
+        """Names of all images, in order. The names of a live source grow while it runs."""
+        return self._names
 
     def __len__(self) -> int:
         return len(self.names)
 
-    @abstractmethod
     def position(self, name: str) -> int:
         """Return the position of an image in `names`, from 0."""
+        return self._position[name]
 
-    @abstractmethod
     def timestamp(self, name: str) -> float:
         """Return the time at which the image was taken [s]."""
+        return self._times[self._position[name]]
 
-    @abstractmethod
     def find(self, name: str) -> str | None:
-        """Find the image that a tracker's file name refers to, or return None."""
+        """Find the image that a tracker's file name refers to, or return None. Folders and image suffix are ignored.
 
-    @abstractmethod
+        This is for sources that name their frames themselves. A number alone does not match, because programs that
+        extract frames differ in counting from 0 or from 1.
+        """
+        path = PurePosixPath(name.replace("\\", "/"))
+        tail = path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
+        return tail if tail in self._position else None
+
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
         """Return the names at positions start, start + step, ... before stop.
 
         Raises:
             InputError: If there are none.
         """
+        names = self._names[start:stop:step]
+        if not names:
+            raise InputError(
+                f"{self.path}: source.start={start} leaves no frame of the {len(self)} "
+                f"in the {'folder' if self.path.is_dir() else 'file'}"
+            )
+        return names
 
     def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
         """Yield the names of `selected` as soon as their images are available. Ends when no more will come."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files import LARGEST, is_file, text_lines
+from modp_ti.files import LARGEST, input_lines, is_file
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.intrinsics import Intrinsics
@@ -17,6 +16,7 @@ from modp_ti.inputs.sources.listed_images import ListedImages
 __all__ = ["open_tum_rgbd", "read_listing"]
 
 WIDTH, HEIGHT = 640, 480
+HINT = "; it should list the images (source.path)"
 
 # Published calibrations of the benchmark's three cameras: fx, fy, cx, cy with pixel centres at whole numbers, and the
 # lens. The images of the third camera are already undistorted.
@@ -79,7 +79,7 @@ def read_listing(file: Path) -> list[tuple[float, str]]:
     """
     entries: list[tuple[float, str]] = []
     first_line: dict[str, int] = {}
-    for number, line in enumerate(_lines(file), 1):
+    for number, line in enumerate(input_lines(file, HINT), 1):
         words = line.partition("#")[0].split(maxsplit=1)
         if not words:
             continue
@@ -104,18 +104,10 @@ def read_listing(file: Path) -> list[tuple[float, str]]:
     return entries
 
 
-def _lines(file: Path) -> Iterator[str]:
-    try:
-        yield from text_lines(file, "utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise InputError(f"{file}: the listing of the images cannot be read: {reason}") from None
-
-
 def _camera_number(path: Path, listing: Path) -> int | None:
     """Return the camera, 1, 2 or 3, from the folder's name or else from the comments of the listing."""
     found = CAMERA_NAME.search(path.resolve().name)
     if found is None:
-        comments = [line for line in _lines(listing) if line.startswith("#")]
+        comments = [line for line in input_lines(listing, HINT) if line.startswith("#")]
         found = next(filter(None, map(CAMERA_NAME.search, comments)), None)
     return None if found is None else int(found.group(1))

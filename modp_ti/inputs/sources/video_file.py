@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.known_frames import KnownFrames
+from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.video_container import missing_bytes
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ PASSED_OVER = 60
 SEEK_MARGINS = (0.0, 1.0, 10.0, 100.0)
 
 
-class VideoFile(KnownFrames):
+class VideoFile(ImageSource):
     """An `ImageSource` of a video file. Frame n, from 0, is called `<file stem>_<n, six digits>`.
 
     The file is decoded once when it is opened, because only that gives the number of frames and their times. Frames are

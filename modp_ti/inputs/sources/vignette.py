@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import read_bytes
+from modp_ti.files import read_bytes, readable
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.listed_images import decoded_as
@@ -29,10 +29,8 @@ def read_vignette(path: Path) -> NDArray[np.float32]:
     """
     import cv2
 
-    try:
+    with readable(path, "; it should be the vignette (source.vignette)"):
         data = read_bytes(path)
-    except OSError as error:
-        raise InputError(f"{path}: the vignette cannot be opened: {error.strerror} (source.vignette)") from None
     reason = why_undecodable(data)
     if data and reason is not None:
         raise InputError(f"{path}: the vignette is no image that can be used: {reason} (source.vignette)")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_header import read_image_header
+from modp_ti.inputs.sources.listed_images import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.tracker_server.messages import POINT, Encoding, Frame, Hello, UnfitError, parse_points
 
@@ -40,10 +41,7 @@ class Spool(ImageSource):
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-server-")
         super().__init__(Path(self._folder.name))
         self.intrinsics = hello.intrinsics
-        self._names: list[str] = []
         self._encoding = hello.encoding
-        self._position: dict[str, int] = {}
-        self._timestamps: list[float] = []
         self._last: tuple[str, NDArray[np.uint8]] | None = None
 
     def add(self, frame: Frame) -> str:
@@ -64,9 +62,7 @@ class Spool(ImageSource):
         except InputError as error:
             (self.path / name).unlink(missing_ok=True)
             raise UnfitError(f"FRAME {frame.number}: {error}", frame.number) from None
-        self._position[name] = len(self._names)
-        self._names.append(name)
-        self._timestamps.append(frame.timestamp)
+        self._append(name, frame.timestamp)
         return name
 
     def name(self, number: int) -> str:
@@ -94,16 +90,6 @@ class Spool(ImageSource):
                 f"{what}: its image is {header.width}x{header.height}, HELLO says {camera.width}x{camera.height}",
                 frame.number,
             )
-
-    @property
-    def names(self) -> Sequence[str]:
-        return self._names
-
-    def position(self, name: str) -> int:
-        return self._position[name]
-
-    def timestamp(self, name: str) -> float:
-        return self._timestamps[self._position[name]]
 
     def find(self, name: str) -> str | None:
         return name if name in self._position else None
@@ -134,22 +120,15 @@ class Spool(ImageSource):
 
     def _decode(self, name: str) -> NDArray[np.uint8]:
         width, height = self.size(name)
-        data = np.frombuffer((self.path / name).read_bytes(), np.uint8)
+        data = (self.path / name).read_bytes()
         if self._encoding.channels is not None:
-            image = data.reshape(height, width, self._encoding.channels)
+            image = np.frombuffer(data, np.uint8).reshape(height, width, self._encoding.channels)
             return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
         import cv2
 
-        log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:  # OpenCV's log is silenced, because the error below already reports the problem in one line
-            # Same flags as ImageFolder for JPEG. PNG keeps its alpha channel.
-            png = self._encoding is Encoding.PNG
-            flags = cv2.IMREAD_UNCHANGED if png else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(data, flags)
-        except cv2.error:
-            image = None
-        finally:
-            cv2.utils.logging.setLogLevel(log_level)
+        # Same flags as ImageFolder for JPEG. PNG keeps its alpha channel.
+        png = self._encoding is Encoding.PNG
+        image = decoded_as(data, cv2.IMREAD_UNCHANGED if png else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None or image.dtype != np.uint8:
             raise InputError(f"{name}: its {self._encoding.name} image is damaged or not of 8 bits a channel")
         if image.ndim == 2:

@@ -1,14 +1,15 @@
 """Readers of poses and sparse points, one file per kind. Each delivers `TrackedFrame`s in order.
 
-The registry of kinds is in `openers`; their settings are in `modp_ti.config.tracker_settings`.
+The settings of the kinds are in `modp_ti.config.tracker_settings`. A reader is imported when it is opened, so that a
+run loads only the libraries that it needs.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from modp_ti.config import tracker_settings as kinds
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.trackers.openers import OPENERS, Opening
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
@@ -30,4 +31,49 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         for frame in modp_ti.open_tracker(modp_ti.load_scene("scene.yaml")):
             print(frame.name, len(frame.points))
     """
-    return OPENERS[type(config.tracker)](config.tracker, Opening(config.source, config.seed, progress))
+    source = config.source
+    match config.tracker:
+        case kinds.ColmapSettings() as tracker:
+            from modp_ti.inputs.trackers.colmap import open_colmap
+
+            return open_colmap(source, tracker)
+        case kinds.TransformsSettings() as tracker:
+            from modp_ti.inputs.trackers.transforms import open_transforms
+
+            return open_transforms(source, tracker, progress)
+        case kinds.KltSettings():
+            from modp_ti.inputs.klt import open_klt
+
+            return open_klt(source, config.seed, progress)
+        case kinds.TumSettings() as tracker:
+            from modp_ti.inputs.trackers.tum import open_tum
+
+            return open_tum(source, tracker, progress)
+        case kinds.OrbSlam3Settings() as tracker:
+            from modp_ti.inputs.trackers.tum import open_orbslam3
+
+            return open_orbslam3(source, tracker, progress)
+        case kinds.StellaVslamSettings() as tracker:
+            from modp_ti.inputs.trackers.stella_vslam import open_stella_vslam
+
+            return open_stella_vslam(source, tracker)
+        case kinds.AriaSettings() as tracker:
+            from modp_ti.inputs.trackers.aria import open_aria
+
+            return open_aria(source, tracker, progress)
+        case kinds.ModpSettings() as tracker:
+            from modp_ti.inputs.trackers.modp import open_modp
+
+            return open_modp(source, tracker)
+        case kinds.ReplicaSettings() as tracker:
+            from modp_ti.inputs.trackers.data_sets import open_replica
+
+            return open_replica(source, tracker, progress)
+        case kinds.SevenScenesSettings() as tracker:
+            from modp_ti.inputs.trackers.data_sets import open_sevenscenes
+
+            return open_sevenscenes(source, tracker, progress)
+        case kinds.SocketSettings() as tracker:
+            from modp_ti.inputs.tracker_server import open_tracker_server
+
+            return open_tracker_server(source, tracker, progress)

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import inverse_poses
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import AriaSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.sources import ImageSource, open_source
 from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.trackers.aria_mps import (
@@ -24,8 +25,14 @@ from modp_ti.inputs.trackers.aria_mps import (
     read_open_loop,
     read_points,
 )
-from modp_ti.inputs.trackers.given_poses import checked_reader, missing_frames_note, selected_frames, spread_points
-from modp_ti.inputs.trackers.trajectory import inverse_poses, rows_at_frames
+from modp_ti.inputs.trackers.given_poses import (
+    checked_reader,
+    missing_frames_note,
+    selected_frames,
+    solving,
+    spread_points,
+)
+from modp_ti.inputs.trackers.trajectory import rows_at_frames
 
 __all__ = ["open_aria"]
 
@@ -49,11 +56,7 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
     the tracking cameras saw within `SEEN_WITHIN` of the frame's time are used. Without points, features are tracked and
     triangulated. The same happens with the open loop, because the points belong to the closed loop's world.
 
-    Args:
-        source: Settings of the images.
-        tracker: Settings of the tracker. `path` is the MPS folder, its `slam` or `trajectory` folder, or one of the two
-            trajectory files.
-        progress: Called while points are triangulated.
+    `tracker.path` is the MPS folder, its `slam` or `trajectory` folder, or one of the two trajectory files.
 
     Raises:
         InputError: If a required file is missing, a file is malformed, or the images do not match the camera or the
@@ -75,9 +78,9 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
         [device.T_world_device[rows[name]] @ mounts.at(device.times[rows[name]]) for name in names]
     )
     undistorter = require_intrinsics(images).undistorter(source.scale)
-    reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
+    reader = checked_reader(images, source, [(name, undistorter) for name in names], "source.intrinsics")
     frames = [PosedImage(name, undistorter, T) for name, T in zip(names, inverse_poses(T_world_camera), strict=True)]
-    notes = [*missing_frames_note(selected, rows, file), *_notes(device, mounts, file), *missing]
+    notes = [*missing_frames_note(selected, rows, file.name), *_notes(device, mounts, file), *missing]
 
     cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     if file.name == OPEN_LOOP or cloud is None:
@@ -86,8 +89,8 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
                 f"{folder / POINTS[0]} is missing: it would have brought the points; features of the images are "
                 "tracked and triangulated instead"
             )
-        solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
-        return ReplayedTracker(reader, triangulated_frames(images, frames, solves, progress), source, notes)
+        frames = triangulated_frames(images, frames, solving(frames, source), progress)
+        return ReplayedTracker(reader, frames, source, notes)
     numbers, xyz, total = read_points(cloud, device.world, tracker.max_inv_dist_std, tracker.max_dist_std)
     notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
     times = device.times[[rows[name] for name in names]]

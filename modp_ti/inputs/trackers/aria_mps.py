@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import LARGEST, parse_json, text_lines
+from modp_ti.files import LARGEST, input_lines, parse_json
 from modp_ti.files.csv_columns import read_csv_blocks
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers.trajectory import poses_of_quaternions, require_rising
+from modp_ti.files.trajectory import poses_of_quaternions
+from modp_ti.inputs.trackers.trajectory import require_rising
 
 __all__ = [
     "CameraMounts",
@@ -111,19 +112,14 @@ def _trajectory(path: Path, world: str, frame: str) -> DeviceTrajectory:
 def read_calibration(path: Path, label: str) -> CameraMounts:
     """Read `T_device_camera` of the camera with this label from online_calibration.jsonl."""
     times, translations, quaternions, lines = [], [], [], []
-    try:
-        for number, line in enumerate(text_lines(path), start=1):
-            if not line.strip():
-                continue
-            time, translation, quaternion = _mount(line, label, path, number)
-            times.append(time)
-            translations.append(translation)
-            quaternions.append(quaternion)
-            lines.append(number)
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: holds bytes that are no text") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    for number, line in enumerate(input_lines(path), start=1):
+        if not line.strip():
+            continue
+        time, translation, quaternion = _mount(line, label, path, number)
+        times.append(time)
+        translations.append(translation)
+        quaternions.append(quaternion)
+        lines.append(number)
     if not times:
         raise InputError(f"{path}: holds no calibration")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,17 +13,12 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.replay import (
-    PosedImage,
-    ReplayedTracker,
-    checked_pose,
-    points_inside,
-    require_fitting_sizes,
-)
-from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
+from modp_ti.inputs.sources import Undistorter, open_source
 from modp_ti.inputs.sources.distortion import colmap_intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
+from modp_ti.inputs.trackers.given_poses import checked_reader, matched_entries
 
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
@@ -35,9 +29,7 @@ __all__ = ["open_colmap"]
 def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTracker:
     """Open the images that have a pose in the model, in natural order, with the points that each observes.
 
-    Args:
-        source: Settings of the images.
-        tracker: Settings of the tracker. `path` is the model's folder.
+    `tracker.path` is the model's folder.
 
     Raises:
         InputError: If the model is missing or damaged, has an unsupported camera model, has no image in the folder, or
@@ -45,55 +37,25 @@ def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTrac
     """
     place = source.require_path()
     images = open_source(source)
-    selected = set(images.selected(source.start, source.stop, source.step))
     folder = _model_folder(place, tracker.path)
     model = read_colmap_model(folder)
-    if not model.images:
-        raise InputError(f"{folder}: the COLMAP model holds no image")
-
-    posed: dict[str, pycolmap.Image] = {}
-    absent: list[str] = []
-    for image in model.images.values():
-        if not image.has_pose:
-            continue
-        name = images.find(image.name)
-        if name is None:
-            absent.append(image.name)
-        elif name in posed:
-            raise InputError(f"{folder}: images {posed[name].name} and {image.name} are both {images.path / name}")
-        else:
-            posed[name] = image
-    if not posed:
-        raise InputError(_no_match(images, folder, absent))
-
-    names = [name for name in images.names if name in posed and name in selected]
-    if not names:
-        raise InputError(
-            f"{folder}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
-        )
+    stated = [(image.name, image) for image in model.images.values() if image.has_pose]
+    if not stated:
+        raise InputError(f"{folder}: the COLMAP model holds no image{' with a pose' if model.images else ''}")
+    posed, notes = matched_entries(images, source, stated, folder, str(folder), "images")
     undistorters = {i: _undistorter(camera, source.scale, folder) for i, camera in model.cameras.items()}
-    cameras = [(name, undistorters[posed[name].camera_id]) for name in names]
-    require_fitting_sizes(images, cameras, str(folder))
-    reader = FrameReader(images, source)
-    reader.require_fitting(cameras)
+    cameras = [(name, undistorters[image.camera_id]) for name, image in posed.items()]
+    reader = checked_reader(images, source, cameras, str(folder))
 
     positions = {i: np.asarray(point.xyz, dtype=np.float64) for i, point in model.points3D.items()}
     frames = []
-    for name in names:
-        image = posed[name]
+    for name, image in posed.items():
         undistorter = undistorters[image.camera_id]
         T_camera_world = np.eye(4)
         T_camera_world[:3] = image.cam_from_world().matrix()
         T_camera_world = checked_pose(T_camera_world, f"{folder}: image {image.name}")
         points = _observed_points(image, positions, undistorter, T_camera_world, folder)
         frames.append(PosedImage(name, undistorter, T_camera_world, points))
-
-    notes = []
-    if absent:
-        notes.append(f"{len(absent)} images of {folder} are not in {images.path}: skipped")
-    without_pose = len(selected) - len(names)
-    if without_pose:
-        notes.append(f"{without_pose} of {len(selected)} images have no pose in {folder}: skipped")
     return ReplayedTracker(reader, frames, source, notes)
 
 
@@ -109,15 +71,6 @@ def _model_folder(images: Path, given: Path | None) -> Path:
     if not given.exists():
         raise InputError(f"{given}: no such folder (tracker.path); it should hold a COLMAP model")
     raise InputError(f"{given}: holds no COLMAP model (cameras, images and points3D as .bin or .txt)")
-
-
-def _no_match(images: ImageSource, folder: Path, absent: Sequence[str]) -> str:
-    if not absent:
-        return f"{folder}: no image of the COLMAP model has a pose"
-    return (
-        f"none of the {len(absent)} images of {folder} is in {images.path}: "
-        f"the model names {absent[0]}, the folder holds {images.names[0]}; check source.path"
-    )
 
 
 def _undistorter(camera: pycolmap.Camera, scale: float, folder: Path) -> Undistorter:

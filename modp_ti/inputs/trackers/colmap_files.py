@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from modp_ti.files import read_bytes, text_lines
+from modp_ti.files import input_lines, read_bytes, readable
 from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _require_text_model(folder: Path) -> None:
         if not file.exists():
             continue
         try:
-            lines = text_lines(file, longest=MAX_TEXT_LINE)
+            lines = input_lines(file, "; export the COLMAP model again", MAX_TEXT_LINE)
             for line in lines:
                 words = line.split(maxsplit=5)
                 if stem == "images" and words and not words[0].startswith("#"):
@@ -77,9 +77,6 @@ def _require_text_model(folder: Path) -> None:
                     next(lines, None)  # the image's observations
         except _DamagedError as error:
             raise InputError(f"{file}: {error}; the file is damaged") from None
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
-            raise InputError(f"{file}: cannot be read as text: {reason}; export the COLMAP model again") from None
 
 
 class _CutOffError(Exception):
@@ -100,14 +97,10 @@ class _Cursor:
         if self.at > len(self.data):
             raise _CutOffError
 
-    def read(self, form: str) -> int:
+    def read(self, form: str) -> tuple[Any, ...]:
         size = struct.calcsize(form)
         self.skip(size)
-        return int(struct.unpack_from(form, self.data, self.at - size)[0])
-
-    def read_float(self) -> float:
-        self.skip(8)
-        return float(struct.unpack_from("<d", self.data, self.at - 8)[0])
+        return struct.unpack_from(form, self.data, self.at - size)
 
     def skip_text(self) -> None:
         end = self.data.find(b"\0", self.at)
@@ -116,7 +109,7 @@ class _Cursor:
         self.at = end + 1
 
 
-def _require_quaternion(q: list[float]) -> None:
+def _require_quaternion(q: Sequence[float]) -> None:
     """Raise _DamagedError if a quaternion is not of unit length. COLMAP would normalise it silently."""
     length = math.hypot(*q)
     if not 0.9 < length < 1.1:
@@ -125,7 +118,7 @@ def _require_quaternion(q: list[float]) -> None:
 
 def _camera(cursor: _Cursor) -> None:
     cursor.skip(4)  # id
-    model = cursor.read("<i")
+    (model,) = cursor.read("<i")
     cursor.skip(16)  # width, height
     if model not in CAMERA_PARAMS:
         raise _DamagedError(f"camera model number {model} is not known")
@@ -134,31 +127,31 @@ def _camera(cursor: _Cursor) -> None:
 
 def _image(cursor: _Cursor) -> None:
     cursor.skip(4)  # id
-    _require_quaternion([cursor.read_float() for _ in range(4)])
+    _require_quaternion(cursor.read("<4d"))
     cursor.skip(3 * 8 + 4)  # position, camera
     cursor.skip_text()
-    cursor.skip(24 * cursor.read("<Q"))  # x, y, point
+    cursor.skip(24 * cursor.read("<Q")[0])  # x, y, point
 
 
 def _point(cursor: _Cursor) -> None:
     cursor.skip(8 + 3 * 8 + 3 + 8)  # id, position, colour, error
-    cursor.skip(8 * cursor.read("<Q"))  # image, observation
+    cursor.skip(8 * cursor.read("<Q")[0])  # image, observation
 
 
 def _rig(cursor: _Cursor) -> None:
     cursor.skip(4)  # id
-    sensors = cursor.read("<I")
+    (sensors,) = cursor.read("<I")
     if sensors > 0:
         cursor.skip(8)  # the reference sensor has no pose
     for _ in range(sensors - 1):
         cursor.skip(8)
-        if cursor.read("<B"):
+        if cursor.read("<B")[0]:
             cursor.skip(7 * 8)
 
 
 def _frame(cursor: _Cursor) -> None:
     cursor.skip(4 + 4 + 7 * 8)  # id, rig, pose
-    cursor.skip(16 * cursor.read("<I"))  # sensor type, sensor, data
+    cursor.skip(16 * cursor.read("<I")[0])  # sensor type, sensor, data
 
 
 RECORDS: dict[str, Callable[[_Cursor], None]] = {
@@ -176,12 +169,10 @@ def _require_whole_binary_model(folder: Path) -> None:
         file = folder / f"{stem}.bin"
         if not file.exists():
             continue
-        try:
+        with readable(file):
             cursor = _Cursor(read_bytes(file))
-        except OSError as error:
-            raise InputError(f"{file}: cannot be read: {error.strerror}") from None
         try:
-            for _ in range(cursor.read("<Q")):
+            for _ in range(cursor.read("<Q")[0]):
                 skip_record(cursor)
         except _CutOffError:
             raise InputError(f"{file}: the file is cut off; copy or export the COLMAP model again") from None

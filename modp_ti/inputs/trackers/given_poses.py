@@ -5,8 +5,9 @@ The camera comes from the source, the points from another file or from triangula
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,22 +21,70 @@ from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out, require_fitting_sizes
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.inputs.sources.protocol import require_intrinsics
-from modp_ti.inputs.trackers.point_cloud import visible_points
-from modp_ti.inputs.trackers.point_file import read_point_file
+from modp_ti.inputs.trackers.point_cloud import read_point_file, visible_points
 
 __all__ = [
     "checked_reader",
     "found_file",
+    "matched_entries",
     "missing_frames_note",
     "replay_poses",
     "selected_frames",
+    "solving",
     "spread_points",
 ]
 
+T = TypeVar("T")
 
-def selected_frames(images: ImageSource, source: SourceSettings) -> list[str]:
+
+def selected_frames(images: ImageSource, source: SourceSettings) -> Sequence[str]:
     """Return the images selected by source.start/stop/step, in order."""
-    return list(images.selected(source.start, source.stop, source.step))
+    return images.selected(source.start, source.stop, source.step)
+
+
+def matched_entries(
+    images: ImageSource, source: SourceSettings, entries: Iterable[tuple[str, T]], origin: Path, shown: str, what: str
+) -> tuple[dict[str, T], list[str]]:
+    """Match the entries of a file with the selected images, by the names in the file.
+
+    Args:
+        images: The image source.
+        source: Settings of the images.
+        entries: Name of the image in the file, and content of each entry.
+        origin: The file.
+        shown: Name of the file in remarks.
+        what: What the entries are called, for messages.
+
+    Returns:
+        The content of the entry of each image that has one, in the source's order, and remarks for the user.
+
+    Raises:
+        InputError: If two entries have the same image, or none has a selected one.
+    """
+    found: dict[str, tuple[str, T]] = {}  # label and content of the entry by image
+    absent = []
+    for number, (stated, content) in enumerate(entries):
+        label = f"{number} ({stated})"
+        name = images.find(stated)
+        if name is None:
+            absent.append(stated)
+        elif name in found:
+            raise InputError(f"{origin}: {what} {found[name][0]} and {label} are both the image {name}")
+        else:
+            found[name] = label, content
+    if not found:
+        raise InputError(
+            f"{origin}: none of its {len(absent)} {what} is in {images.path}: the first is {absent[0]}, there is "
+            f"{images.names[0]}; check source.path"
+        )
+    selected = selected_frames(images, source)
+    matched = {name: found[name][1] for name in selected if name in found}
+    if not matched:
+        raise InputError(
+            f"{origin}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
+        )
+    notes = [f"{len(absent)} {what} of {shown} are not in {images.path}: skipped"] if absent else []
+    return matched, [*notes, *missing_frames_note(selected, matched, shown)]
 
 
 def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
@@ -66,35 +115,31 @@ def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
 
 
 def checked_reader(
-    images: ImageSource, source: SourceSettings, names: Sequence[str], undistorter: Undistorter, intrinsics: str
+    images: ImageSource, source: SourceSettings, cameras: Sequence[tuple[str, Undistorter]], intrinsics: str
 ) -> FrameReader:
-    """Create the reader of the frames and check that images, masks and vignette match the camera.
+    """Create the reader of the frames and check that images, masks and vignette match the cameras.
 
     Args:
         images: The image source.
         source: Settings of the images.
-        names: Names of the images that will be read.
-        undistorter: Undistorter of all images.
-        intrinsics: Origin of the camera, for error messages.
+        cameras: Name and undistorter of each image that will be read.
+        intrinsics: Origin of the cameras, for error messages.
 
     Raises:
-        InputError: If an image, a mask or the vignette does not match the camera.
+        InputError: If an image, a mask or the vignette does not match its camera.
     """
-    cameras = [(name, undistorter) for name in names]
     require_fitting_sizes(images, cameras, intrinsics)
     reader = FrameReader(images, source)
     reader.require_fitting(cameras)
     return reader
 
 
-def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], origin: Path) -> list[str]:
+def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], origin: str) -> list[str]:
     """Return a remark on selected images without a pose, or an empty list if there are none."""
     missing = [name for name in selected if name not in posed]
     if not missing:
         return []
-    return [
-        f"{len(missing)} of {len(selected)} images have no pose in {origin.name}: skipped (the first: {missing[0]})"
-    ]
+    return [f"{len(missing)} of {len(selected)} images have no pose in {origin}: skipped (the first: {missing[0]})"]
 
 
 def replay_poses(
@@ -124,7 +169,7 @@ def replay_poses(
     """
     undistorter = require_intrinsics(images).undistorter(source.scale)
     names = sorted(poses, key=images.position)
-    reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
+    reader = checked_reader(images, source, [(name, undistorter) for name in names], "source.intrinsics")
     frames = [PosedImage(name, undistorter, poses[name]) for name in names]
     if tracker.points is not None:
         xyz = read_point_file(tracker.points)
@@ -136,13 +181,18 @@ def replay_poses(
                 "points and poses must be of one world, poses camera to world (tracker.points)"
             )
     else:
-        solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
+        solves = solving(frames, source)
         if tracker.adjusts:
             frames, note = adjusted_frames(images, frames, solves, progress)
             notes = [*notes, note]
         else:
             frames = triangulated_frames(images, frames, solves, progress)
     return ReplayedTracker(reader, frames, source, notes)
+
+
+def solving(frames: Sequence[PosedImage], source: SourceSettings) -> NDArray[np.bool_]:
+    """Return which frames (F,) points may be triangulated with: those that are not held out."""
+    return np.array([not is_held_out(index, source) for index in range(len(frames))])
 
 
 def spread_points(xyz: NDArray[np.float64], numbers: NDArray[np.int64], frame: PosedImage, limit: int) -> SparsePoints:

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.tracked_frame import SparsePoints
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ModpSettings
-from modp_ti.files import LARGEST, open_file, read_json
+from modp_ti.files import LARGEST, open_file, read_json, readable
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import read_number_rows
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
-from modp_ti.inputs.sources import Undistorter, open_source
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
+from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.sources.protocol import require_intrinsics
-from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
+from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, matched_entries
+from modp_ti.inputs.trackers.point_cloud import projected_points
 
 __all__ = ["open_modp"]
 
@@ -41,79 +41,40 @@ def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
     """Open the images that have a pose in the JSON file, in the source's order, each with the points of its own file.
 
     Points have no ids in these files: points with the same coordinates are treated as one point. Pixels are
-    projections.
-
-    Args:
-        source: Settings of the images.
-        tracker: Settings of the tracker. `path` is the JSON file or its folder.
+    projections. `tracker.path` is the JSON file or its folder.
 
     Raises:
         InputError: If a file is missing or malformed, a pose is not a rigid motion, a point file has wrong columns or
             contains NaN, there are no points at all, or images do not match `source.intrinsics`.
     """
     place = source.require_path()
-    folders = (place, place.parent)
-    guesses = [folder / name for name in (POSES, POSES_ORB) for folder in folders]
+    guesses = [folder / name for name in (POSES, POSES_ORB) for folder in (place, place.parent)]
     file = found_file(tracker.path, guesses, f"the release's {POSES} or {POSES_ORB}")
     cameras = _cameras(file)
     folder = file.parent / CLOUDS.get(file.name, CLOUDS[POSES])
     clouds = _cloud_files(folder)
     images = open_source(source)
-    selected = selected_frames(images, source)
-    entries: dict[str, int] = {}
-    absent = []
-    for number, (image, _) in enumerate(cameras):
-        name = images.find(image)
-        if name is None:
-            absent.append(image)
-        elif name in entries:
-            raise InputError(f"{file}: cameras {entries[name]} and {number} both have the image {name}")
-        else:
-            entries[name] = number
-    if not entries:
-        raise InputError(
-            f"{file}: none of its {len(absent)} cameras has an image in {images.path}: the first is {absent[0]}, "
-            f"there is {images.names[0]}; check source.path"
-        )
-    names = [name for name in selected if name in entries]
-    if not names:
-        raise InputError(f"{file}: has no pose for any of the frames that source.start/stop/step select")
-
+    stated = ((image, (number, T)) for number, (image, T) in enumerate(cameras))
+    entries, notes = matched_entries(images, source, stated, file, file.name, "cameras")
+    numbers = [number for number, _ in entries.values()]
     undistorter = require_intrinsics(images).undistorter(source.scale)
-    reader = checked_reader(images, source, names, undistorter, "source.intrinsics")
-    numbers = [entries[name] for name in names]
+    reader = checked_reader(images, source, [(name, undistorter) for name in entries], "source.intrinsics")
     xyz = [_read_cloud(clouds[number]) if number in clouds else np.zeros((0, 3)) for number in numbers]
     if not any(len(each) for each in xyz):
-        raise InputError(f"{folder}: holds no point for any of the {len(names)} frames")
+        raise InputError(f"{folder}: holds no point for any of the {len(entries)} frames")
     # The same coordinates get the same id in all files.
     _, ids = np.unique(np.concatenate(xyz), axis=0, return_inverse=True)
     ids = ids.reshape(-1).astype(np.int64)
     frames, first = [], 0
-    for name, number, cloud in zip(names, numbers, xyz, strict=True):
-        T = cameras[number][1]
-        mine = np.unique(ids[first : first + len(cloud)], return_index=True)
-        frames.append(PosedImage(name, undistorter, T, _projected(cloud[mine[1]], mine[0], undistorter, T)))
+    for (name, (_, T)), cloud in zip(entries.items(), xyz, strict=True):
+        mine, rows = np.unique(ids[first : first + len(cloud)], return_index=True)
+        frames.append(PosedImage(name, undistorter, T, projected_points(cloud[rows], mine, undistorter, T)))
         first += len(cloud)
 
-    notes = []
-    if absent:
-        notes.append(f"{len(absent)} cameras of {file.name} have no image in {images.path}: skipped")
-    notes += missing_frames_note(selected, entries, file)
     without = sum(number not in clouds for number in numbers)
     if without:
         notes.append(f"{without} frames have no file of points in {folder}: they bring none")
     return ReplayedTracker(reader, frames, source, notes)
-
-
-def _projected(
-    xyz: NDArray[np.float64], ids: NDArray[np.int64], undistorter: Undistorter, T_camera_world: NDArray[np.float64]
-) -> SparsePoints:
-    """Return the points in front of the camera that project into the image, with their projections as pixels."""
-    depth = xyz @ T_camera_world[2, :3] + T_camera_world[2, 3]
-    pixels = np.full((len(xyz), 2), np.nan)
-    before = depth > 1e-9
-    pixels[before] = undistorter.camera.project(xyz[before] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
-    return points_inside(xyz, pixels, ids, undistorter, T_camera_world)
 
 
 def _cameras(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
@@ -157,12 +118,9 @@ def _cloud_files(folder: Path) -> dict[int, Path]:
 def _read_cloud(path: Path) -> NDArray[np.float64]:
     """Read world points (N, 3). An empty text file has none."""
     if path.suffix.lower() == ".txt":
-        try:
-            with open_file(path) as file:
-                if not file.read(1):
-                    return np.zeros((0, 3))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        with readable(path), open_file(path) as file:
+            if not file.read(1):
+                return np.zeros((0, 3))
         return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
     try:
         with open_file(path) as file:

@@ -1,4 +1,4 @@
-"""Points without observations: reading from PLY files, and a visibility test per camera."""
+"""Points without observations: reading from PLY or text files, and a visibility test per camera."""
 
 from __future__ import annotations
 
@@ -10,18 +10,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
-from modp_ti.files import limited_lines, read_bytes
+from modp_ti.files import limited_lines, open_file, read_bytes, readable
 from modp_ti.files.errors import InputError
+from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.ply import PlyHeader, parse_ply_header
-from modp_ti.inputs.replay import FARTHEST, points_inside
+from modp_ti.files.trajectory import FARTHEST
+from modp_ti.inputs.replay import points_inside
 from modp_ti.inputs.sources import Undistorter
 
-__all__ = ["read_ply_points", "visible_points"]
+__all__ = ["projected_points", "read_ply_points", "read_point_file", "visible_points"]
 
 # Visibility is decided per square cell, whose size is this share of the image's longer side. In a cell, points up to
 # this factor of the nearest depth are visible; those farther away count as hidden.
 CELL = 1 / 60
 HIDDEN_BEHIND = 1.15
+
+
+def read_point_file(path: Path) -> NDArray[np.float64]:
+    """Read positions (N, 3) from a PLY file, or from text whose lines begin with `x y z`.
+
+    Raises:
+        InputError: If the file is neither or has no points. For text, the message names the line.
+    """
+    with readable(path, " (tracker.points)"), open_file(path) as file:
+        is_ply = file.read(3) == b"ply"
+    if not is_ply:
+        return read_number_rows(path, 3, "x y z", "tracker.points", more=True).values
+    xyz = read_ply_points(path)
+    if len(xyz) == 0:
+        raise InputError(f"{path}: holds no point (tracker.points); leave the key out to have points triangulated")
+    return xyz
 
 
 def read_ply_points(path: Path) -> NDArray[np.float64]:
@@ -32,10 +50,8 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: If the file is missing, damaged, or lacks x, y and z.
     """
-    try:
+    with readable(path):
         data = read_bytes(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     header = parse_ply_header(data, path)
     if not set("xyz") <= set(header.names):
         raise InputError(f"{path}: the vertices have no x, y and z")
@@ -72,6 +88,17 @@ def _ascii_rows(data: bytes, header: PlyHeader) -> Iterator[str]:
             yield line
 
 
+def projected_points(
+    xyz: NDArray[np.float64], ids: NDArray[np.int64], undistorter: Undistorter, T_camera_world: NDArray[np.float64]
+) -> SparsePoints:
+    """Return the points in front of the camera that project into the image, with their projections as pixels."""
+    in_camera = xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    pixels = np.full((len(xyz), 2), np.nan)
+    before = in_camera[:, 2] > 1e-9
+    pixels[before] = undistorter.camera.project(in_camera[before])
+    return points_inside(xyz, pixels, ids, undistorter, T_camera_world)
+
+
 def visible_points(
     xyz: NDArray[np.float64], undistorter: Undistorter, T_camera_world: NDArray[np.float64]
 ) -> SparsePoints:
@@ -86,11 +113,7 @@ def visible_points(
         The visible points, with their projections as pixels and their row in `xyz` as id.
     """
     camera = undistorter.camera
-    in_camera = xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    pixels = np.full((len(xyz), 2), np.nan)
-    before = in_camera[:, 2] > 1e-9
-    pixels[before] = camera.project(in_camera[before])
-    points = points_inside(xyz, pixels, np.arange(len(xyz)), undistorter, T_camera_world)
+    points = projected_points(xyz, np.arange(len(xyz)), undistorter, T_camera_world)
     if len(points) == 0:
         return points
 

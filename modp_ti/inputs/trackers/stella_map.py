@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files import LARGEST, open_file
+from modp_ti.files import LARGEST, open_file, readable
 from modp_ti.files.errors import InputError
+from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.sources import Distortion, Intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
-from modp_ti.inputs.trackers.trajectory import poses_of_quaternions
 
 __all__ = ["StellaKeyframe", "StellaMap", "read_stella_map"]
 
@@ -81,28 +81,24 @@ def read_stella_map(path: Path) -> StellaMap:
     Raises:
         InputError: If the file is missing, truncated, damaged, or has no keyframes or landmarks.
     """
-    try:
-        with open_file(path) as file:
-            if file.read(16).startswith(b"SQLite format 3"):
-                raise InputError(
-                    f"{path}: an SQLite map; let stella_vslam write MessagePack: MapFormat: msgpack in its "
-                    "configuration, and --map-db-out map.msg"
-                )
+    with readable(path, " (tracker.path)"), open_file(path) as file:
+        if file.read(16).startswith(b"SQLite format 3"):
+            raise InputError(
+                f"{path}: an SQLite map; let stella_vslam write MessagePack: MapFormat: msgpack in its "
+                "configuration, and --map-db-out map.msg"
+            )
+        try:
             file.seek(0)
             _unpacker(file).skip()  # without allocating anything, checks that every stated length has its content
             file.seek(0)
             return _read(path, file)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file (tracker.path)") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except msgpack.OutOfData:
-        raise InputError(f"{path}: the file is cut off; copy it again or let stella_vslam write it again") from None
-    except _DamagedError as error:
-        raise InputError(f"{path}: {error}; the file is damaged or of another version of stella_vslam") from None
-    except (ValueError, msgpack.UnpackException) as error:
-        reason = " ".join(str(error).split())[:80] or type(error).__name__
-        raise InputError(f"{path}: not a map of stella_vslam in MessagePack ({reason})") from None
+        except msgpack.OutOfData:
+            raise InputError(f"{path}: the file is cut off; copy it again or let stella_vslam write it again") from None
+        except _DamagedError as error:
+            raise InputError(f"{path}: {error}; the file is damaged or of another version of stella_vslam") from None
+        except (ValueError, msgpack.UnpackException) as error:
+            reason = " ".join(str(error).split())[:80] or type(error).__name__
+            raise InputError(f"{path}: not a map of stella_vslam in MessagePack ({reason})") from None
 
 
 def _unpacker(file: BinaryIO) -> msgpack.Unpacker:

@@ -16,7 +16,7 @@ from modp_ti.inputs.sources import ImageSource, Intrinsics, Undistorter, open_so
 from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
 from modp_ti.inputs.trackers.point_cloud import visible_points
 from modp_ti.inputs.trackers.stella_map import StellaKeyframe, StellaMap, read_stella_map
-from modp_ti.inputs.trackers.trajectory import Trajectory, read_trajectory_file, rows_at_frames
+from modp_ti.inputs.trackers.trajectory import TimedPoses, read_trajectory_file, rows_at_frames
 
 __all__ = ["open_stella_vslam"]
 
@@ -32,11 +32,8 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
 
     A keyframe gets its observed landmarks at the observed pixels. A frame between keyframes gets the landmarks that the
     two keyframes before it and the two after it observe, at their projections, because the files do not contain its
-    observations. Without frame_trajectory.txt next to the map, only keyframes are used.
-
-    Args:
-        source: Settings of the images.
-        tracker: Settings of the tracker. `path` is the map or its folder.
+    observations. Without frame_trajectory.txt next to the map, only keyframes are used. `tracker.path` is the map or
+    its folder.
 
     Raises:
         InputError: If the map is missing, the map or the trajectory is malformed, or images do not match the camera or
@@ -46,19 +43,20 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
     file = found_file(tracker.path, [place.parent / "map.msg", place / "map.msg"], "a map of stella_vslam (map.msg)")
     world = read_stella_map(file)
     beside = file.with_name(TRAJECTORY)
-    trajectory = read_trajectory_file(beside) if beside.is_file() else None
-    keyframes_alone = trajectory is None
     images = open_source(source)
     selected = selected_frames(images, source)
     keyframe_times = np.array([keyframe.time for keyframe in world.keyframes])
-    if trajectory is None:
-        trajectory = Trajectory(file, keyframe_times, np.stack([each.T_camera_world for each in world.keyframes]))
+    keyframes_alone = not beside.is_file()
+    if keyframes_alone:
+        trajectory = TimedPoses(file, keyframe_times, np.stack([each.T_camera_world for each in world.keyframes]))
+    else:
+        trajectory = read_trajectory_file(beside)
     rows = rows_at_frames(images, selected, trajectory.path, trajectory.times, tracker)
 
     intrinsics, said_by = _intrinsics(images, world, source)
     undistorter = intrinsics.undistorter(source.scale)
     names = sorted(rows, key=images.position)
-    reader = checked_reader(images, source, names, undistorter, said_by)
+    reader = checked_reader(images, source, [(name, undistorter) for name in names], said_by)
 
     frames, between = [], 0
     for name in names:
@@ -76,7 +74,7 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
             between += 1
         frames.append(PosedImage(name, undistorter, T, points))
 
-    notes = [*missing_frames_note(selected, rows, trajectory.path)]
+    notes = missing_frames_note(selected, rows, trajectory.path.name)
     if keyframes_alone:
         notes.append(f"{beside} is missing: it would have brought the poses of the frames between the keyframes")
     if between:

@@ -10,32 +10,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import matrices_from_unit_quaternions
 from modp_ti.config.tracker_settings import TimedPosesSettings
 from modp_ti.files.errors import FEW, InputError
-from modp_ti.files.number_rows import read_number_rows
-from modp_ti.inputs.replay import FARTHEST
+from modp_ti.files.trajectory import read_tum_rows, tum_poses
 from modp_ti.inputs.sources import ImageSource
 from modp_ti.inputs.sources.association import associate
 
-__all__ = [
-    "Trajectory",
-    "inverse_poses",
-    "poses_of_quaternions",
-    "read_trajectory_file",
-    "require_rising",
-    "rows_at_frames",
-]
+__all__ = ["TimedPoses", "read_trajectory_file", "require_rising", "rows_at_frames"]
 
-TUM_COLUMNS = "time tx ty tz qx qy qz qw"
-# Largest deviation of a quaternion's length from 1. Rounding in text files stays below it.
-MAX_LENGTH_ERROR = 1e-2
 # Times from here on are nanoseconds: in seconds they would be 3 million years.
 NANOSECONDS_FROM = 1e14
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class TimedPoses:
     """Poses over time.
 
     Attributes:
@@ -54,7 +42,7 @@ class Trajectory:
         return len(self.times)
 
 
-def read_trajectory_file(path: Path) -> Trajectory:
+def read_trajectory_file(path: Path) -> TimedPoses:
     """Read a trajectory in TUM format: `time tx ty tz qx qy qz qw` per line, camera to world, ordered by time.
 
     Times are in seconds, or in nanoseconds in ORB-SLAM3's EuRoC variant; the magnitude decides. Lines with NaN, which
@@ -64,15 +52,15 @@ def read_trajectory_file(path: Path) -> Trajectory:
         InputError: If a line has the wrong number of columns or a quaternion that is not of unit length, or if too many
             lines are faulty. The message names file and line.
     """
-    rows = read_number_rows(path, 8, TUM_COLUMNS, few=FEW)
+    rows = read_tum_rows(path, few=FEW)
     rising, left_out = _rising(rows.values[:, 0]), rows.left_out
     if len(rows) - len(rising) <= FEW * len(rows):
         left_out += len(rows) - len(rising)
         rows = replace(rows, values=rows.values[rising], lines=rows.lines[rising])
-    T_world_camera = poses_of_quaternions(rows.values[:, 1:4], rows.values[:, 4:8], rows.where)
+    T_camera_world = tum_poses(rows)
     require_rising(rows.values[:, 0], rows.where)
     times = rows.values[:, 0] * (1e-9 if rows.values[-1, 0] >= NANOSECONDS_FROM else 1.0)
-    return Trajectory(path, times, inverse_poses(T_world_camera), left_out)
+    return TimedPoses(path, times, T_camera_world, left_out)
 
 
 def _rising(times: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -90,44 +78,6 @@ def _rising(times: NDArray[np.float64]) -> NDArray[np.int64]:
         chain.append(i)
         i = int(before[i])
     return np.array(chain[::-1], dtype=np.int64)
-
-
-def poses_of_quaternions(
-    translation: NDArray[np.float64], quaternion: NDArray[np.float64], where: Callable[[int], str]
-) -> NDArray[np.float64]:
-    """Convert translations and quaternions to poses (N, 4, 4).
-
-    Args:
-        translation: Translations (N, 3).
-        quaternion: Quaternions (N, 4) as (x, y, z, w).
-        where: Maps a row to file and line, for error messages.
-
-    Raises:
-        InputError: If a quaternion is not of unit length, or a position lies beyond `FARTHEST` or is NaN.
-    """
-    far = np.flatnonzero(~(np.abs(translation) <= FARTHEST).all(axis=1))
-    if len(far):
-        raise InputError(f"{where(int(far[0]))}: the position lies beyond {FARTHEST:g}; the file is damaged")
-    with np.errstate(over="ignore"):  # an infinite length is rejected below
-        length = np.linalg.norm(quaternion, axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1.0) <= MAX_LENGTH_ERROR))
-    if len(wrong):
-        raise InputError(
-            f"{where(int(wrong[0]))}: the quaternion qx qy qz qw has length {length[wrong[0]]:.4g} instead of 1; "
-            "check the order of the columns"
-        )
-    poses = np.tile(np.eye(4), (len(quaternion), 1, 1))
-    poses[:, :3, :3] = matrices_from_unit_quaternions((quaternion / length[:, None])[:, [3, 0, 1, 2]])
-    poses[:, :3, 3] = translation
-    return poses
-
-
-def inverse_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Invert rigid motions (N, 4, 4)."""
-    inverse = np.tile(np.eye(4), (len(poses), 1, 1))
-    inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
-    inverse[:, :3, 3] = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    return inverse
 
 
 def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> None:

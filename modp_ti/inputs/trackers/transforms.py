@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files import is_file, read_json
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.replay import (
-    PosedImage,
-    ReplayedTracker,
-    checked_pose,
-    is_held_out,
-    require_fitting_sizes,
-)
-from modp_ti.inputs.sources import Distortion, FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
+from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter, open_source
 from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.trackers.given_poses import checked_reader, matched_entries, solving
 from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
 
 __all__ = ["open_transforms"]
@@ -44,12 +40,7 @@ def open_transforms(
     """Open the frames of the file whose images are in the folder, in natural order of the image names.
 
     Points are read from `ply_file_path` if the file names one that exists. Otherwise they are triangulated with the
-    given poses before the first frame is delivered.
-
-    Args:
-        source: Settings of the images.
-        tracker: Settings of the tracker. `path` is transforms.json or its folder.
-        progress: Called while points are triangulated.
+    given poses before the first frame is delivered. `tracker.path` is transforms.json or its folder.
 
     Raises:
         InputError: If the file is missing or malformed, a pose is not a rigid motion, no image is found, or images do
@@ -57,50 +48,17 @@ def open_transforms(
     """
     place = source.require_path()
     images = open_source(source)
-    selected = set(images.selected(source.start, source.stop, source.step))
     file = _transforms_file(place, tracker.path)
     data = _read_json(file)
-
-    entries: dict[str, Mapping[str, Any]] = {}
-    absent: list[str] = []
-    for number, entry in enumerate(data["frames"]):
-        path = entry.get("file_path") if isinstance(entry, dict) else None
-        if not isinstance(path, str):
-            raise InputError(f"{file}: frame {number} has no `file_path`")
-        name = images.find(path)
-        if name is None:
-            absent.append(path)
-        elif name in entries:
-            raise InputError(f"{file}: two frames name the image {name} (the second is {path})")
-        else:
-            entries[name] = entry
-    if not entries:
-        raise InputError(
-            f"{file}: none of its {len(absent)} frames has an image in {images.path}: "
-            f"the first is {absent[0]}, the folder holds {images.names[0]}; check source.path"
-        )
-    names = [name for name in images.names if name in entries and name in selected]
-    if not names:
-        raise InputError(
-            f"{file}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
-        )
+    entries, notes = matched_entries(images, source, _named(data["frames"], file), file, file.name, "frames")
 
     undistorters: dict[tuple[PinholeCamera, Distortion], Undistorter] = {}
     frames = []
-    for name in names:
-        raw, distortion = _intrinsics({**data, **entries[name]}, images, name, file)
+    for name, entry in entries.items():
+        raw, distortion = _intrinsics({**data, **entry}, images, name, file)
         undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, source.scale))
-        frames.append(PosedImage(name, undistorter, _pose(entries[name], file)))
-    require_fitting_sizes(images, [(frame.name, frame.undistorter) for frame in frames], str(file))
-    reader = FrameReader(images, source)
-    reader.require_fitting([(frame.name, frame.undistorter) for frame in frames])
-
-    notes = []
-    if absent:
-        notes.append(f"{len(absent)} frames of {file.name} have no image file: skipped")
-    without_pose = len(selected) - len(names)
-    if without_pose:
-        notes.append(f"{without_pose} of {len(selected)} images have no pose in {file.name}: skipped")
+        frames.append(PosedImage(name, undistorter, _pose(entry, file)))
+    reader = checked_reader(images, source, [(frame.name, frame.undistorter) for frame in frames], str(file))
 
     cloud = data.get("ply_file_path")
     if isinstance(cloud, str) and is_file(file.parent / cloud):
@@ -109,9 +67,16 @@ def open_transforms(
     else:
         if isinstance(cloud, str):
             notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
-        solves = np.array([not is_held_out(index, source) for index in range(len(frames))])
-        frames = triangulated_frames(images, frames, solves, progress)
+        frames = triangulated_frames(images, frames, solving(frames, source), progress)
     return ReplayedTracker(reader, frames, source, notes)
+
+
+def _named(entries: list[Any], file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    for number, entry in enumerate(entries):
+        path = entry.get("file_path") if isinstance(entry, dict) else None
+        if not isinstance(path, str):
+            raise InputError(f"{file}: frame {number} has no `file_path`")
+        yield path, entry
 
 
 def _transforms_file(images: Path, given: Path | None) -> Path:
@@ -145,11 +110,7 @@ def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4):
         raise InputError(f"{what}: `transform_matrix` must be 4 rows of 4 numbers, camera to world")
-    T_world_camera = checked_pose(matrix, what) @ OPENCV_OPENGL
-    T_camera_world = np.eye(4)
-    T_camera_world[:3, :3] = T_world_camera[:3, :3].T
-    T_camera_world[:3, 3] = -T_world_camera[:3, :3].T @ T_world_camera[:3, 3]
-    return T_camera_world
+    return inverse_se3(checked_pose(matrix, what) @ OPENCV_OPENGL)
 
 
 def _intrinsics(

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import os
-from array import array
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import matrices_from_unit_quaternions
-from modp_ti.files import LARGEST, text_lines
 from modp_ti.files.atomic import replace_text
-from modp_ti.files.errors import InputError
+from modp_ti.files.trajectory import read_tum_rows, tum_poses
 
 __all__ = ["read_trajectory", "write_trajectory"]
 
@@ -57,32 +53,8 @@ def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], 
     Raises:
         InputError: If the file is not a TUM trajectory. The message names the line.
     """
-    file = Path(path)
-    rows = array("d")
-    try:
-        for number, line in enumerate(text_lines(file), start=1):
-            words = line.split("#", 1)[0].replace(",", " ").split()
-            if not words:
-                continue
-            try:
-                row = [float(word) for word in words]
-            except ValueError:
-                row = []
-            if len(row) != 8 or not max(map(abs, row)) <= LARGEST or any(map(math.isnan, row)):
-                raise InputError(f"{file}:{number}: a line holds 8 numbers: time tx ty tz qx qy qz qw")
-            if not 0.5 < np.linalg.norm(row[4:]) < 1e6:
-                raise InputError(f"{file}:{number}: the quaternion is not of unit length")
-            rows.extend(row)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
-        raise InputError(f"{file}: cannot be read as a trajectory: {reason}") from None
-    table = np.frombuffer(rows).reshape(-1, 8)
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    for pose, row in zip(poses, table, strict=True):
-        rotation = matrices_from_unit_quaternions((row[4:] / np.linalg.norm(row[4:]))[[3, 0, 1, 2]])
-        pose[:3, :3] = rotation.T
-        pose[:3, 3] = -rotation.T @ row[1:4]
-    return table[:, 0], poses
+    rows = read_tum_rows(Path(path), "a trajectory in TUM's format", least=0)
+    return rows.values[:, 0], tum_poses(rows)
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import camera_centres
+
 __all__ = ["looking_at", "orbit", "smoothed"]
 
 # Weight that pulls the focus to the points at the scene's depth on the optical axes. It determines the focus if the
@@ -35,7 +37,7 @@ def smoothed(poses: NDArray[np.float64], count: int, deviation: float) -> NDArra
     weights = np.exp(-0.5 * (square - square.min(axis=1, keepdims=True)) / max(deviation, 1e-3) ** 2)
     weights /= weights.sum(axis=1, keepdims=True)
     rotations = poses[:, :3, :3].transpose(0, 2, 1)  # camera to world
-    centres = _centres(poses)
+    centres = camera_centres(poses)
     # Chordal mean: the rotation nearest to the weighted sum of the rotation matrices.
     U, _, Vt = np.linalg.svd((weights @ rotations.reshape(n, 9)).reshape(count, 3, 3))
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
@@ -53,7 +55,7 @@ def orbit(poses: NDArray[np.float64], depth: float, count: int) -> NDArray[np.fl
         depth: The scene's depth [scene units].
         count: Number of poses.
     """
-    centres, forward = _centres(poses), poses[:, 2, :3]
+    centres, forward = camera_centres(poses), poses[:, 2, :3]
     up = -poses[:, 1, :3].mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -poses[0, 1, :3]
     focus = _focus(centres, forward, depth)
@@ -109,11 +111,6 @@ def _unit_across(v: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[n
         least: NDArray[np.float64] = np.eye(3)[np.argmin(np.abs(axis))]
         v = np.cross(axis, least)
     return v / np.linalg.norm(v)
-
-
-def _centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the camera centres (N, 3)."""
-    return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
 def _poses(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import camera_centres
 from modp_ti.outputs.report.record import FrameNote
 
 __all__ = ["binned", "frame_rate", "shifts_and_turns"]
@@ -52,9 +53,7 @@ def shifts_and_turns(
     """
     a, b = np.asarray(before), np.asarray(after)
     R_a, R_b = a[:, :3, :3], b[:, :3, :3]
-    centre_a = -np.einsum("nji,nj->ni", R_a, a[:, :3, 3])
-    centre_b = -np.einsum("nji,nj->ni", R_b, b[:, :3, 3])
     # |R - I|^2 = 8 sin^2(angle / 2): exact for small angles, where the arc cosine of the trace is not.
     difference = np.linalg.norm(R_b @ R_a.transpose(0, 2, 1) - np.eye(3), axis=(1, 2))
     turns = 2 * np.arcsin(np.minimum(difference / np.sqrt(8.0), 1.0))
-    return np.linalg.norm(centre_b - centre_a, axis=1), np.degrees(turns)
+    return np.linalg.norm(camera_centres(b) - camera_centres(a), axis=1), np.degrees(turns)

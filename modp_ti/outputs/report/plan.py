@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import camera_centres
 from fields.map.gaussians import SH_C0
 
 __all__ = ["Plan", "floor_plan", "plan_of"]
@@ -44,7 +45,7 @@ def plan_of(poses: Sequence[NDArray[np.float64]]) -> Plan:
     """
     T = np.asarray(poses)
     rotations = T[:, :3, :3]
-    centres = -np.einsum("nji,nj->ni", rotations, T[:, :3, 3])
+    centres = camera_centres(T)
     up = _unit(-rotations[:, 1].mean(axis=0), -rotations[0, 1])
     flat = centres - centres.mean(axis=0)
     flat = flat - np.outer(flat @ up, up)

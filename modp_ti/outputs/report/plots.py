@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import camera_centres
 from modp_ti.outputs.evaluation import FrameScore
 from modp_ti.outputs.report.curves import binned, frame_rate, shifts_and_turns
 from modp_ti.outputs.report.plan import Plan
@@ -152,7 +153,7 @@ def trajectory(
         floor: Page positions (N, 2) and colours (N, 3) of Gaussians.
         truth: (M, 3) true camera centres in the map's world, or None.
     """
-    ways = {"after": plan.on_page(_centres(after)), "before": plan.on_page(_centres(before))}
+    ways = {"after": plan.on_page(camera_centres(after)), "before": plan.on_page(camera_centres(before))}
     if truth is not None:
         ways["truth"] = plan.on_page(truth)
     around = np.concatenate(list(ways.values()))
@@ -223,11 +224,6 @@ def _line(axes: Axes, x: NDArray, y: NDArray, name: str, **style: Any) -> None:
 def _label(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-
-
-def _centres(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    T = np.asarray(poses)
-    return -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
 
 
 def _extent(ways: NDArray[np.float64], floor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import inverse_se3, matrix_from_quaternion
+from fields.geometry.se3 import camera_centres, inverse_se3, matrix_from_quaternion
 from modp_ti.outputs.playback.film import depth_colours
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.viewer.handover import BrowserCamera
@@ -127,7 +127,7 @@ def nearest_photograph(poses: NDArray[np.float64], T_camera_world: NDArray[np.fl
     The measure adds the distance between the points at the scene's depth on both optical axes and half the distance
     between the camera centres.
     """
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centres = camera_centres(poses)
     centre = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
     towards = centres + scene_depth * poses[:, 2, :3] - (centre + scene_depth * T_camera_world[2, :3])
     return int(np.argmin(np.linalg.norm(towards, axis=1) + 0.5 * np.linalg.norm(centres - centre, axis=1)))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import inverse_se3, quaternion_from_matrix
+from fields.geometry.se3 import camera_centres, inverse_se3, quaternion_from_matrix
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Requests
 from modp_ti.outputs.viewer.modes import MODES, SPLATS
@@ -288,7 +288,7 @@ def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: floa
     size = np.array([camera.width, camera.height])
     corners = camera.unproject(CORNERS * size, np.full(4, KEYFRAME_SIZE))
     R = poses[:, :3, :3]
-    centres = -np.einsum("nji,nj->ni", R, poses[:, :3, 3]) * units
+    centres = camera_centres(poses) * units
     ends = centres[:, None] + np.einsum("nji,kj->nki", R, corners)
     sides = np.stack([np.broadcast_to(centres[:, None], ends.shape), ends], axis=2)
     around = np.stack([ends, np.roll(ends, -1, axis=1)], axis=2)

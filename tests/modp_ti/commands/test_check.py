@@ -143,7 +143,7 @@ def test_blurred_repeated_and_missing_frames_are_named(plane_scene, tmp_path: Pa
     assert data["blurred"] == ["view10.png"]
     assert data["duplicates"] == ["view12.png"]
     assert data["time_gaps"] == ["view13.png"]
-    assert data["notes"] == [f"6 of 13 images have no pose in {model}: skipped"]
+    assert data["notes"] == [f"6 of 13 images have no pose in {model}: skipped (the first: view13-0.png)"]
     assert codes(data)["duplicates"] == "warning"  # one in seven
     assert code >= 1
 

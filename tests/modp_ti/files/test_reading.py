@@ -10,7 +10,7 @@ import pytest
 from modp_ti.files import exists, is_file, open_file, parse_json, read_bytes, text_lines
 from modp_ti.files import reading as files
 from modp_ti.files.errors import InputError
-from modp_ti.files.memory import available_memory
+from modp_ti.files.reading import available_memory
 
 
 def failure(path: Path) -> str:

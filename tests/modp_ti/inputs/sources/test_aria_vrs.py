@@ -52,7 +52,7 @@ def test_images_are_those_of_the_librarys_undistortion_on_the_devices_clock(reco
     from projectaria_tools.core import calibration
 
     made = open_source(SourceSettings(path=recording))
-    assert made.names == tuple(f"{recording.stem}_{i:06d}" for i in range(4))
+    assert tuple(made.names) == tuple(f"{recording.stem}_{i:06d}" for i in range(4))
     stream = library.get_stream_id_from_label("camera-rgb")
     fisheye = library.get_device_calibration().get_camera_calib("camera-rgb")
     pinhole = calibration.get_linear_camera_calibration(800, 800, 400)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.inputs.sources.exif import focal_length_35mm
+from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 CODED = cv2.imencode(".jpg", np.zeros((36, 48, 3), np.uint8))[1].tobytes()
 

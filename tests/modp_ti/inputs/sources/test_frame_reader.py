@@ -165,7 +165,7 @@ def test_all_frames_of_a_camera_share_one_vignette(images: Path, tmp_path: Path)
 
 
 def test_a_vignette_that_cannot_be_used_is_named(images: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"v\.png: the vignette cannot be opened"):
+    with pytest.raises(InputError, match=r"v\.png: no such file; it should be the vignette"):
         reader(images, vignette=tmp_path / "v.png")
     (tmp_path / "v.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"v\.png: the vignette is no image"):

@@ -28,7 +28,7 @@ def folder(tmp_path):
 def test_names_are_in_natural_order_with_subfolders_and_without_other_files(folder, tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     made = folder("f10.png", "f9.png", "F2.PNG", "f0010.jpg", "b/1.png", ".hidden/1.png", "._f9.png")
-    assert made.names == ("b/1.png", "F2.PNG", "f9.png", "f0010.jpg", "f10.png")
+    assert tuple(made.names) == ("b/1.png", "F2.PNG", "f9.png", "f0010.jpg", "f10.png")
     assert [made.position(name) for name in made.names] == [0, 1, 2, 3, 4]
 
 

@@ -25,7 +25,7 @@ NAMES = ("frame-000002.color.png", "frame-000004.color.png", "frame-000011.color
 def test_colour_images_are_taken_alone_and_timed_by_their_number(tmp_path, inside):
     sequence(tmp_path / inside, *NAMES, "frame-000002.depth.png", "other.png")
     made = open_source(SourceSettings(path=tmp_path))
-    assert made.names == NAMES
+    assert tuple(made.names) == NAMES
     np.testing.assert_allclose([made.timestamp(name) for name in NAMES], np.array([2, 4, 11]) / 30)
     camera = made.intrinsics.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (525, 525, 320, 240)

@@ -84,7 +84,7 @@ def by_opencv(file: Path) -> list[np.ndarray]:
 
 def test_frames_are_named_counted_and_timed_by_the_container(video):
     made = VideoFile(video, fps=99.0)
-    assert made.names[:2] == ("room_000000", "room_000001")
+    assert tuple(made.names[:2]) == ("room_000000", "room_000001")
     assert len(made) == FRAMES
     assert made.position("room_000012") == 12
     assert made.size("room_000003") == (64, 48)

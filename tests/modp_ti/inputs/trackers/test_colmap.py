@@ -119,7 +119,7 @@ def test_poses_and_images_that_do_not_match_are_named(plane_scene):
     for i, file in enumerate(sorted(plane_scene.folder.iterdir())):
         file.rename(file.with_name(f"other{i}.png"))
     message = failure(plane_scene)
-    assert f"none of the 7 images of {folder} is in {plane_scene.folder}" in message
+    assert f"{folder}: none of its 7 images is in {plane_scene.folder}" in message
     assert "view" in message and "other0.png" in message
 
 

@@ -66,7 +66,7 @@ def test_what_is_not_there_is_counted(released):
     assert [frame.name for frame in tracker.frames] == [released.names[i] for i in (0, 2, 3, 4, 5)]
     assert [len(frame.points) > 0 for frame in tracker.frames] == [True, False, False, True, True]
     assert tracker.notes == [
-        f"1 cameras of trajectory.json have no image in {released.root / 'images'}: skipped",
+        f"1 cameras of trajectory.json are not in {released.root / 'images'}: skipped",
         "1 of 6 images have no pose in trajectory.json: skipped (the first: view14.png)",
         f"1 frames have no file of points in {released.root / 'point_cloud'}: they bring none",
     ]
@@ -81,8 +81,11 @@ def test_what_is_not_there_is_counted(released):
         (lambda c: c[2].update(T_camera_world=np.diag([1, 2, 1, 1.0]).tolist()), ["camera 2", "no rigid motion"]),
         (lambda c: c[2]["T_camera_world"][1].__setitem__(3, float("nan")), ["camera 2", "NaN"]),
         (lambda c: c[2].pop("image"), ["camera 2 has no `image`"]),
-        (lambda c: c[2].update(image=c[1]["image"]), ["cameras 1 and 2 both have the image view9.png"]),
-        (lambda c: [each.update(image="gone.png") for each in c], ["none of its 7 cameras has an image", "gone.png"]),
+        (
+            lambda c: c[2].update(image=c[1]["image"]),
+            ["cameras 1 (view9.png) and 2 (view9.png) are both the image view9.png"],
+        ),
+        (lambda c: [each.update(image="gone.png") for each in c], ["none of its 7 cameras is in", "gone.png"]),
         (lambda c: c.clear(), ["holds no list of `cameras`"]),
     ],
 )

@@ -1,28 +1,26 @@
-"""Every kind of tracker that a scene may name has an opener, of its own settings."""
+"""Every kind of tracker that a scene may name can be opened, and its settings say what it can do."""
 
 from __future__ import annotations
 
-from typing import get_type_hints
+import re
 
 import pytest
 
 from modp_ti.config.keys import variants_of
-from modp_ti.config.settings import SceneConfig, SourceSettings
-from modp_ti.config.tracker_settings import TrackerSettings
-from modp_ti.inputs.trackers import openers
-from modp_ti.inputs.trackers.openers import OPENERS, Opening, opens
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.trackers import open_tracker
 
 KINDS = variants_of(SceneConfig.model_fields["tracker"])
 
 
-def test_every_kind_has_an_opener():
-    assert list(OPENERS) == list(KINDS.values())
-
-
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_opener_takes_the_settings_that_it_is_registered_for(kind):
-    hints = get_type_hints(OPENERS[KINDS[kind]], vars(openers))
-    assert KINDS[kind] in hints.values() and hints["opening"] is Opening
+def test_every_kind_is_opened_and_names_what_is_missing(tmp_path, kind):
+    source = {} if kind == "socket" else {"path": tmp_path / "gone"}
+    tracker = {"kind": kind, **({"path": tmp_path / "gone" / "socket"} if kind == "socket" else {})}
+    config = SceneConfig.model_validate({"source": source, "tracker": tracker, "output": tmp_path / "out"})
+    with pytest.raises(InputError, match=re.escape(str(tmp_path))):
+        open_tracker(config)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -33,14 +31,3 @@ def test_settings_know_their_kind_and_what_it_can_do(kind):
     assert settings.brings_cameras == (kind in ("colmap", "transforms", "socket"))
     assert settings.follows_streams == (kind == "klt")
     assert settings.is_live == (kind == "socket")
-
-
-def test_an_opener_can_be_added(monkeypatch):
-    class Another(TrackerSettings):
-        kind: str = "another"
-
-    seen = []
-    monkeypatch.setitem(OPENERS, Another, None)
-    opens(Another)(lambda tracker, opening: seen.append((tracker.kind, opening.seed)))
-    OPENERS[Another](Another(), Opening(SourceSettings(), seed=4))
-    assert seen == [("another", 4)]

@@ -19,7 +19,7 @@ from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.config.tracker_settings import AriaSettings, SevenScenesSettings, StellaVslamSettings, TumSettings
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.trackers.aria import open_aria
-from modp_ti.inputs.trackers.sevenscenes import open_sevenscenes
+from modp_ti.inputs.trackers.data_sets import open_sevenscenes
 from modp_ti.inputs.trackers.stella_vslam import open_stella_vslam
 from modp_ti.inputs.trackers.tum import open_tum
 

@@ -76,8 +76,8 @@ def test_frames_without_image_file_are_skipped_with_a_count(with_cloud):
     tracker = opened(with_cloud)
     assert len(tracker) == 7
     assert tracker.notes == [
-        "3 frames of transforms.json have no image file: skipped",
-        "1 of 8 images have no pose in transforms.json: skipped",
+        f"3 frames of transforms.json are not in {with_cloud.folder}: skipped",
+        "1 of 8 images have no pose in transforms.json: skipped (the first: unposed.png)",
     ]
 
 
@@ -88,7 +88,7 @@ def test_no_image_at_all_is_an_error(with_cloud):
 
     edited(with_cloud, rename)
     message = failure(with_cloud)
-    assert "none of its 7 frames has an image" in message and "gone0.png" in message and "source.path" in message
+    assert "none of its 7 frames is in" in message and "gone0.png" in message and "source.path" in message
 
 
 def test_names_without_suffix_or_from_another_folder_are_found(with_cloud):
@@ -102,7 +102,7 @@ def test_names_without_suffix_or_from_another_folder_are_found(with_cloud):
 
 def test_two_frames_of_one_image_are_an_error(with_cloud):
     edited(with_cloud, lambda data: data["frames"].append(data["frames"][2]))
-    assert "two frames name the image view10.png" in failure(with_cloud)
+    assert "frames 2 (images/view10.png) and 7 (images/view10.png) are both the image view10.png" in failure(with_cloud)
 
 
 def test_intrinsics_of_a_frame_win_over_those_of_the_file(with_cloud):

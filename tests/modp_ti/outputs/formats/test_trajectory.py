@@ -70,7 +70,7 @@ def test_missing_file_is_named(tmp_path):
 
 
 def test_comments_commas_and_no_poses_are_read(tmp_path):
-    (tmp_path / "t.txt").write_text("# time\n1.5, 1, 2, 3, 0, 0, 0, 2 # not of unit length\n")
+    (tmp_path / "t.txt").write_text("# time\n1.5, 1, 2, 3, 0, 0, 0, 1 # one\n")
     times, T = read_trajectory(tmp_path / "t.txt")
     assert times.tolist() == [1.5]
     np.testing.assert_allclose(T[0], [[1, 0, 0, -1], [0, 1, 0, -2], [0, 0, 1, -3], [0, 0, 0, 1]])
