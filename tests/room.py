@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d as o3d
 import pycolmap
 from numpy.typing import NDArray
 
@@ -52,6 +51,9 @@ class Room:
     """Walls, two boxes, a sphere and a cylinder, each with its own texture."""
 
     def __init__(self) -> None:
+        import open3d as o3d  # takes seconds, which the collection of the tests would wait for
+
+        self._tensor = o3d.core.Tensor
         make = o3d.t.geometry.TriangleMesh
         pieces = [
             (make.create_box(*(HIGH - LOW)), LOW),
@@ -79,7 +81,7 @@ class Room:
             rays: (N, 3) directions.
         """
         six = np.concatenate([np.broadcast_to(eye, rays.shape), rays], axis=1).astype(np.float32)
-        hit = self._scene.cast_rays(o3d.core.Tensor(six), nthreads=1)
+        hit = self._scene.cast_rays(self._tensor(six), nthreads=1)
         return (
             hit["t_hit"].numpy().astype(np.float64),
             hit["geometry_ids"].numpy().astype(np.int64),

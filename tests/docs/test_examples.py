@@ -7,9 +7,9 @@ import runpy
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import pytest
 
+from modp_ti.outputs.formats.open3d_io import open3d
 from modp_ti.outputs.formats.splats_ply import read_splats
 
 pytestmark = pytest.mark.slow
@@ -50,7 +50,7 @@ def voxels(names: dict) -> None:
 def exports(names: dict) -> None:
     assert (read_splats("out/opaque.ply")["opacity_logit"] > 0).all()
     assert len(read_splats("out/splats.ply")["position"]) == len(names["opaque"]) > names["opaque"].sum() > 100
-    assert len(o3d.io.read_triangle_mesh("out/mesh.ply").triangles) > 1000
+    assert len(open3d().io.read_triangle_mesh("out/mesh.ply").triangles) > 1000
     assert np.median(names["distance"]) < 0.03  # of a depth of four
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.signal import correlate
 
 from modp_ti.files.errors import InputError
 from modp_ti.outputs import lpips as module
@@ -42,6 +41,8 @@ def pictures(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 def plain_features(alexnet: Entries, picture: np.ndarray) -> list[np.ndarray]:
     """Channels (C, h, w) of the five layers."""
+    from scipy.signal import correlate  # takes seconds, which the collection of the tests would wait for
+
     x = picture.astype(np.float64).transpose(2, 0, 1) * 2 - 1
     x = (x - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[:, None, None]
     features = []

@@ -6,9 +6,9 @@ import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import open3d as o3d
 import pytest
 
 from fields.geometry.camera import PinholeCamera
@@ -22,7 +22,11 @@ from modp_ti.outputs.formats.mesh import (
     without_floating_parts,
     write_mesh,
 )
+from modp_ti.outputs.formats.open3d_io import open3d
 from tests.room import Room, pinhole, walk
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
 COLOUR = np.float32([0.25, 0.5, 1.0])
@@ -71,7 +75,8 @@ def test_the_room_is_fused_to_its_true_surface(room: Room) -> None:
         views.append(SurfaceView(camera, T, without_edges(z.reshape(120, 160).astype(np.float32)), grey))
     mesh = without_floating_parts(extracted(fused(views, voxel=0.025, farthest=10.0)))
     vertices, true = (
-        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz)) for xyz in (mesh.vertices, np.concatenate(surface))
+        open3d().geometry.PointCloud(open3d().utility.Vector3dVector(xyz))
+        for xyz in (mesh.vertices, np.concatenate(surface))
     )
     for one, other in ((vertices, true), (true, vertices)):
         near = np.asarray(one.compute_point_cloud_distance(other)) < 0.025
@@ -90,9 +95,9 @@ def test_depth_is_left_out_at_the_edges_of_things() -> None:
 
 
 def test_small_parts_on_their_own_go_and_large_ones_stay() -> None:
-    sphere = o3d.geometry.TriangleMesh.create_sphere(1.0)
-    other = o3d.geometry.TriangleMesh.create_sphere(0.5).translate((3.0, 0, 0))
-    crumb = o3d.geometry.TriangleMesh.create_sphere(0.03).translate((0, 3.0, 0))
+    sphere = open3d().geometry.TriangleMesh.create_sphere(1.0)
+    other = open3d().geometry.TriangleMesh.create_sphere(0.5).translate((3.0, 0, 0))
+    crumb = open3d().geometry.TriangleMesh.create_sphere(0.03).translate((0, 3.0, 0))
     mesh = without_floating_parts(sphere + other + crumb)
     vertices = np.asarray(mesh.vertices)
     assert vertices[:, 0].max() == pytest.approx(3.5)
@@ -116,8 +121,8 @@ def test_a_file_without_triangles_is_refused(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def tetrahedron() -> o3d.geometry.TriangleMesh:
-    mesh = o3d.geometry.TriangleMesh.create_tetrahedron()
-    mesh.vertex_colors = o3d.utility.Vector3dVector([[1, 0, 0], [0, 0.5, 0], [0, 0, 0.2], [0.8, 0.8, 0.8]])
+    mesh = open3d().geometry.TriangleMesh.create_tetrahedron()
+    mesh.vertex_colors = open3d().utility.Vector3dVector([[1, 0, 0], [0, 0.5, 0], [0, 0, 0.2], [0.8, 0.8, 0.8]])
     return mesh
 
 
@@ -126,9 +131,9 @@ def test_another_program_reads_places_triangles_and_colours(
     tmp_path: Path, tetrahedron: o3d.geometry.TriangleMesh, suffix: str
 ) -> None:
     path = tmp_path / f"mesh{suffix}"
-    write_mesh(path, o3d.geometry.TriangleMesh(tetrahedron))
+    write_mesh(path, open3d().geometry.TriangleMesh(tetrahedron))
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
-    back = o3d.io.read_triangle_mesh(str(path))
+    back = open3d().io.read_triangle_mesh(str(path))
     vertices, colours = np.asarray(back.vertices), np.asarray(back.vertex_colors)
     if suffix == ".glb":
         vertices = vertices * [1, -1, -1]  # y is up there
@@ -147,7 +152,7 @@ def test_another_program_reads_places_triangles_and_colours(
 
 
 def test_glb_has_the_layout_that_is_published(tmp_path: Path, tetrahedron: o3d.geometry.TriangleMesh) -> None:
-    write_mesh(tmp_path / "mesh.glb", o3d.geometry.TriangleMesh(tetrahedron))
+    write_mesh(tmp_path / "mesh.glb", open3d().geometry.TriangleMesh(tetrahedron))
     data = (tmp_path / "mesh.glb").read_bytes()
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
     length, kind = struct.unpack_from("<I4s", data, 12)
