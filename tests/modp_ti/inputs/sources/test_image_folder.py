@@ -129,7 +129,7 @@ def test_name_of_a_tracker_is_found_by_its_end_and_without_suffix(folder, asked,
 
 def test_range_selects_by_position(folder):
     made = folder(*(f"{i}.png" for i in range(12)))
-    assert made.selected(1, 8, 3) == ("1.png", "4.png", "7.png")
-    assert made.selected(10, None, 1) == ("10.png", "11.png")
+    assert made.selected(1, 8, 3) == ["1.png", "4.png", "7.png"]
+    assert made.selected(10, None, 1) == ["10.png", "11.png"]
     with pytest.raises(InputError, match=r"source\.start=12 leaves no frame"):
         made.selected(12, None, 1)

@@ -201,7 +201,7 @@ def test_two_threads_may_read(mp4):
 def test_stop_ends_the_reading_there(mp4):
     made = VideoFile(mp4, stop=7)
     assert len(made) == 7
-    assert made.selected(1, 7, 3) == ("room_000001", "room_000004")
+    assert made.selected(1, 7, 3) == ["room_000001", "room_000004"]
     with pytest.raises(InputError, match=r"source\.start=7 leaves no frame of the 7 in the file"):
         made.selected(7, None, 1)
 
