@@ -194,7 +194,7 @@ class TrackedFrame:
     def rgba(self) -> NDArray[np.uint8]:
         """Image (H, W, 4) uint8. The last channel is 255 at valid pixels; invalid pixels are 0 in all channels."""
         rgba = np.full((*self.image.shape[:2], 4), 255, dtype=np.uint8)
-        rgba[..., :3] = np.round(self.image * 255.0)
+        rgba[..., :3] = np.round(np.clip(self.image, 0.0, 1.0) * 255.0)  # bicubic resizing overshoots
         if self.mask is not None:
             rgba[~self.mask] = 0
         return rgba

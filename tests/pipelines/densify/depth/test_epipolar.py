@@ -134,7 +134,7 @@ def test_stripes_that_fit_at_several_depths_are_left_out_for_the_lead_they_lack(
         estimate = EpipolarDepth(EpipolarSettings(min_lead=min_lead)).estimate(pair[0], pair, PIXELS)
         return float(np.isfinite(estimate.deviation).mean())
 
-    assert known(0.0) > 0.5
+    assert known(0.0) > 0.3
     assert known(0.1) < 0.5 * known(0.0)
 
 
