@@ -33,6 +33,11 @@ class OnlineMapper(OnlineMap):
         seed: Seed of the random generator.
         depth: Depth estimator; None builds the one that `settings.depth` names.
         views: View selection; None for `LocalGlobalViews`.
+
+    Example:
+        mapper = modp_ti.OnlineMapper(modp_ti.MappingSettings(), max_width=640, max_height=480, seed=0)
+        for frame in frames:  # of class `TrackedFrame`
+            report = mapper.process(frame)
     """
 
     def compile(self) -> None:

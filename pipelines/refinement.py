@@ -33,6 +33,10 @@ def refine(
         progress: Called after every step with (steps done, mean PSNR of its views).
         done: Number of steps made before the mapper was restored. The remaining steps are the same as without the
             interruption.
+
+    Example:
+        mapper.finish()
+        modp_ti.refine(mapper, modp_ti.RefineSettings(steps=100))
     """
     store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
     pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0

@@ -27,7 +27,7 @@ class PoseCorrection:
             increasing.
 
     Example:
-        mapper.correct(modp_ti.PoseCorrection(np.array([0, 5]), np.stack([np.eye(4), T_camera_world])))
+        mapper.correct(modp_ti.PoseCorrection(np.array([0, 1]), np.stack([np.eye(4), T_camera_world])))
     """
 
     index: NDArray[np.int64]

@@ -81,6 +81,12 @@ class TrackedFrame:
 
     Raises:
         ValueError: If the shapes or dtypes do not fit, or the pose is not finite.
+
+    Example:
+        image = np.zeros((480, 640, 3), dtype=np.uint8)
+        intrinsics = (500.0, 500.0, 320.0, 240.0)
+        xyz, pixels = [[0.0, 0.0, 2.0]], [[320.0, 240.0]]
+        frame = modp_ti.TrackedFrame.from_arrays(0, image, np.eye(4), intrinsics, xyz, pixels)
     """
 
     index: int

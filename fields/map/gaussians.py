@@ -44,6 +44,10 @@ class GaussianField:
         anchor: Number of the view that placed each Gaussian; NO_ANCHOR if it is not known.
         count: Number of Gaussians.
         capacity: Size of the pool.
+
+    Example:
+        gaussians = modp_ti.GaussianField(sh_degree=1)
+        gaussians.load(modp_ti.read_splats("out/room/splats.ply"))
     """
 
     def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:

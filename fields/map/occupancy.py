@@ -61,6 +61,10 @@ class OccupancyVoxels:
 
     Raises:
         ValueError: If the levels and resolution exceed the range of the tree, or `coarsest` is not positive.
+
+    Example:
+        points = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 2.01]])
+        kept = modp_ti.OccupancyVoxels(coarsest=1.0).admit(points, 0.25)  # [True, False]: both are in one cell
     """
 
     def __init__(

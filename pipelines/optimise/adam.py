@@ -103,7 +103,7 @@ class Adam:
     def _update_field(self, i, value: ti.template(), m: ti.template(), v: ti.template(), lr, betas, corrections, eps):
         value[i] = self._update(value[i], value.grad[i], m[i], v[i], lr, betas, corrections, eps)
 
-    # Scalars instead of one array: on CUDA, Taichi would copy a NumPy array in both directions and wait for it.
+    # Fifteen scalars instead of one array: on CUDA, Taichi would copy a NumPy array in both directions and wait for it.
     @ti.kernel
     def _step(
         self,

@@ -36,6 +36,10 @@ class RasterizedView(NamedTuple):
         image: Colour (H, W, 3), not clipped.
         depth: Depth (H, W) as the weighted sum of z, not divided by opacity.
         opacity: Opacity (H, W).
+
+    Example:
+        view: modp_ti.RasterizedView = modp_ti.rasterize(**tensors, T_camera_world=torch.eye(4), camera=camera)
+        image, depth, opacity = view
     """
 
     image: Tensor
@@ -88,6 +92,11 @@ def rasterize(
         TypeError: If types do not fit, or not exactly one of `sh` and `colour` is given. The message is one line.
         ValueError: If shapes, devices or values do not fit. The message is one line.
         RuntimeError: If `initialise` has not been called, or there is no room for another set of fields.
+
+    Example:
+        state = modp_ti.read_splats("out/room/splats.ply")
+        tensors = {name: torch.from_numpy(values).requires_grad_() for name, values in state.items()}
+        modp_ti.rasterize(**tensors, T_camera_world=torch.eye(4), camera=camera).image.mean().backward()
     """
     program()
     if (sh is None) == (colour is None):

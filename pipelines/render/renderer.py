@@ -80,6 +80,10 @@ class Renderer:
         images: Image buffers.
         view_renders: Number of views rendered and differentiated so far, the measure of work in comparisons of the
             online and offline modes.
+
+    Example:
+        view = modp_ti.Renderer(gaussians, 640, 480).render(camera, T_camera_world, near=0.01)
+        print(view.colour.shape, view.expected_depth().max())
     """
 
     def __init__(self, gaussians: GaussianField, max_width: int, max_height: int, image_cache_gb: float = 2.0) -> None:

@@ -114,7 +114,13 @@ class Compositing:
             for p in range(TILE_PIXELS):
                 not_opaque += ti.select(self.images.transmittance[base + p] > OPAQUE, 1.0, 0.0)
         self.pairs.reached[tile] = reached
+        self._store_tile(tile, width, height)
 
+    @ti.func
+    def _store_tile(self, tile, width, height):
+        """Copy a composited tile to the image."""
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        base = tile * TILE_PIXELS
         stride, plane = ti.static(self.images.stride, self.images.plane)
         columns = ti.min(TILE_WIDTH, width - tile % tiles_x * TILE_WIDTH)
         background = self.images.background[None]
@@ -165,7 +171,8 @@ class Compositing:
                 self._backward_tile(spread // SPREAD, width, height, with_depth)
 
     @ti.func
-    def _backward_tile(self, tile, width, height, with_depth: ti.template()):
+    def _load_gradients(self, tile, width, height, with_depth: ti.template()):
+        """Copy a tile's gradients from the image, with `behind` and the transmittance as before the first Gaussian."""
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
         base = tile * TILE_PIXELS
         for p in range(TILE_PIXELS):
@@ -200,6 +207,11 @@ class Compositing:
                 self.images.blue_grad[target + x] = blue_grad
                 self.images.behind[target + x] = behind
 
+    @ti.func
+    def _backward_tile(self, tile, width, height, with_depth: ti.template()):
+        self._load_gradients(tile, width, height, with_depth)
+        tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+        base = tile * TILE_PIXELS
         left = ti.cast(tile % tiles_x * TILE_WIDTH, self.real) + 0.5
         top = ti.cast(tile // tiles_x * TILE_HEIGHT, self.real) + 0.5
         first, reached = self.pairs.first[tile], self.pairs.reached[tile]

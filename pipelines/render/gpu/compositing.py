@@ -194,6 +194,39 @@ class DeviceCompositing:
             self._backward_pixel(i, width, height, slot, rows, origin, gradient, True)
 
     @ti.func
+    def _column_sums(
+        self,
+        g,
+        column,
+        rows,
+        dx,
+        dy,
+        weights: ti.template(),
+        power_grads: ti.template(),
+        image_grad: ti.template(),
+        with_depth: ti.template(),
+    ):
+        """Gradients of the step's g-th Gaussian over its rows of one column; (dx, dy) leads from its mean to row 0."""
+        s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
+        s, s_y, s_yy = 0.0, 0.0, 0.0
+        for r in range(rows & 0xFFFF, rows >> 16):
+            at = ((r << ROW_BITS) & (TILE_PIXELS - 1)) | column
+            weight = weights[g * PLANE + at]
+            power_grad = power_grads[g * PLANE + at]
+            s_red += weight * image_grad[at]
+            s_green += weight * image_grad[TILE_PIXELS + at]
+            s_blue += weight * image_grad[2 * TILE_PIXELS + at]
+            if ti.static(with_depth):
+                s_z += weight * image_grad[3 * TILE_PIXELS + at]
+            down = dy + ti.cast(r, ti.f32)
+            u = power_grad * down
+            s += power_grad
+            s_y += u
+            s_yy += u * down
+        return ti.Vector([s_red, s_green, s_blue, s_z, s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy])
+
+    # Longer than other functions: its three phases share six arrays of the block and the pixel's registers.
+    @ti.func
     def _backward_pixel(
         self,
         i,
@@ -286,25 +319,8 @@ class DeviceCompositing:
             g = thread >> ROW_BITS
             sums = ti.Vector.zero(ti.f32, SUMS)
             if g < here:
-                dx = px - splats[g * WIDTH]
-                dy = ti.cast(top, ti.f32) + 0.5 - splats[g * WIDTH + 1]
-                s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
-                s, s_y, s_yy = 0.0, 0.0, 0.0
-                for r in range(spans[g] & 0xFFFF, spans[g] >> 16):
-                    at = ((r << ROW_BITS) & (TILE_PIXELS - 1)) | column
-                    weight = weights[g * PLANE + at]
-                    power_grad = power_grads[g * PLANE + at]
-                    s_red += weight * image_grad[at]
-                    s_green += weight * image_grad[TILE_PIXELS + at]
-                    s_blue += weight * image_grad[2 * TILE_PIXELS + at]
-                    if ti.static(with_depth):
-                        s_z += weight * image_grad[3 * TILE_PIXELS + at]
-                    down = dy + ti.cast(r, ti.f32)
-                    u = power_grad * down
-                    s += power_grad
-                    s_y += u
-                    s_yy += u * down
-                sums = ti.Vector([s_red, s_green, s_blue, s_z, s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy])
+                dx, dy = px - splats[g * WIDTH], ti.cast(top, ti.f32) + 0.5 - splats[g * WIDTH + 1]
+                sums = self._column_sums(g, column, spans[g], dx, dy, weights, power_grads, image_grad, with_depth)
             ti.simt.block.sync()
             for c in ti.static(range(SUMS)):
                 weights[(g * SUMS + c) * COLUMNS + column] = sums[c]
