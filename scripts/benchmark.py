@@ -3,6 +3,9 @@
 The tables contain: the time of a step by stage and by pixel-Gaussian pair; its share of the machine's float32
 throughput and memory bandwidth; how it grows; the cost of the voxels; and the frames per second of whole runs. Every
 measurement runs in its own process. Figures are medians after a warm-up.
+
+With --quality, they contain instead the held-out PSNR of scenes against processor time at several budgets, by this
+version of the program and, with --against, by another one.
 """
 
 from __future__ import annotations
@@ -14,9 +17,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from benchmarks import quality, quality_report
 from benchmarks.report import report
 from ending import documented_ending
 from experiments import Job, command_line, execute, named_scenes, parser, write_report
@@ -37,10 +43,21 @@ def main() -> None:
     options.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
     options.add_argument("--scene", action="append", metavar="FILE", help="scene of a whole run (default: the demo)")
     options.add_argument("--repeats", type=int, default=15, help="timed calls a figure (default 15)")
+    options.add_argument("--quality", action="store_true", help="held-out PSNR against processor time; needs -o")
+    options.add_argument("--against", metavar="REV", help="for --quality: also run this commit, interleaved")
+    options.add_argument(
+        "--budgets", type=int, nargs="+", default=[1, 2, 4, 8, 25], metavar="STEPS", help="steps a keyframe of its runs"
+    )
+    options.add_argument("--runs", type=int, default=1, help="for --quality: runs of each, medians count (default 1)")
     options.add_argument("--measure", help=argparse.SUPPRESS)
     arguments = options.parse_args()
     if arguments.measure:
         print(json.dumps(measure(**json.loads(arguments.measure))))
+        return
+    if arguments.quality:
+        if arguments.output is None:
+            options.error("--quality writes a plot: give a folder with -o")
+        measure_quality(arguments)
         return
     figures = collect(arguments)
     text = report(figures)
@@ -48,6 +65,25 @@ def main() -> None:
         print(text)
     else:
         write_report(arguments.output, "benchmark", text, figures)
+
+
+def measure_quality(arguments: argparse.Namespace) -> None:
+    """Measure quality against processor time, and write quality.md, quality.json and quality.png."""
+    scenes = named_scenes(arguments.scene or [str(DEMO)])
+    settings = {"device": arguments.device, **command_line(arguments.set)}
+    for name, scene in scenes.items():
+        Job(name, scene, arguments.output, settings).check()
+    with ExitStack() as held:
+        programs = [quality.this_program()]
+        if arguments.against:
+            programs.append(held.enter_context(quality.against(arguments.against)))
+        runs = quality.curves(scenes, programs, arguments.budgets, arguments.runs, settings, arguments.output / "runs")
+    figures = {
+        scene: {program: [asdict(point) for point in points] for program, points in of.items()}
+        for scene, of in runs.items()
+    }
+    write_report(arguments.output, "quality", quality_report.report(runs), figures)
+    quality_report.plot(runs, arguments.output / "quality.png")
 
 
 def collect(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -28,10 +28,12 @@ from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.trackers import Tracker, open_tracker
-from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
+from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, keyframe_psnr, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.retention import retention
+from pipelines.pipeline import FrameReport
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
@@ -132,7 +134,8 @@ class _Session:
                 self._map(rest)
             except RunStopped:
                 raise self._stopped() from None
-            self.clock.end_mapping(self.observer.waited)
+            scoring = self.mapper.pipeline.stopwatch.seconds.get("evaluate", 0.0)
+            self.clock.end_mapping(self.observer.waited + scoring)
         # A live tracker adds notes at its end.
         self._say(*(note for note in self.tracker.notes if note not in notes))
 
@@ -166,7 +169,7 @@ class _Session:
                     )
                 report = mapper.add(frame)
                 line.frame(report)
-                self.record.frame(frame.index, report)
+                self.record.frame(frame.index, report, self._mapped_psnr(report))
                 self.observer.on_frame(frame, report)
                 self.checkpointer.after_frame()
             if offline:
@@ -177,6 +180,14 @@ class _Session:
             self.stop.check()
         finally:
             line.stop()
+
+    def _mapped_psnr(self, report: FrameReport | None) -> float | None:
+        """Return the PSNR of a keyframe that was just mapped, for `retention`. None for other frames."""
+        pipeline = self.mapper.pipeline
+        if report is None or not report.is_keyframe or report.psnr is None:
+            return None
+        with pipeline.stopwatch.measure("evaluate"):
+            return keyframe_psnr(pipeline, pipeline.keyframes[-1])
 
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Callback after a step of the offline optimisation."""
@@ -298,6 +309,7 @@ class _Session:
             "lpips_note": self.no_lpips,
             "breakdown_percent": self.breakdown,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
+            "retention": retention(self.record.frames, scores),
             **trajectory_errors(frames.T_tracked, list(versions.values())[-1].trajectory, truth),
         }
         results.write_scores(scores, metrics)

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.se3 import inverse_se3
 from fields.map.gaussians import GaussianField
+from fields.map.keyframes import Keyframe
+from modp_ti.outputs.detail import explained_detail
 from modp_ti.outputs.lpips import Lpips
-from pipelines.optimise.losses import PhotometricLoss
+from pipelines.optimise.losses import LossValues, PhotometricLoss
 from pipelines.render.renderer import Renderer
 
 __all__ = [
@@ -23,6 +25,7 @@ __all__ = [
     "MapVersion",
     "absolute_trajectory_error",
     "evaluate",
+    "keyframe_psnr",
     "score_frame",
     "summary",
     "trajectory_errors",
@@ -75,6 +78,8 @@ class FrameScore:
         psnr: PSNR [dB].
         ssim: SSIM.
         lpips: LPIPS, None if its weights are not available.
+        detail: Share of the image's finest band that the render explains, see `explained_detail`. None if the image
+            has no detail.
     """
 
     index: int
@@ -84,6 +89,7 @@ class FrameScore:
     psnr: float
     ssim: float
     lpips: float | None
+    detail: float | None = None
 
 
 def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
@@ -97,6 +103,7 @@ def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
         "psnr": mean([score.psnr for score in scores], 4),
         "ssim": mean([score.ssim for score in scores], 5),
         "lpips": mean([score.lpips for score in scores], 5),
+        "detail": mean([score.detail for score in scores], 5),
         "count": len(scores),
     }
 
@@ -130,14 +137,34 @@ def score_frame(
         The score, and the render (H, W, 3).
     """
     rgba = frame.rgba
+    values = _compare(renderer, loss, frame, T_camera_world, near, exposure)
+    render = renderer.images.colour_to_numpy()
+    image = np.asarray(rgba[..., :3] / np.float32(255.0), dtype=np.float32)
+    distance = None if lpips is None else lpips(render, image)
+    detail = explained_detail(render, image, rgba[..., 3] > 0)
+    score = FrameScore(frame.index, frame.name, frame.held_out, stage, values.psnr, values.ssim, distance, detail)
+    return score, render
+
+
+def keyframe_psnr(mapper: EvaluatedMap, view: Keyframe) -> float:
+    """Return the PSNR [dB] of a keyframe in the current map, computed as `score_frame` does."""
+    return _compare(mapper.renderer, mapper.loss, view, view.T_camera_world, mapper.near, view.exposure).psnr
+
+
+def _compare(
+    renderer: Renderer,
+    loss: PhotometricLoss,
+    frame: TrackedFrame | Keyframe,
+    T_camera_world: NDArray[np.float64],
+    near: float,
+    exposure: NDArray[np.float64] | None,
+) -> LossValues:
+    """Render a frame's view, develop and clip it, and compare it with the frame's image."""
     renderer.forward(frame.camera, T_camera_world, near)
     renderer.develop(exposure, frame.vignette)
     renderer.images.clip_colour()
-    renderer.images.set_reference(rgba)
-    values = loss.forward()
-    render = renderer.images.colour_to_numpy()
-    distance = None if lpips is None else lpips(render, np.asarray(rgba[..., :3] / np.float32(255.0), dtype=np.float32))
-    return FrameScore(frame.index, frame.name, frame.held_out, stage, values.psnr, values.ssim, distance), render
+    renderer.images.set_reference(frame.rgba)
+    return loss.forward()
 
 
 def evaluate(

@@ -293,8 +293,10 @@ def _write_run(folder: Path) -> None:
     matrix = np.eye(3, 4).tolist()
     frames = [{"index": i, "timestamp": i / 30, "keyframe": True, "matrix": matrix} for i in range(FRAMES)]
     write_text(folder, "out/exposure.json", [json.dumps({"frames": frames})])
-    scores = ["index,name,held_out,stage,psnr,ssim,lpips"]
-    write_text(folder, "out/scores.csv", [*scores, *(f"{i},{name},0,online,30.5,0.9," for i, name in enumerate(NAMES))])
+    scores = ["index,name,held_out,stage,psnr,ssim,lpips,detail"]
+    write_text(
+        folder, "out/scores.csv", scores + [f"{i},{name},0,online,30.5,0.9,,0.8" for i, name in enumerate(NAMES)]
+    )
     scene_file(folder, "kind: colmap", "path: images")
     (folder / "out" / "config.yaml").write_text((folder / "scene.yaml").read_text())
 

@@ -96,6 +96,7 @@ scores = st.builds(
     psnr=st.floats(0, 100, allow_subnormal=False),
     ssim=st.floats(-1, 1, allow_subnormal=False),
     lpips=st.none() | st.floats(0, 2, allow_subnormal=False),
+    detail=st.none() | st.floats(-2, 1, allow_subnormal=False),
 )
 
 

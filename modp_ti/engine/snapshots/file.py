@@ -25,7 +25,7 @@ __all__ = ["FILE", "VERSION", "read_arrays", "write_arrays"]
 
 FILE = "snapshot.npz"
 # Version of the arrays and the JSON. Other versions are refused, as they hold the state of different code.
-VERSION = 1
+VERSION = 2
 ABOUT = "about"
 KINDS = "biuf"
 

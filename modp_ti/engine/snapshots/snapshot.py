@@ -154,8 +154,10 @@ class Snapshot:
         state = MapState(self.arrays, {})
         rows = state.group("record")
         columns = [rows[name].tolist() for name in ("index", "held_out", "is_keyframe", "done", "gaussians")]
-        psnr = [None if np.isnan(value) else float(value) for value in rows["psnr"]]
-        record.frames = [FrameNote(*row) for row in zip(*columns, psnr, strict=True)]
+        columns += [
+            [None if np.isnan(value) else float(value) for value in rows[name]] for name in ("psnr", "mapped_psnr")
+        ]
+        record.frames = [FrameNote(*row) for row in zip(*columns, strict=True)]
         steps = state.group("record_steps")
         record.steps = [StepNote(*row) for row in zip(steps["step"].tolist(), steps["psnr"].tolist(), strict=True)]
         record.started = float(self.numbers["started"])
@@ -200,7 +202,9 @@ def record_state(record: RunRecord) -> MapState:
         "is_keyframe": np.array([note.is_keyframe for note in notes], dtype=bool),
         "done": np.array([note.done for note in notes], dtype=np.float64),
         "gaussians": np.array([note.gaussians for note in notes], dtype=np.int64),
-        "psnr": np.array([note.psnr for note in notes], dtype=np.float64),  # None becomes NaN
+        # None becomes NaN.
+        "psnr": np.array([note.psnr for note in notes], dtype=np.float64),
+        "mapped_psnr": np.array([note.mapped_psnr for note in notes], dtype=np.float64),
     }
     steps = {
         "step": np.array([note.step for note in record.steps], dtype=np.int64),

@@ -16,13 +16,15 @@ from modp_ti.outputs.evaluation import FrameScore
 __all__ = ["read_scores", "write_scores"]
 
 COLUMNS = [field.name for field in dataclasses.fields(FrameScore)]
+# Columns of version 0.1.0, which had no `detail`.
+OLD_COLUMNS = COLUMNS[:-1]
 
 
 def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> None:
     """Write the scores with a header line.
 
-    The columns are index, name, held_out (0 or 1), stage, psnr [dB], ssim and lpips (empty if not computed). Numbers
-    are written with enough digits to be read back exactly.
+    The columns are index, name, held_out (0 or 1), stage, psnr [dB], ssim, lpips and detail (both empty if not
+    computed). Numbers are written with enough digits to be read back exactly.
     """
     with replacing(path, "w") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -32,7 +34,7 @@ def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> 
 
 
 def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
-    """Read a file that `write_scores` wrote.
+    """Read a file that `write_scores` wrote, or version 0.1.0, whose files have no `detail`.
 
     Raises:
         InputError: If the file is not valid. The message names the line.
@@ -43,14 +45,17 @@ def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{file}: cannot be read as scores: {reason}") from None
-    if not rows or rows[0] != COLUMNS:
+    if not rows or rows[0] not in (COLUMNS, OLD_COLUMNS):
         raise InputError(f"{file}:1: the columns must be {','.join(COLUMNS)}")
     scores = []
     for number, row in enumerate(rows[1:], start=2):
         try:
-            index, name, held_out, stage, psnr, ssim, lpips = row
+            index, name, held_out, stage, psnr, ssim, *others = row
             held = {"0": False, "1": True}[held_out]
-            score = FrameScore(int(index), name, held, stage, float(psnr), float(ssim), float(lpips) if lpips else None)
+            lpips, *detail = (float(value) if value else None for value in others)
+            if len(row) != len(rows[0]):
+                raise ValueError
+            score = FrameScore(int(index), name, held, stage, float(psnr), float(ssim), lpips, *detail)
         except (ValueError, KeyError):
             raise InputError(f"{file}:{number}: not a line of scores") from None
         scores.append(score)

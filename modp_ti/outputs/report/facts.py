@@ -177,6 +177,10 @@ def other_figures(metrics: Mapping[str, Any]) -> list[Figure]:
     if corrections["received"]:
         text = f"{corrections['received']}, of which {corrections['moved']} moved the map"
         figures.append(Figure("corrections from the tracker", text))
+    kept = (metrics.get("retention") or {}).get(last_stage(metrics))
+    if kept is not None:
+        text = f"{kept['mean']:+.2f} dB in the mean, {kept['worst']:+.2f} dB in the worst 20 in a row"
+        figures.append(Figure("keyframes at the end, against just mapped", text))
     return figures
 
 

@@ -85,7 +85,7 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
     last = list(run.versions.values())[-1]
     plan = plan_of(last.trajectory)
     floor = floor_plan(plan, last.gaussians, _centres(last.trajectory))
-    drawings = {"psnr": plots.psnr_of_frames(run.scores)}
+    drawings = {"psnr": plots.psnr_of_frames(run.scores, run.record.frames)}
     if run.record.frames and run.config.mode == "online":
         drawings["growth"] = plots.growth(run.record.frames)
     if run.record.steps:

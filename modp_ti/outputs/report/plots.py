@@ -71,10 +71,19 @@ def _figure(height: float) -> Figure:
 
 
 @_drawn
-def psnr_of_frames(scores: Sequence[FrameScore]) -> Figure:
-    """Plot the PSNR of every frame in each version of the map, with held-out frames as dots."""
+def psnr_of_frames(scores: Sequence[FrameScore], frames: Sequence[FrameNote] = ()) -> Figure:
+    """Plot the PSNR of every frame in each version of the map, with held-out frames as dots.
+
+    Args:
+        scores: Scores of all frames in all versions.
+        frames: The run's frames; the PSNR of keyframes soon after they were mapped is drawn below the versions'.
+    """
     figure = _figure(3.0)
     axes = figure.add_subplot()
+    mapped = [(note.index, note.mapped_psnr) for note in frames if note.mapped_psnr is not None]
+    if mapped:
+        x, y = np.array(mapped, float).T
+        _line(axes, x, y, "psnr-mapped", color=GREY, lw=1.0, label="keyframes, just mapped")
     for stage in dict.fromkeys(score.stage for score in scores):
         of = [score for score in scores if score.stage == stage]
         x, y = (np.array([getattr(score, name) for score in of], float) for name in ("index", "psnr"))

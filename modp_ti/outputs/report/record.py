@@ -24,6 +24,7 @@ class FrameNote:
         done: Time since the first frame began [s].
         gaussians: Number of Gaussians after the frame.
         psnr: Mean PSNR of the last optimisation step's views [dB], None if nothing was optimised.
+        mapped_psnr: PSNR of the keyframe itself after its own steps [dB], None for other frames.
     """
 
     index: int
@@ -32,6 +33,7 @@ class FrameNote:
     done: float
     gaussians: int
     psnr: float | None
+    mapped_psnr: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,19 +76,21 @@ class RunRecord:
         """Start the clock, before the first frame or before the next frame of a resumed run."""
         self._first = self.clock() - (self.frames[-1].done if self.frames else 0.0)
 
-    def frame(self, index: int, report: FrameReport | None) -> None:
+    def frame(self, index: int, report: FrameReport | None, mapped_psnr: float | None = None) -> None:
         """Record a finished frame.
 
         Args:
             index: The frame's index.
             report: What the frame did to the map, None for a held-out frame.
+            mapped_psnr: PSNR of a keyframe after its own steps [dB].
         """
         done = self.clock() - self._first
         if report is None:
             before = self.frames[-1].gaussians if self.frames else 0
             self.frames.append(FrameNote(index, True, False, done, before, None))
         else:
-            self.frames.append(FrameNote(index, False, report.is_keyframe, done, report.gaussians, report.psnr))
+            note = FrameNote(index, False, report.is_keyframe, done, report.gaussians, report.psnr, mapped_psnr)
+            self.frames.append(note)
 
     def refined(self, step: int, psnr: float) -> None:
         """Record a refinement step. Steps count from 1."""

@@ -10,9 +10,9 @@ from modp_ti.outputs.evaluation import FrameScore, absolute_trajectory_error, su
 
 
 def test_the_summary_holds_means_and_nothing_where_there_are_no_frames() -> None:
-    assert summary([]) == {"psnr": None, "ssim": None, "lpips": None, "count": 0}
+    assert summary([]) == {"psnr": None, "ssim": None, "lpips": None, "detail": None, "count": 0}
     scores = [FrameScore(0, "a", True, "online", 20.0, 0.5, None), FrameScore(1, "b", False, "online", 30.0, 0.7, None)]
-    assert summary(scores) == {"psnr": 25.0, "ssim": 0.6, "lpips": None, "count": 2}
+    assert summary(scores) == {"psnr": 25.0, "ssim": 0.6, "lpips": None, "detail": None, "count": 2}
     scores = [replace(score, lpips=0.1 + 0.2 * score.index) for score in scores]
     assert summary(scores)["lpips"] == 0.2
 

@@ -23,6 +23,7 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion
 from modp_ti.outputs.report.page import ReportedRun
 from modp_ti.outputs.report.pictures import Album
 from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.retention import retention
 from pipelines.pipeline import FrameReport
 
 
@@ -77,7 +78,8 @@ def run_record(frames: int, holdout: int, mode: str, refine: int, keyframe_every
         keyframes += is_keyframe
         psnr = 20.0 + 0.1 * index if is_keyframe and mode == "online" else None
         count = 100 * (index + 1) if mode == "online" else 0
-        record.frame(index, FrameReport(index, is_keyframe, keyframes, count, psnr))
+        mapped = None if psnr is None else psnr + 2.0
+        record.frame(index, FrameReport(index, is_keyframe, keyframes, count, psnr), mapped)
     for step in range(1, refine + 1):
         if mode == "offline":
             record.optimised(step, 50 * step, 20 + 5 * step / refine)
@@ -127,7 +129,7 @@ def made_up_run(
     }
     held_out = [bool(holdout) and index % holdout == 0 for index in range(frames)]
     scores = [
-        FrameScore(i, name.format(i), held_out[i], stage, 25 + n + 3 * np.sin(i), 0.9 + 0.01 * n, None)
+        FrameScore(i, name.format(i), held_out[i], stage, 25 + n + 3 * np.sin(i), 0.9 + 0.01 * n, None, 0.6 + 0.1 * n)
         for n, stage in enumerate(stages)
         for i in range(frames)
     ]
@@ -149,6 +151,7 @@ def made_up_run(
         "ate_rmse_rigid": 0.0234 if truth else None,
         "ate_rmse_tracked": 0.0345 if truth else None,
         **metrics_of(scores, versions, delivered(tracked, held_out), seconds),
+        "retention": retention(record.frames, scores),
     }
     album = Album.of(held_out)
     (folder / "renders").mkdir(exist_ok=True)

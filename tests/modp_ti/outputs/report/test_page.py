@@ -73,10 +73,14 @@ def test_the_numbers_are_those_of_the_metrics(made) -> None:
         expected = []
         for which in ("held_out", "all"):
             s = m[which]
-            expected += [f"{s['psnr']:.2f}", f"{s['ssim']:.3f}", "–", str(s["count"])]
+            expected += [f"{s['psnr']:.2f}", f"{s['ssim']:.3f}", "–", f"{s['detail']:.2f}", str(s["count"])]
         assert rows[stage] == [*expected, f"{m['gaussians']:,}", f"{m['view_renders']:,}"]
     assert rows["trajectory error after mapping"] == ["0.0123"]
     assert rows["most memory held"] == ["1,234 MB"]
+    kept = run.metrics["retention"]["refined"]
+    assert rows["keyframes at the end, against just mapped"] == [
+        f"{kept['mean']:+.2f} dB in the mean, {kept['worst']:+.2f} dB in the worst 20 in a row"
+    ]
     headline = " ".join(page.text)
     assert f"{run.metrics['refined']['held_out']['psnr']:.2f} dB" in headline
     assert f"{run.metrics['gaussians']:,}" in headline

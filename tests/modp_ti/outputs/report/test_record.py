@@ -10,11 +10,11 @@ def test_frames_are_noted_with_the_time_since_the_first_began() -> None:
     times = iter([1000.0, 1000.5, 1002.0, 1002.25])
     record = RunRecord(clock=lambda: next(times))
     record.begin()
-    record.frame(0, FrameReport(0, True, 1, 250, 18.5))
+    record.frame(0, FrameReport(0, True, 1, 250, 18.5), 19.5)
     record.frame(1, None)
     record.frame(2, FrameReport(2, False, 1, 260, None))
     assert record.frames == [
-        FrameNote(0, False, True, 0.5, 250, 18.5),
+        FrameNote(0, False, True, 0.5, 250, 18.5, 19.5),
         FrameNote(1, True, False, 2.0, 250, None),  # held out: the map is as it was
         FrameNote(2, False, False, 2.25, 260, None),
     ]

@@ -1,0 +1,111 @@
+"""Quality against time: the points of a run, the frontier between them, and the comparison of two commits."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+from benchmarks import quality, quality_report
+from benchmarks.quality import Point, Program, frontier, points_of, psnr_at, seconds_to
+
+from modp_ti.files.errors import InputError
+
+
+def point(seconds: float, psnr: float, stage: str = "online", steps: int = 1) -> Point:
+    return Point(steps, stage, seconds, psnr, 0.9, 1000, 5000)
+
+
+def test_processor_time_is_divided_as_the_stages_of_the_run(make_metrics: Callable[..., dict]) -> None:
+    # 100 s in all, of which 10 compile, 5 evaluate and 30 refine.
+    online, refined = points_of(make_metrics(20.0, refined=21.0), processor=200.0, steps=4)
+    assert (online.stage, online.seconds, online.psnr, online.view_renders) == ("online", 110.0, 20.0, 1000)
+    assert (refined.stage, refined.seconds, refined.psnr, refined.steps) == ("refined", 170.0, 21.0, 4)
+    assert [p.stage for p in points_of(make_metrics(20.0), 200.0, 4)] == ["online"]
+
+
+def test_the_frontier_leaves_out_what_another_point_beats() -> None:
+    points = [point(40.0, 24.0), point(10.0, 20.0), point(20.0, 19.0), point(80.0, 24.0)]
+    assert frontier(points) == [(10.0, 20.0), (40.0, 24.0)]
+
+
+def test_quality_and_time_are_read_off_the_same_curve() -> None:
+    points = [point(10.0, 20.0), point(40.0, 24.0)]
+    assert psnr_at(points, 9.0) is None
+    assert psnr_at(points, 20.0) == pytest.approx(22.0)  # halfway in the logarithm of time
+    assert psnr_at(points, 1000.0) == 24.0
+    assert seconds_to(points, 22.0) == pytest.approx(20.0)
+    assert seconds_to(points, 24.5) is None
+
+
+def test_programs_run_interleaved_and_finished_runs_of_commits_are_kept(
+    tmp_path: Path, make_metrics: Callable[..., dict], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[str] = []
+    speeds = {"new": iter([30.0, 10.0, 20.0]), "old+": iter([60.0, 60.0, 60.0])}
+
+    def run(program: Program, scene: Path, overrides: Mapping[str, str]) -> float:
+        started.append(program.label)
+        output = Path(json.loads(overrides["output"]))
+        output.mkdir(parents=True)
+        metrics = make_metrics(20.0 + int(overrides["mapping.optimise.steps"]), refined=30.0)
+        (output / "metrics.json").write_text(json.dumps(metrics))
+        return next(speeds[program.label])
+
+    monkeypatch.setattr(quality, "_run", run)
+    scene = tmp_path / "scene.yaml"
+    scene.write_text("output: out")
+    programs = [Program("new", tmp_path), Program("old+", tmp_path)]
+
+    def measure() -> dict[str, dict[str, list[Point]]]:
+        return quality.curves({"room": scene}, programs, [4], 3, {}, tmp_path / "runs")
+
+    curves = measure()
+    assert started == ["new", "old+", "old+", "new", "new", "old+"]
+    assert [p.seconds for p in curves["room"]["new"]] == [pytest.approx(11.0), pytest.approx(17.0)]  # of 20 s
+    assert [p.psnr for p in curves["room"]["old+"]] == [24.0, 30.0]
+    started.clear()
+    speeds["old+"] = iter([60.0, 60.0, 60.0])
+    assert measure() == curves
+    assert started == ["old+"] * 3  # a changed working tree may have changed again
+
+
+def test_the_report_compares_the_programs_at_the_same_quality(tmp_path: Path) -> None:
+    curves = {
+        "room": {
+            "new": [point(10.0, 20.0), point(40.0, 24.0), point(60.0, 25.0, "refined")],
+            "old": [point(40.0, 22.0), point(90.0, 26.0, "refined")],
+        }
+    }
+    text = quality_report.report(curves)
+    assert "| room, online, 1 steps | 22.00 | 40 | 20 | 50 |" in text
+    assert "| room, refined, 1 steps | 26.00 | 90 | – | – |" in text
+    # The refined map of `new` is best after a minute; that of `old` has not come yet.
+    assert "| room, new | 23.17 | 25.00 |" in text
+    assert "| room, old | – | 24.00 |" in text
+    quality_report.plot(curves, tmp_path / "quality.png")
+    assert (tmp_path / "quality.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_another_commit_is_checked_out_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def git(*arguments: str) -> None:
+        who = ["-c", "user.name=a", "-c", "user.email=a@example.com"]
+        subprocess.run(["git", "-C", str(tmp_path), *who, *arguments], check=True, capture_output=True)
+
+    git("init")
+    for text in ("first", "second"):
+        (tmp_path / "file.py").write_text(text)
+        git("add", ".")
+        git("commit", "-m", text)
+    monkeypatch.setattr(quality, "ROOT", tmp_path)
+    assert quality.this_program().keeps
+    (tmp_path / "file.py").write_text("third")
+    assert not quality.this_program().keeps
+    with quality.against("HEAD~1") as program:
+        assert (program.root / "file.py").read_text() == "first"
+        assert program.keeps
+    assert not program.root.exists()
+    with pytest.raises(InputError, match="no such revision"), quality.against("nowhere"):
+        pass
