@@ -31,8 +31,8 @@ def explained_detail(
     around = np.maximum(_blurred(weight), 1e-6)
 
     def finest(picture: NDArray[np.floating]) -> NDArray[np.float32]:
-        picture = np.asarray(picture, dtype=np.float32) * weight
-        return picture - weight * _blurred(picture) / around
+        counted = (np.asarray(picture, dtype=np.float32) * weight).astype(np.float32)
+        return np.asarray(counted - weight * _blurred(counted) / around, dtype=np.float32)
 
     detail = finest(image)
     whole = float(np.square(detail, dtype=np.float64).sum())
