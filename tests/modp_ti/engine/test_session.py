@@ -104,7 +104,8 @@ def test_the_report_shows_the_figures_and_the_pictures_of_the_run(finished: Path
     rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
     for stage in ("online", "refined"):
         held_out, every = metrics[stage]["held_out"], metrics[stage]["all"]
-        assert rows[stage][0] == f"{held_out['psnr']:.2f}" and rows[stage][4] == f"{every['psnr']:.2f}"
+        assert rows[stage][0] == f"{held_out['psnr']:.2f}" and rows[stage][5] == f"{every['psnr']:.2f}"
+        assert rows[stage][3] == f"{held_out['detail']:.2f}" and rows[stage][8] == f"{every['detail']:.2f}"
     times = {row[0]: row[2] for row in page.tables["time"]}
     assert times["total"] == f"{metrics['seconds']['total']:.1f} s"
     assert any(line.startswith("LPIPS is not computed: ") for line in page.text), "what the run remarked"
