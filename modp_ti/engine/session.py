@@ -39,6 +39,8 @@ from pipelines.stopwatch import Stopwatch, breakdown_percent
 __all__ = ["build_mapper", "run_scene"]
 
 Event = TrackedFrame | PoseCorrection
+# Time of a view at its full size over that of mapping's mean pyramid level. 20 ms against 14 ms on the demo.
+FULL_SIZE = 1.4
 
 
 def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
@@ -152,7 +154,9 @@ class _Session:
     def _map(self, arriving: Iterator[Event]) -> None:
         """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
         mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
-        line.start("reading" if offline else "mapping", self.tracker.frame_count, len(mapper.frames))
+        line.start(
+            "reading" if offline else "mapping", self.tracker.frame_count, len(mapper.frames), self._refinement_time
+        )
         size = None
         self.record.begin()
         try:
@@ -234,6 +238,14 @@ class _Session:
             self.mapper.refine(refine.steps, refine, self._refined, self.checkpointer.refined)
         finally:
             self.line.stop()
+
+    def _refinement_time(self) -> float:
+        """Estimate the time of the refinement [s] from that of the views optimised so far."""
+        if self.config.mode == "offline":
+            return 0.0
+        pipeline, views = self.mapper.pipeline, self.config.refine.steps * self.config.refine.views
+        of_a_view = pipeline.stopwatch.seconds.get("optimise", 0.0) / max(pipeline.renderer.view_renders, 1)
+        return views * of_a_view * FULL_SIZE
 
     def _refined(self, step: int, psnr: float) -> None:
         """Callback after a step of refinement."""

@@ -1,14 +1,16 @@
-"""The progress line of a run: frames, keyframes, Gaussians, PSNR, frames per second."""
+"""The progress line of a run: frames, keyframes, Gaussians, PSNR, frames per second, and the time left."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from modp_ti.outputs.time_left import TimeLeft, duration
 
 if TYPE_CHECKING:
     from pipelines.pipeline import FrameReport
@@ -29,6 +31,8 @@ class ProgressLine:
         self._progress: Progress | None = None
         self._state = ""
         self._logged = 0.0
+        self._left = TimeLeft(None, clock=time.monotonic)
+        self._later: Callable[[], float] = _nothing
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
@@ -58,9 +62,17 @@ class ProgressLine:
         finally:
             self.stop()
 
-    def start(self, what: str, total: int | None, done: int = 0) -> None:
-        """Begin the line of a stage: its name, the number of its items (None if unknown), and how many are done."""
+    def start(self, what: str, total: int | None, done: int = 0, later: Callable[[], float] | None = None) -> None:
+        """Begin the line of a stage.
+
+        Args:
+            what: Name of the stage.
+            total: Number of its items, None if unknown.
+            done: Number of items that are done already.
+            later: Returns the time that the following stages will take [s]; None for no time.
+        """
         self.stop()
+        self._left, self._later = TimeLeft(total, done, clock=time.monotonic), later or _nothing
         self._state = ""
         self._logged = time.monotonic()
         self._progress = Progress(
@@ -68,10 +80,10 @@ class ProgressLine:
             BarColumn(bar_width=8),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[state]}"),
+            TextColumn("{task.fields[state]}{task.fields[left]}"),
             console=self.console,
         )
-        self._progress.add_task(what, total=total, completed=done, state="")
+        self._progress.add_task(what, total=total, completed=done, state="", left="")
         self._progress.start()
 
     def frame(self, report: FrameReport | None) -> None:
@@ -116,8 +128,16 @@ class ProgressLine:
             raise RuntimeError("no progress is shown: call `start` first")
         task = self._progress.tasks[0]
         self._progress.update(task.id, **changes)
+        self._left.update(int(task.completed))
+        left = self._left.seconds()
+        text = "" if left is None or task.finished else f"  {duration(left + self._later())} left"
+        self._progress.update(task.id, left=text)
         if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
             return
         self._logged = time.monotonic()
         total = "" if task.total is None else f"/{task.total:.0f}"
-        self.note(f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}")
+        self.note(f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}{text}")
+
+
+def _nothing() -> float:
+    return 0.0

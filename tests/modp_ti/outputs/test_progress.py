@@ -43,3 +43,20 @@ def test_what_is_quick_leaves_only_its_end_in_a_log() -> None:
 def test_a_terminal_has_one_line_that_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
     assert "mapping 1/3" not in written(terminal=True)
+
+
+def test_the_time_left_includes_that_of_later_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """30 of 90 frames at 2 s each are done: 2 minutes for the others, and 3 minutes for what follows."""
+    now = [0.0]
+    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    console = Console(file=io.StringIO(), width=100)
+    line = ProgressLine(console)
+    line.start("mapping", 90, later=lambda: 180.0)
+    for index in range(30):
+        now[0] += 2.0
+        line.frame(FrameReport(index, True, index + 1, 1200, 20.5))
+    line.stop()
+    text = console.file.getvalue()
+    assert "mapping 30/90" in text and text.split("mapping 30/90")[1].splitlines()[0].endswith("5 min left")
+    assert "left" not in text.split("mapping 5/90")[0], "no estimate in the first ten seconds"
