@@ -102,6 +102,7 @@ def test_the_tables_say_what_came_of_it() -> None:
     assert "| growth of the rest | | +1.00 % |" in soak_table(soak)
 
 
+@pytest.mark.slow
 def test_an_unknown_part_gets_one_line_and_code_two(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.fault_injection.faults", "thunder", "-o", str(tmp_path / "out")]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)

@@ -13,6 +13,8 @@ from tests.pipelines.wall import CAMERA, NORMAL, OFFSET, frame, on_the_plane, po
 
 SETTINGS = MappingSettings(optimise={"steps": 20, "last_steps": 30}, densify={"warm_up": 2})
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def mapped(taichi_on_the_cpu: None) -> OnlineMapper:

@@ -55,6 +55,7 @@ def loss_of(optimiser: MapOptimiser, store: KeyframeStore, state: dict[str, NDAr
     return (1 - WEIGHT) * values.l1 + WEIGHT * (1 - values.ssim)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_photometric_loss_are_those_of_finite_differences(exact: MapOptimiser) -> None:
     """Through loss, compositing and projection, with masked pixels, clamped ones, several tiles and small Gaussians.
 

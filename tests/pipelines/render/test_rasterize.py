@@ -97,6 +97,7 @@ def test_the_gradient_of_a_pose_is_that_of_the_tangent_it_was_made_from(scene: d
     np.testing.assert_allclose(found, numeric, rtol=1e-6, atol=1e-6 * np.abs(found).max())
 
 
+@pytest.mark.slow
 def test_a_gradient_does_not_mind_pictures_drawn_in_between(scene: dict[str, Tensor]) -> None:
     T = torch.from_numpy(POSE).requires_grad_()
     inputs = scene | {"T": T}
@@ -110,6 +111,7 @@ def test_a_gradient_does_not_mind_pictures_drawn_in_between(scene: dict[str, Ten
         np.testing.assert_array_equal(found[name], value)
 
 
+@pytest.mark.slow
 def test_a_gradient_can_be_taken_again_and_by_parts(scene: dict[str, Tensor]) -> None:
     picture = view(scene)
     whole = torch.autograd.grad(picture.image.sum() + picture.depth.sum(), scene["position"], retain_graph=True)[0]
@@ -153,6 +155,7 @@ def test_what_does_not_fit_is_told_in_one_line(
 # ---- room, and Taichi started anew ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_third_set_of_fields_is_refused_with_the_way_out(anew: None, scene: dict[str, Tensor]) -> None:
     view(scene)
     view(scene, camera=LARGE)

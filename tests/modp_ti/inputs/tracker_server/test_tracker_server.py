@@ -160,6 +160,7 @@ def test_alpha_says_which_pixels_count(tmp_path: Path) -> None:
         assert only.rgba[0, 0].tolist() == [200, 200, 200, 255]
 
 
+@pytest.mark.slow
 def test_nothing_more_is_read_while_the_mapper_is_busy(tmp_path: Path) -> None:
     with opened(tmp_path / "s", prefetch=1) as tracker, greeted(tmp_path / "s") as connection:
         sent = 0

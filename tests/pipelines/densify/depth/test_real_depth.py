@@ -18,7 +18,10 @@ from pipelines.densify.depth.estimate import point_depths
 from pipelines.settings import DepthSettings, EpipolarSettings
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "redkitchen"
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no redkitchen beside the project")
+pytestmark = [
+    pytest.mark.real_data,
+    pytest.mark.skipif(not DATA.is_dir(), reason="no redkitchen beside the project"),
+]
 VIEWS = (15, 25, 35, 45, 58)
 
 
