@@ -81,7 +81,7 @@ class OnlineMapper(OnlineMap):
         if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
             self.optimiser.poses.align(view)
         with self.stopwatch.measure("optimise"):
-            self.optimiser.exposure.begin(view, self.renderer, self.near)
+            self.optimiser.exposure.begin(self.keyframes, self.renderer, self.near)
         level = self._draw_level(view)
         image = view.at_level(level)
         self.densifier.add_tracked_points(image)

@@ -214,15 +214,14 @@ class LevelSettings(StrictModel):
 class ExposureSettings(StrictModel):
     """Exposure of every keyframe, image = A colour + b, for cameras with automatic exposure."""
 
-    enabled: bool = Field(default=False, description="estimate the exposure of keyframes with the map")
+    enabled: Literal["auto"] | bool = Field(
+        default=False,
+        description="estimate the exposure of keyframes with the map; auto: from the first keyframe on whose light "
+        "differs from the map's",
+    )
     learning_rate: float = Field(default=0.005, ge=0, description="Adam step of A (3x3) and b")
     regularisation: float = Field(
         default=0.03, ge=0, description="weight of |A - I|^2 + |b|^2 of a keyframe beside its loss"
-    )
-    prior: float = Field(
-        default=0.001,
-        gt=0,
-        description="weight of the last keyframe's exposure in the fit that a new keyframe begins with",
     )
 
 

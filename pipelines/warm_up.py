@@ -9,6 +9,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
 from pipelines.densify.growth import grow, tracked_seeds
 from pipelines.online_map import OnlineMap
+from pipelines.render.cpu.photometric_model import IDENTITY
 
 __all__ = ["warm_up"]
 
@@ -32,8 +33,10 @@ def warm_up(mapper: OnlineMap) -> None:
             voxels.query(np.zeros((0, 3)), 1.0)
             voxels.admit(np.zeros((0, 3)), 1.0)
         grow(gaussians, tracked_seeds(view), None, 1.0, settings.densify, mapper.budget)
-        optimiser.exposure.begin(view, renderer, settings.near)
-        optimiser.step(store, [0], optimiser.rates(1.0), pose_rate=0.0)
+        optimiser.exposure.begin(store, renderer, settings.near)
+        if settings.exposure.enabled:
+            first.exposure = view.exposure = np.array(IDENTITY)
+        optimiser.step(store, [1], optimiser.rates(1.0), pose_rate=0.0)
         optimiser.settle()
         depth.estimate(view, [first], pixels)
         mapper.contribution.measure(store, settings.near)

@@ -10,7 +10,7 @@ A kind that was removed is an error that says what replaces it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from modp_ti.config.keys import variants_of
@@ -40,6 +40,9 @@ FLAT_TRACKER: Mapping[str, Any] = {
 # What to do instead of a tracker that this version no longer has, by kind.
 REMOVED_KINDS = {"synthetic": "the procedural room was replaced by demo/room.mp4; map demo/scene.yaml"}
 
+# Every `config.yaml` of 0.2.0 has this key. The fit that it belonged to is gone.
+REMOVED_KEY = ("mapping", "exposure", "prior")
+
 
 def refuse_removed_kind(settings: Mapping[str, Any], where: Mapping[str, str], name: str) -> None:
     """Raise InputError if this version no longer has the scene's `tracker.kind`.
@@ -60,6 +63,7 @@ def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:
 
     If the tracker's kind is missing or unknown, all keys are kept.
     """
+    settings = _without_removed(settings)
     tracker = settings.get("tracker")
     kind = tracker.get("kind") if isinstance(tracker, Mapping) else None
     model = variants_of(SceneConfig.model_fields["tracker"]).get(str(kind))
@@ -70,3 +74,12 @@ def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:
         return key in model.model_fields or key not in FLAT_TRACKER or value not in (None, FLAT_TRACKER[key])
 
     return {**settings, "tracker": {key: value for key, value in tracker.items() if says_something(key, value)}}
+
+
+def _without_removed(settings: Mapping[str, Any], names: Sequence[str] = REMOVED_KEY) -> dict[str, Any]:
+    """Return a copy of settings without the removed key, whose sections may be absent."""
+    name, *deeper = names
+    if not deeper:
+        return {key: value for key, value in settings.items() if key != name}
+    section = settings.get(name)
+    return {**settings, name: _without_removed(section, deeper)} if isinstance(section, Mapping) else dict(settings)

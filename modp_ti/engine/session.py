@@ -39,8 +39,7 @@ from pipelines.stopwatch import Stopwatch, breakdown_percent
 __all__ = ["build_mapper", "run_scene"]
 
 Event = TrackedFrame | PoseCorrection
-# Time of a view at its full size over that of mapping's mean pyramid level. 20 ms against 14 ms on the demo.
-FULL_SIZE = 1.4
+FULL_SIZE = 1.4  # time of a view at its full size over that at mapping's mean pyramid level: 20 and 14 ms on the demo
 
 
 def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:

@@ -10,21 +10,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.keyframes import Keyframe
+from fields.map.keyframes import Keyframe, KeyframeStore
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
 from pipelines.settings import ExposureSettings
 
-__all__ = ["ExposureRefinement", "fitted_exposure", "scene_colours"]
+__all__ = ["ExposureRefinement", "fitted_gains", "scene_colours"]
 
 # Pixels whose rendered opacity is at most this are not used to fit an exposure.
 MIN_OPACITY = 0.9
 MIN_PIXELS = 100
 # Scene colours may exceed the white of a photograph (1), but not by more than a short exposure explains.
 BRIGHTEST = 2.0
-FIT_ROUNDS = 5
-LEAST_RESIDUAL = 0.01
+# Darker values are mostly noise, brighter ones may be saturated: neither says how bright the image is.
+DARK, SATURATED = 0.04, 0.96
+# A keyframe starts within this factor of the map's brightness.
+LARGEST_GAIN = 4.0
+# Relative change of brightness from which a recording counts as one whose light changes.
+CHANGED = 0.03
 
 
 def scene_colours(view: Keyframe, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -56,33 +60,27 @@ def _resized(vignette: NDArray[np.float32], rgba: NDArray[np.uint8]) -> NDArray[
     return np.asarray(cv2.resize(vignette, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def fitted_exposure(
-    colours: NDArray[np.floating], image: NDArray[np.floating], prior: NDArray[np.float64], prior_weight: float
+def fitted_gains(
+    colours: NDArray[np.floating], image: NDArray[np.floating], otherwise: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Fit an exposure (A, b) with image = A colours + b, regularised towards a prior.
+    """Fit a gain per channel, image = gain * colours, as the median ratio, so that errors of the map act as outliers.
 
-    Minimises the absolute residuals by iteratively reweighted least squares, so that errors of the map act as outliers.
+    A full (A, b) is not fitted: nearly grey images leave it undetermined, and errors of the rendered colours shrink it.
 
     Args:
         colours: Rendered colours (N, 3).
         image: Observed colours (N, 3).
-        prior: Prior (A, b) (3, 4).
-        prior_weight: Weight of the squared distance to the prior.
+        otherwise: Gains (3,) of channels with fewer than `MIN_PIXELS` values that are neither dark nor saturated.
 
     Returns:
-        Exposure (A, b) (3, 4).
+        Gains (3,), from 1/4 to 4.
     """
-    homogeneous = np.concatenate([colours, np.ones((len(colours), 1))], axis=1).astype(np.float64)
-    weights = np.ones(len(colours))
-    exposure = prior
-    for _ in range(FIT_ROUNDS):
-        weighted = homogeneous * (weights / len(colours))[:, None]
-        normal = weighted.T @ homogeneous + prior_weight * np.eye(4)
-        exposure = np.linalg.solve(normal, weighted.T @ image + prior_weight * prior.T).T
-        residual = np.linalg.norm(homogeneous @ exposure.T - image, axis=1)
-        weights = 1.0 / np.maximum(residual, LEAST_RESIDUAL)
-        weights /= weights.mean()
-    return exposure
+    gains = np.array(otherwise, dtype=np.float64)
+    for c in range(3):
+        sound = (image[:, c] > DARK) & (image[:, c] < SATURATED) & (colours[:, c] > DARK)
+        if sound.sum() >= MIN_PIXELS:
+            gains[c] = np.median(image[sound, c] / colours[sound, c])
+    return np.clip(gains, 1.0 / LARGEST_GAIN, LARGEST_GAIN)
 
 
 class ExposureRefinement:
@@ -100,31 +98,38 @@ class ExposureRefinement:
         self.settings = settings
         self.safeguards = Safeguards() if safeguards is None else safeguards
 
-    def begin(self, view: Keyframe, renderer: Renderer, near: float) -> None:
-        """Initialise the exposure of a new keyframe by a fit to the current render. Does nothing if disabled.
+    def begin(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
+        """Initialise the exposure of the latest keyframe by a fit of gains to the current render, if enabled.
 
-        `view.exposure` must hold the exposure of the last keyframe, which is the prior of the fit, or None for the
-        first keyframe, whose exposure becomes the identity.
+        With `enabled: auto`, exposures are estimated from the first keyframe on whose brightness differs from that of
+        the render. All earlier keyframes then get the identity, which the first keyframe always has.
 
         Args:
-            view: The new keyframe.
+            store: The keyframes.
             renderer: Renderer of the map. Its images are overwritten.
             near: Depth below which nothing is drawn [scene units].
         """
-        if not self.settings.enabled:
-            return
-        if view.exposure is None:
+        view, enabled = store[-1], self.settings.enabled
+        if enabled is True and len(store) == 1:
             view.exposure = np.array(IDENTITY)
+        if not enabled or len(store) == 1:
             return
-        renderer.forward(view.camera, view.T_camera_world, near)
-        known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (view.rgba[..., 3] > 0)
+        small = view.at_level(store.levels)
+        renderer.forward(small.camera, view.T_camera_world, near)
+        known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
         if known.sum() < MIN_PIXELS:
             return
-        image = view.rgba[known][:, :3] / 255.0
+        image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:
-            image = image / _resized(view.vignette, view.rgba)[known]
-        colours = renderer.images.colour_to_numpy()[known]
-        view.exposure = fitted_exposure(colours, image, view.exposure, self.settings.prior)
+            image = image / _resized(view.vignette, small.rgba)[known]
+        before = IDENTITY if view.exposure is None else view.exposure
+        gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(before))
+        if view.exposure is None:
+            if abs(gains.mean() - 1.0) < CHANGED:
+                return
+            for earlier in store:
+                earlier.exposure = np.array(IDENTITY)
+        view.exposure = np.column_stack([np.diag(gains), np.zeros(3)])
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], weight: float = 1.0) -> None:
         """Make one Adam step on the exposure of a keyframe, with the regularisation towards the identity.

@@ -102,3 +102,9 @@ def test_the_rendered_demo_of_0_1_0_is_refused_with_what_replaces_it(tracker, tm
     with pytest.raises(InputError, match=r"demo/room\.mp4") as caught:
         load_scene(tmp_path / "scene.yaml")
     assert "\n" not in str(caught.value)
+
+
+def test_the_prior_of_exposures_that_0_2_0_wrote_has_no_effect() -> None:
+    data = {"tracker": {"kind": "socket"}, "output": "out", "mapping": {"exposure": {"enabled": True, "prior": 0.001}}}
+    assert scene_from_data(data, "config.yaml").mapping.exposure.enabled is True
+    assert data["mapping"]["exposure"]["prior"] == 0.001

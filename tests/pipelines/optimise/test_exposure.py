@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fields.map.keyframes import Keyframe, KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.online import OnlineMapper
-from pipelines.optimise.exposure import ExposureRefinement, fitted_exposure, scene_colours
+from pipelines.optimise.exposure import ExposureRefinement, fitted_gains, scene_colours
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.settings import ExposureSettings, MappingSettings
 from tests.pipelines.test_online import CAMERA, frame
@@ -64,22 +64,19 @@ def test_colours_stay_within_bounds_where_the_exposure_cannot_be_undone() -> Non
 # ---- the fit and the pull --------------------------------------------------------------------------------------
 
 
-def test_the_fit_finds_an_exposure_behind_outliers() -> None:
+def test_the_fit_finds_gains_behind_outliers_and_saturated_pixels() -> None:
     rng = np.random.default_rng(3)
+    gains = np.array([1.3, 0.8, 1.1])
     colours = rng.uniform(0, 1, (4000, 3))
-    image = colours @ EXPOSURE[:, :3].T + EXPOSURE[:, 3] + rng.normal(scale=0.005, size=(4000, 3))
+    image = np.clip(gains * colours + rng.normal(scale=0.005, size=(4000, 3)), 0, 1)
     image[:800] = rng.uniform(0, 1, (800, 3))
-    np.testing.assert_allclose(fitted_exposure(colours, image, IDENTITY, 1e-5), EXPOSURE, atol=0.02)
+    np.testing.assert_allclose(fitted_gains(colours, image, np.ones(3)), gains, rtol=0.01)
 
 
-def test_what_the_colours_do_not_tell_stays_as_in_the_last_keyframe() -> None:
-    """All of one colour: the image's is matched, by the exposure nearest to the prior."""
-    colours = np.tile([0.5, 0.4, 0.6], (500, 1))
-    found = fitted_exposure(colours, 1.2 * colours, EXPOSURE, 1e-6)
-    np.testing.assert_allclose(found @ [0.5, 0.4, 0.6, 1.0], 1.2 * colours[0], atol=1e-4)
-    direction = np.array([0.5, 0.4, 0.6, 1.0])
-    across = np.eye(4) - np.outer(direction, direction) / (direction @ direction)
-    np.testing.assert_allclose((found - EXPOSURE) @ across, 0.0, atol=1e-7)
+def test_a_channel_that_shows_nothing_keeps_its_gain() -> None:
+    colours = np.tile([0.5, 0.4, 0.001], (500, 1))
+    found = fitted_gains(colours, colours * [1.2, 3.0, 1.0], np.array([0.9, 0.9, 0.7]))
+    np.testing.assert_allclose(found, [1.2, 0.9, 0.7])  # green is saturated, blue is dark
 
 
 def test_without_news_from_the_image_the_exposure_returns_to_the_identity() -> None:
@@ -118,15 +115,22 @@ def mapped(frames: list, **exposure: object) -> OnlineMapper:
     return mapper
 
 
-def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None) -> None:
+@pytest.mark.parametrize("enabled", [True, "auto"])
+def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None, enabled: bool | str) -> None:
     frames = [frame(i) for i in range(len(GAINS))]
     frames = [replace(f, image=np.clip(g * f.image, 0, 1)) for f, g in zip(frames, GAINS, strict=True)]
-    mapper = mapped(frames, enabled=True)
+    mapper = mapped(frames, enabled=enabled)
     assert len(mapper.keyframes) == len(GAINS)
     np.testing.assert_array_equal(mapper.keyframes[0].exposure, IDENTITY)
     for view, gain in zip(mapper.keyframes, GAINS, strict=True):
         shown = view.exposure @ [0.5, 0.5, 0.5, 1.0]
         np.testing.assert_allclose(shown, 0.5 * gain, atol=0.03)
+
+
+def test_no_exposure_is_estimated_in_a_light_that_does_not_change(taichi_on_the_cpu: None) -> None:
+    mapper = mapped([frame(i) for i in range(len(GAINS))], enabled="auto")
+    assert len(mapper.keyframes) == len(GAINS)
+    assert all(view.exposure is None for view in mapper.keyframes)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -136,7 +140,7 @@ def test_a_scene_of_one_colour_is_recovered_behind_a_known_vignette(taichi_on_th
         replace(frame(i), image=(colour * vignette()).astype(np.float32), vignette=vignette() if known else None)
         for i in range(4)
     ]
-    mapper = mapped(frames)
+    mapper = mapped(frames, enabled=False)
     view = mapper.keyframes[1]
     scene = mapper.renderer.render(view.camera, view.T_camera_world, 0.01)
     solid = scene.opacity > 0.9
