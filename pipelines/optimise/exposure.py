@@ -110,9 +110,10 @@ class ExposureRefinement:
             near: Depth below which nothing is drawn [scene units].
         """
         view, enabled = store[-1], self.settings.enabled
-        if enabled is True and len(store) == 1:
-            view.exposure = np.array(IDENTITY)
-        if not enabled or len(store) == 1:
+        if not enabled:
+            return
+        if len(store) == 1:
+            view.exposure = np.array(IDENTITY) if enabled is True else None
             return
         small = view.at_level(store.levels)
         renderer.forward(small.camera, view.T_camera_world, near)

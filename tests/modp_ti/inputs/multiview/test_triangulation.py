@@ -182,6 +182,7 @@ def test_features_without_a_ray_are_not_matched(plane_scene):
     assert len(match_features(found.descriptors, found.descriptors, rays, rays, np.eye(3), 1.0)) == 0
 
 
+# The second is searched at a smaller size.
 @pytest.mark.parametrize("size", [(300, 260), pytest.param((2400, 2080), marks=pytest.mark.slow)])
 def test_features_lie_at_the_centres_of_blobs(size):
     width, height = size
