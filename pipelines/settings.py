@@ -96,6 +96,12 @@ class DepthSettings(StrictModel):
     max_deviation: float = Field(
         default=0.045, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
     )
+    max_misplacement: float = Field(
+        default=0.0,
+        ge=0,
+        description="a pixel gets its Gaussian all the same if a depth wrong by its deviation moves it by less than "
+        "this in other keyframes [px]; 0 for never",
+    )
     hole_deviation: float = Field(
         default=0.15,
         gt=0,
@@ -215,9 +221,9 @@ class ExposureSettings(StrictModel):
     """Exposure of every keyframe, image = A colour + b, for cameras with automatic exposure."""
 
     enabled: Literal["auto"] | bool = Field(
-        default=False,
-        description="estimate the exposure of keyframes with the map; auto: from the first keyframe on whose light "
-        "differs from the map's",
+        default="auto",
+        description="estimate the exposure of keyframes with the map; auto: from the first keyframe on in which the "
+        "tracked points have become brighter or darker",
     )
     learning_rate: float = Field(default=0.005, ge=0, description="Adam step of A (3x3) and b")
     regularisation: float = Field(

@@ -100,7 +100,7 @@ class Densifier:
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
             last = len(self.keyframes) - 1
             neighbours = [self.keyframes[j] for j in range(max(0, last - depth.neighbours), last)]
-            seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit)
+            seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit, depth.max_misplacement)
         self._grow(seeds, view)
 
     def _grow(self, seeds: Seeds, view: Keyframe) -> None:

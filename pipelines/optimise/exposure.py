@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.keyframes import Keyframe, KeyframeStore
+from pipelines.optimise.light import DARK, SATURATED, light_changes
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
@@ -23,12 +24,8 @@ MIN_OPACITY = 0.9
 MIN_PIXELS = 100
 # Scene colours may exceed the white of a photograph (1), but not by more than a short exposure explains.
 BRIGHTEST = 2.0
-# Darker values are mostly noise, brighter ones may be saturated: neither says how bright the image is.
-DARK, SATURATED = 0.04, 0.96
 # A keyframe starts within this factor of the map's brightness.
 LARGEST_GAIN = 4.0
-# Relative change of brightness from which a recording counts as one whose light changes.
-CHANGED = 0.03
 
 
 def scene_colours(view: Keyframe, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -101,8 +98,8 @@ class ExposureRefinement:
     def begin(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
         """Initialise the exposure of the latest keyframe by a fit of gains to the current render, if enabled.
 
-        With `enabled: auto`, exposures are estimated from the first keyframe on whose brightness differs from that of
-        the render. All earlier keyframes then get the identity, which the first keyframe always has.
+        With `enabled: auto`, exposures are estimated from the first keyframe on whose light has changed, see
+        `light_changes`. All earlier keyframes then get the identity, which the first keyframe always has.
 
         Args:
             store: The keyframes.
@@ -115,6 +112,11 @@ class ExposureRefinement:
         if len(store) == 1:
             view.exposure = np.array(IDENTITY) if enabled is True else None
             return
+        if view.exposure is None:
+            if not light_changes(store):
+                return
+            for keyframe in store:
+                keyframe.exposure = np.array(IDENTITY)
         small = view.at_level(store.levels)
         renderer.forward(small.camera, view.T_camera_world, near)
         known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
@@ -123,13 +125,7 @@ class ExposureRefinement:
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:
             image = image / _resized(view.vignette, small.rgba)[known]
-        before = IDENTITY if view.exposure is None else view.exposure
-        gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(before))
-        if view.exposure is None:
-            if abs(gains.mean() - 1.0) < CHANGED:
-                return
-            for earlier in store:
-                earlier.exposure = np.array(IDENTITY)
+        gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(view.exposure))
         view.exposure = np.column_stack([np.diag(gains), np.zeros(3)])
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], weight: float = 1.0) -> None:

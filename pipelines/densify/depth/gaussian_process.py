@@ -35,8 +35,8 @@ class GaussianProcessDepth:
     # Colour difference that is equivalent to one length scale of distance; with infinity, colour is ignored.
     COLOURS: tuple[float, ...] = (np.inf,)
     NOISE_RATIOS = (1e-3, 1e-2, 1e-1)
-    # Maximum number of points, approximately, in the fit of the four parameters.
-    FIT_POINTS = 150
+    # Maximum number of points in the fit of the four parameters.
+    FIT_POINTS = 100
     # Factor on the deviation of the process.
     CAUTION = 1.0
 
@@ -51,7 +51,7 @@ class GaussianProcessDepth:
             return unknown_depth(len(pixels))
         known, asked = self._features(view, places), self._features(view, pixels)
         y = torch.from_numpy(np.log(z))
-        some = slice(None, None, max(len(y) // self.FIT_POINTS, 1))
+        some = np.linspace(0, len(y) - 1, min(len(y), self.FIT_POINTS)).astype(int)
         length, colour, ratio, variance = self._fit(known[some], (y - y.mean())[some])
         K = variance * self._correlation(known, known, length, colour)
         k = variance * self._correlation(asked, known, length, colour)

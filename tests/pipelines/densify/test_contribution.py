@@ -62,7 +62,7 @@ def test_what_no_view_shows_covers_nothing(renderers: Callable[..., Renderer], s
     state["position"][7] = -50.0 * POSE[2, :3]  # behind both cameras
     renderer.gaussians.load(state)
     measured = Contribution(renderer.gaussians, renderer).measure(store, NEAR)
-    assert measured[7] == 0 and np.count_nonzero(measured) >= 15
+    assert measured[7] == 0 and np.count_nonzero(measured) >= 10
 
 
 def test_measuring_leaves_no_gradient(renderers: Callable[..., Renderer], store: KeyframeStore) -> None:

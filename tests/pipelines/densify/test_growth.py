@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
@@ -11,7 +13,15 @@ from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframes import Keyframe, KeyframeStore
 from fields.map.occupancy import OccupancyVoxels
 from pipelines.densify.depth import DepthEstimate
-from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
+from pipelines.densify.growth import (
+    Seeds,
+    dissimilarity,
+    error_pixels,
+    grow,
+    misplacement,
+    pixel_seeds,
+    tracked_seeds,
+)
 from pipelines.memory_budget import MemoryBudget
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.settings import DensifySettings
@@ -130,6 +140,46 @@ def test_every_pixel_may_have_a_limit_of_its_own() -> None:
     seeds = pixel_seeds(view(), [], pixels, Wall(), np.array([0.001, 0.06, 2.0]))
     local = seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3]
     np.testing.assert_allclose(CAMERA.project(local), pixels[2:])
+
+
+def sideways(view: Keyframe, baseline: float) -> Keyframe:
+    """The view from a camera that has moved to its right."""
+    T = view.T_camera_world.copy()
+    T[0, 3] -= baseline
+    return replace(view, index=view.index + 1, T_camera_world=T)
+
+
+def test_a_misplacement_is_the_motion_of_the_pixel_in_the_views_that_see_it() -> None:
+    v = view()
+    pixels, depth, deviation = np.array([[80.5, 60.5], [158.5, 60.5]]), np.array([5.0, 5.0]), np.array([0.2, 0.2])
+    others = [sideways(v, 0.5), sideways(v, 1.0)]
+    moved = misplacement(v, others, pixels, depth, deviation)
+    # A sideways camera sees a point at depth z at x - f b / z.
+    expected = [100.0 * b * (1 / 5.0 - 1 / (5.0 * np.exp(0.2))) for b in (0.5, 1.0)]
+    np.testing.assert_allclose(moved, np.sqrt(np.mean(np.square(expected))), rtol=1e-6)
+    np.testing.assert_allclose(misplacement(v, [v], pixels, depth, deviation), 0.0, atol=1e-9)
+
+
+def test_what_no_other_view_sees_is_misplaced_without_bound() -> None:
+    v = view()
+    pixels, depth, deviation = np.array([[2.5, 60.5]]), np.array([5.0]), np.array([0.2])
+    assert np.isinf(misplacement(v, [], pixels, depth, deviation)).all()
+    assert np.isinf(misplacement(v, [sideways(v, 1.0)], pixels, depth, deviation)).all()
+
+
+def test_an_uncertain_pixel_is_seeded_where_its_error_would_hardly_be_seen() -> None:
+    pixels = np.array([[70.5, 60.5], [120.5, 60.5]])  # of deviation 0.01, and 0.4
+
+    class Vague(Wall):
+        def estimate(self, view: Keyframe, neighbours, pixels: np.ndarray) -> DepthEstimate:
+            return DepthEstimate(np.full(len(pixels), 5.0), np.where(pixels[:, 0] < 80, 0.01, 0.4))
+
+    v = view()
+    near, far = [sideways(v, 0.1)], [sideways(v, 1.0)]  # 0.7 and 6.6 px
+    assert len(pixel_seeds(v, near, pixels, Vague(), 0.06)) == 1
+    assert len(pixel_seeds(v, near, pixels, Vague(), 0.06, max_misplacement=2.0)) == 2
+    assert len(pixel_seeds(v, far, pixels, Vague(), 0.06, max_misplacement=2.0)) == 1
+    assert len(pixel_seeds(v, near, pixels, Wall(), 0.06, max_misplacement=2.0)) == 1  # a deviation of 1 says nothing
 
 
 @pytest.fixture(scope="module")
