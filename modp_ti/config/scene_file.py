@@ -131,6 +131,7 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         problems = error.errors()
         first = problems[0]
         place = _place(first["loc"])
+        same = [problem for problem in problems if _place(problem["loc"]) == place]
         text = first["msg"].removeprefix("Value error, ")
         if first["type"].startswith("union_tag"):  # the section's kind is missing or unknown
             place += "." + first.get("ctx", {})["discriminator"].strip("'")
@@ -138,22 +139,33 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         elif first["type"] == "missing":
             text = f"{place} is missing: {_description(place) or 'it has no default'}"
         elif place and first["type"] != "value_error":
-            text = f"{place}: {text.replace('Input should be', 'must be')}, not {as_yaml(first['input'])}"
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+            text = f"{place}: {_expected(same)}, not {as_yaml(first['input'])}"
+        others = len(problems) - len(same)
+        more = f" (and {others} more)" if others else ""
         raise InputError(f"{where.get(place, name)}: {text}{more}") from None
 
 
+def _expected(problems: list[ErrorDetails]) -> str:
+    """What a value must be, from the errors of all types that it may have: "must be 'auto' or a valid number"."""
+    # A word is no advice for a value that is not text: 7 should be less, not 'auto'.
+    types = [problem for problem in problems if problem["type"] != "literal_error"]
+    meant = problems if isinstance(problems[0]["input"], str) or not types else types
+    texts = [problem["msg"].replace("Input should be", "must be") for problem in meant]
+    return " or ".join([texts[0], *(text.removeprefix("must be ") for text in texts[1:])])
+
+
 def _place(location: tuple[int | str, ...]) -> str:
-    """The dotted key of a pydantic error, whose location also contains the kind of a section."""
+    """The dotted key of a pydantic error, whose location also contains the kind of a section or the type of a value."""
     parts: list[str] = []
     fields: Mapping[str, FieldInfo] = SceneConfig.model_fields
     remaining = iter(location)
     for part in remaining:
-        parts.append(str(part))
         info = fields.get(str(part))
         if info is None:
+            parts += [str(part)] if isinstance(part, int) or not parts else []
             fields = {}
             continue
+        parts.append(str(part))
         variants = variants_of(info)
         sections = [variants[str(tag)] for tag in islice(remaining, 1)] if variants else sections_of(info.annotation)
         fields = sections[0].model_fields if sections else {}

@@ -110,6 +110,7 @@ class _Session:
         tick = time.perf_counter()
         self.tracker = open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
+        self.config = self.config.resolved(self.tracker.scale)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             first = next(arriving, None)

@@ -59,6 +59,11 @@ class Tracker(ABC):
         return None
 
     @property
+    def scale(self) -> float:
+        """Factor from the width and height of the stored images to those of the delivered ones."""
+        return 1.0
+
+    @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
         """Damaged images skipped so far, by name, with the error for each."""
         return {}

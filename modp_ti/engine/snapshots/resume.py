@@ -47,7 +47,11 @@ def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> 
     snapshot = Snapshot.read(file)
     config = load_scene(scene, overrides) if scene else scene_from_data(snapshot.settings, str(file), overrides)
     config = config.model_copy(update={"output": output.resolve()})
-    before, now = _leaves(without_leftovers(snapshot.settings)), _leaves(config.model_dump(mode="json"))
+    before = _leaves(without_leftovers(snapshot.settings))
+    scale = before.get("source.scale")
+    if isinstance(scale, float):  # the run's number, which `auto` in the scene file became
+        config = config.resolved(scale)
+    now = _leaves(config.model_dump(mode="json"))
     for key in [*now, *(key for key in before if key not in now)]:
         if before.get(key) != now.get(key) and not any(key == free or key.startswith(f"{free}.") for free in FREE):
             raise InputError(

@@ -179,7 +179,7 @@ class KltTracker(Tracker):
         reader: Reads the images with their masks.
         names: Names of the images as they arrive.
         intrinsics: Camera and lens distortion of the stored images.
-        source: Settings of the images: scale, held-out frames.
+        source: Settings of the images: held-out frames.
         seed: Seed of RANSAC.
         notes: Notes to begin with.
     """
@@ -202,7 +202,7 @@ class KltTracker(Tracker):
         self._source = source
         camera = intrinsics.camera
         self._followed = intrinsics.undistorter(_followed_scale(camera.width, camera.height))
-        self._delivered = intrinsics.undistorter(source.scale)
+        self._delivered = intrinsics.undistorter(reader.images.scale)
         self._odometry = Odometry([Lens.pinhole(self._followed.camera)], seed)
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable: dict[str, UnreadableImageError] = {}
@@ -229,6 +229,10 @@ class KltTracker(Tracker):
     def notes(self) -> list[str]:
         """Notes of the source, and of the tracker so far."""
         return [*self._reader.images.notes, *self._notes]
+
+    @property
+    def scale(self) -> float:
+        return self._reader.images.scale
 
     @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:

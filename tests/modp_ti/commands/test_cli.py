@@ -329,7 +329,7 @@ HEAVY_TO_COMPLETE = "('taichi', 'torch', 'open3d', 'pycolmap', 'matplotlib')"
         ("modp-ti run scene.yaml --q", ["--quiet"]),
         ("modp-ti export out --format sp", ["splat", "spz"]),
         ("modp-ti render out --path ", ["recorded", "smoothed", "orbit"]),
-        ("modp-ti run scene.yaml --set source.sc", ["source.scale=1.0"]),
+        ("modp-ti run scene.yaml --set source.sc", ["source.scale=auto"]),
         ("modp-ti run scene.yaml --set tracker.kind=t", ["tracker.kind=transforms", "tracker.kind=tum"]),
     ],
 )

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.slow
 
 def known_camera(folder: Path, box_room, **settings) -> KltTracker:
     source, images = SourceSettings(path=folder, **settings), ImageFolder(folder)
+    images.scale = settings.get("scale", 1.0)
     intrinsics = Intrinsics(box_room.camera)
     return KltTracker(FrameReader(images, source), ArrivingNames(images, source), intrinsics, source)
 
