@@ -55,7 +55,10 @@ class Tracker(ABC):
 
     @property
     def frame_count(self) -> int | None:
-        """Number of frames that the tracker delivers, or None if it is unknown, as for a live camera."""
+        """Number of frames that the tracker delivers, or None if it is unknown, as for a live camera.
+
+        It may shrink while the tracker finds images that it cannot place.
+        """
         return None
 
     @property
