@@ -30,10 +30,12 @@ INTRODUCTION = """\
 
 This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`
 for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the
-nearest right one. Units are in square brackets. To override a key on the command line, use `--set`:
+nearest right one. Units are in square brackets. To override a key on the command line, use `--set`; `--fast` and
+`--best` set several at once ([Presets](#presets)):
 
 ```sh
 modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000
+modp-ti run scene.yaml --fast
 ```
 
 The tables are generated: `python -m modp_ti.config > docs/configuration.md`."""

@@ -10,6 +10,7 @@ import yaml
 from pydantic import ValidationError
 
 from modp_ti.config.keys import documented_keys, documented_values, markdown_of_keys, variants_of
+from modp_ti.config.presets import markdown_of_presets
 from modp_ti.config.scene_file import dump_scene, load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.config.tracker_settings import KltSettings, TumSettings
@@ -345,4 +346,5 @@ def test_every_setting_is_told_with_its_value(scene):
 
 def test_reference_of_the_keys_is_up_to_date():
     page = Path(__file__).resolve().parents[3] / "docs" / "configuration.md"
-    assert page.read_text() == markdown_of_keys(SceneConfig), "run: python -m modp_ti.config > docs/configuration.md"
+    reference = markdown_of_keys(SceneConfig) + "\n" + markdown_of_presets()
+    assert page.read_text() == reference, "run: python -m modp_ti.config > docs/configuration.md"
