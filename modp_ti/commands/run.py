@@ -9,12 +9,14 @@ from typing import Annotated
 import typer
 
 from modp_ti.commands.shared import AsJson, Overrides, Quiet, examples, outcome, progress_console
+from modp_ti.config.presets import PRESETS
 from modp_ti.files.errors import InputError
 
 __all__ = ["EXAMPLES", "run"]
 
 EXAMPLES = examples(
     "modp-ti run scene.yaml",
+    "modp-ti run scene.yaml --fast   (a first look; --best for a map to keep)",
     "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
     "modp-ti run scene.yaml --set snapshot_every=50",
@@ -34,6 +36,8 @@ def run(
             "--resume", metavar="OUT", help="go on with the run whose output folder this is, from its snapshot"
         ),
     ] = None,
+    fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
+    best: Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")] = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -44,14 +48,24 @@ def run(
         raise typer.BadParameter("name a scene file, or the output folder of a run to go on with (--resume OUT)")
     with outcome(as_json) as result:
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
-        folder = _run(scene, resume, overrides, quiet)
+        folder = _run(scene, resume, overrides, _preset(scene, fast, best), quiet)
         result.text = f"written to {folder}"
         if as_json:
             metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
             result.data = {"output": str(folder), "metrics": metrics}
 
 
-def _run(scene: Path | None, resume: Path | None, overrides: list[str], quiet: bool) -> Path:
+def _preset(scene: Path | None, fast: bool, best: bool) -> str | None:
+    """Return the name of the preset that was asked for. Raises InputError if it is not clear or has no effect."""
+    if fast and best:
+        raise InputError("--fast and --best are two presets: give one of them")
+    preset = "fast" if fast else "best" if best else None
+    if preset is not None and scene is None:
+        raise InputError(f"--{preset} is for a scene file: a run that goes on has its settings already")
+    return preset
+
+
+def _run(scene: Path | None, resume: Path | None, overrides: list[str], preset: str | None, quiet: bool) -> Path:
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.config.scene_file import load_scene
 
@@ -59,10 +73,10 @@ def _run(scene: Path | None, resume: Path | None, overrides: list[str], quiet: b
     if resume is not None:
         from modp_ti.engine.snapshots import load_resumed
 
-        config, snapshot = load_resumed(resume, scene, overrides)
+        config, snapshot = load_resumed(resume, scene, overrides, preset)
     else:
         assert scene is not None, "run() asks for one of them"
-        config = load_scene(scene, overrides)
+        config = load_scene(scene, overrides, preset)
     if config.output.exists() and not config.output.is_dir():
         raise InputError(f"{config.output}: output must be a folder, this is a file")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -30,10 +30,12 @@ INTRODUCTION = """\
 
 This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`
 for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the
-nearest right one. Units are in square brackets. To override a key on the command line, use `--set`:
+nearest right one. Units are in square brackets. To override a key on the command line, use `--set`; `--fast` and
+`--best` set several at once ([Presets](#presets)):
 
 ```sh
 modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000
+modp-ti run scene.yaml --fast
 ```
 
 The tables are generated: `python -m modp_ti.config > docs/configuration.md`."""
@@ -130,6 +132,8 @@ def _type_name(annotation: Any) -> str:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return " or ".join(f"`{argument}`" for argument in arguments)
+    if origin is Annotated:
+        return _type_name(arguments[0])
     if origin in (list, tuple):
         return "list of " + _type_name(arguments[0])
     if arguments:

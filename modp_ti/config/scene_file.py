@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 
 from modp_ti.config.keys import as_yaml, documented_keys, sections_of, variants_of
 from modp_ti.config.old_settings import refuse_removed_kind, without_leftovers
+from modp_ti.config.presets import with_preset
 from modp_ti.config.settings import SceneConfig
 from modp_ti.config.unknown_keys import refuse_unknown_keys
 from modp_ti.files import read_text
@@ -30,19 +31,21 @@ __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 M = TypeVar("M", bound=BaseModel)
 
 
-def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneConfig:
+def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
     """Read a scene file.
 
     Args:
         path: The scene file (YAML).
         overrides: Settings as "section.key=value" with the value in YAML, applied in order after the file.
+        preset: Name of a preset, whose settings replace defaults only: "fast" or "best". None for the defaults.
 
     Returns:
         The settings, with absolute paths. Relative paths, including those of overrides, are resolved against the
         scene file's folder.
 
     Raises:
-        InputError: With a one-line message, if the file is unreadable, a key is unknown, or a value is invalid.
+        InputError: With a one-line message, if the file is unreadable, a key or the preset is unknown, or a value is
+            invalid.
 
     Examples:
         Halve the image size of a scene and change its output folder:
@@ -67,7 +70,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
             f"{file}: a scene file has keys such as `source:`, `tracker:` and `output:`; this one holds none"
         )
     where = {key: f"{file}:{line}" for key, line in lines.items()}
-    return _with_absolute_paths(_resolved(data, where, str(file), overrides), file.resolve().parent)
+    return _with_absolute_paths(_resolved(data, where, str(file), overrides, preset), file.resolve().parent)
 
 
 def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = ()) -> SceneConfig:
@@ -109,8 +112,10 @@ def _absolute_path(value: Path, base: Path, name: str) -> Path:
         raise InputError(f"{name}: {value}: is no path: {error}") from None
 
 
-def _resolved(data: dict[str, Any], where: dict[str, str], name: str, overrides: Iterable[str]) -> SceneConfig:
-    """Apply overrides to the raw data and validate it.
+def _resolved(
+    data: dict[str, Any], where: dict[str, str], name: str, overrides: Iterable[str], preset: str | None = None
+) -> SceneConfig:
+    """Apply overrides to the raw data, fill in the preset and validate the result.
 
     `where` maps each dotted key to the file and line, or the override, that set it. Overrides update it.
     """
@@ -120,7 +125,7 @@ def _resolved(data: dict[str, Any], where: dict[str, str], name: str, overrides:
     refuse_removed_kind(data, where, name)
     data = without_leftovers(data)
     refuse_unknown_keys(data, SceneConfig, where, name)
-    return _validated(data, where, name)
+    return _validated(with_preset(data, preset) if preset else data, where, name)
 
 
 def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
@@ -131,6 +136,7 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         problems = error.errors()
         first = problems[0]
         place = _place(first["loc"])
+        same = [problem for problem in problems if _place(problem["loc"]) == place]
         text = first["msg"].removeprefix("Value error, ")
         if first["type"].startswith("union_tag"):  # the section's kind is missing or unknown
             place += "." + first.get("ctx", {})["discriminator"].strip("'")
@@ -138,22 +144,33 @@ def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> Sce
         elif first["type"] == "missing":
             text = f"{place} is missing: {_description(place) or 'it has no default'}"
         elif place and first["type"] != "value_error":
-            text = f"{place}: {text.replace('Input should be', 'must be')}, not {as_yaml(first['input'])}"
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+            text = f"{place}: {_expected(same)}, not {as_yaml(first['input'])}"
+        others = len(problems) - len(same)
+        more = f" (and {others} more)" if others else ""
         raise InputError(f"{where.get(place, name)}: {text}{more}") from None
 
 
+def _expected(problems: list[ErrorDetails]) -> str:
+    """What a value must be, from the errors of all types that it may have: "must be 'auto' or a valid number"."""
+    # A word is no advice for a value that is not text: 7 should be less, not 'auto'.
+    types = [problem for problem in problems if problem["type"] != "literal_error"]
+    meant = problems if isinstance(problems[0]["input"], str) or not types else types
+    texts = [problem["msg"].replace("Input should be", "must be") for problem in meant]
+    return " or ".join([texts[0], *(text.removeprefix("must be ") for text in texts[1:])])
+
+
 def _place(location: tuple[int | str, ...]) -> str:
-    """The dotted key of a pydantic error, whose location also contains the kind of a section."""
+    """The dotted key of a pydantic error, whose location also contains the kind of a section or the type of a value."""
     parts: list[str] = []
     fields: Mapping[str, FieldInfo] = SceneConfig.model_fields
     remaining = iter(location)
     for part in remaining:
-        parts.append(str(part))
         info = fields.get(str(part))
         if info is None:
+            parts += [str(part)] if isinstance(part, int) or not parts else []
             fields = {}
             continue
+        parts.append(str(part))
         variants = variants_of(info)
         sections = [variants[str(tag)] for tag in islice(remaining, 1)] if variants else sections_of(info.annotation)
         fields = sections[0].model_fields if sections else {}

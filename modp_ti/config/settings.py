@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -16,6 +16,7 @@ from modp_ti.files.errors import InputError
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
 __all__ = [
+    "LONGER_SIDE",
     "EvaluationSettings",
     "ExportSettings",
     "IntrinsicsSettings",
@@ -24,6 +25,9 @@ __all__ = [
     "ViewSettings",
     "VrsSettings",
 ]
+
+LONGER_SIDE = 480
+"""Longest side [px] of a mapped image where `source.scale` is `auto`."""
 
 NO_PATH = "source.path is missing: set it to the folder of the images"
 
@@ -106,7 +110,11 @@ class SourceSettings(StrictModel):
     )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
-    scale: float = Field(default=1.0, gt=0, le=1, description="scale factor of the width and height of every frame")
+    scale: Literal["auto"] | Annotated[float, Field(gt=0, le=1)] = Field(
+        default="auto",
+        description=f"factor on the width and height of every frame. `auto` makes the longer side {LONGER_SIDE} pixels "
+        "if it is longer; images of the tracker `socket` keep their size",
+    )
     holdout: int | None = Field(
         default=None, ge=2, description="n: frames 0, n, 2n, ... are used only for evaluation; empty: none"
     )
@@ -149,6 +157,15 @@ class SourceSettings(StrictModel):
         description="true trajectory of the camera in TUM's format, matched with the frames by time: used only for the "
         "trajectory errors (`ate_rmse`) in `metrics.json` and the report; empty for none",
     )
+
+    def scale_for(self, width: int, height: int) -> float:
+        """Return the scale of images of this size: `scale` if it is a number, otherwise what `auto` chooses.
+
+        Args:
+            width: Width of the stored images [px].
+            height: Height of the stored images [px].
+        """
+        return min(1.0, LONGER_SIDE / max(width, height)) if self.scale == "auto" else self.scale
 
     def require_path(self) -> Path:
         """Return `path`.
@@ -286,6 +303,12 @@ class SceneConfig(StrictModel):
     evaluation: EvaluationSettings = EvaluationSettings()
     export: ExportSettings = ExportSettings()
     view: ViewSettings = ViewSettings()
+
+    def resolved(self, scale: float) -> SceneConfig:
+        """Return these settings with the given scale where `source.scale` is `auto`."""
+        if self.source.scale != "auto":
+            return self
+        return self.model_copy(update={"source": self.source.model_copy(update={"scale": scale})})
 
     @property
     def is_live(self) -> bool:

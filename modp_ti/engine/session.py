@@ -33,13 +33,13 @@ from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord
 from modp_ti.outputs.retention import retention
+from modp_ti.outputs.time_left import TimeAfterMapping
 from pipelines.pipeline import FrameReport
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
 
 Event = TrackedFrame | PoseCorrection
-FULL_SIZE = 1.4  # time of a view at its full size over that at mapping's mean pyramid level: 20 and 14 ms on the demo
 
 
 def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
@@ -91,6 +91,7 @@ class _Session:
         # Set once the first frame has arrived.
         self.tracker: Tracker
         self.mapper: Mapper
+        self.after_mapping: TimeAfterMapping
         self.checkpointer: Checkpointer
 
     def run(self, resumed: Snapshot | None) -> Path:
@@ -110,6 +111,7 @@ class _Session:
         tick = time.perf_counter()
         self.tracker = open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
+        self.config = self.config.resolved(self.tracker.scale)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             first = next(arriving, None)
@@ -153,8 +155,12 @@ class _Session:
     def _map(self, arriving: Iterator[Event]) -> None:
         """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
         mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
+        after = self.after_mapping = TimeAfterMapping(self.config, mapper.pipeline)
         line.start(
-            "reading" if offline else "mapping", self.tracker.frame_count, len(mapper.frames), self._refinement_time
+            "reading" if offline else "mapping",
+            self.tracker.frame_count,
+            len(mapper.frames),
+            lambda _: after.seconds(len(mapper.frames), self.tracker.frame_count),
         )
         size = None
         self.record.begin()
@@ -171,7 +177,7 @@ class _Session:
                         f"{frame.name} is {this}, the first frame {size}: all images of a scene must have one size"
                     )
                 report = mapper.add(frame)
-                line.frame(report)
+                line.frame(report, self.tracker.frame_count)
                 self.record.frame(frame.index, report, self._mapped_psnr(report))
                 self.observer.on_frame(frame, report)
                 self.checkpointer.after_frame()
@@ -232,19 +238,12 @@ class _Session:
     def _refine(self) -> None:
         """Refine the map, or continue its refinement. Raises RunStopped between two steps."""
         refine = self.config.refine
-        self.line.start("refining", refine.steps, self.checkpointer.refined)
+        scores = self.after_mapping.scores(len(self.mapper.frames)) / refine.views  # in steps
+        self.line.start("refining", refine.steps, self.checkpointer.refined, lambda step: step * scores)
         try:
             self.mapper.refine(refine.steps, refine, self._refined, self.checkpointer.refined)
         finally:
             self.line.stop()
-
-    def _refinement_time(self) -> float:
-        """Estimate the time of the refinement [s] from that of the views optimised so far."""
-        if self.config.mode == "offline":
-            return 0.0
-        pipeline, views = self.mapper.pipeline, self.config.refine.steps * self.config.refine.views
-        of_a_view = pipeline.stopwatch.seconds.get("optimise", 0.0) / max(pipeline.renderer.view_renders, 1)
-        return views * of_a_view * FULL_SIZE
 
     def _refined(self, step: int, psnr: float) -> None:
         """Callback after a step of refinement."""

@@ -55,8 +55,16 @@ class Tracker(ABC):
 
     @property
     def frame_count(self) -> int | None:
-        """Number of frames that the tracker delivers, or None if it is unknown, as for a live camera."""
+        """Number of frames that the tracker delivers, or None if it is unknown, as for a live camera.
+
+        It may shrink while the tracker finds images that it cannot place.
+        """
         return None
+
+    @property
+    def scale(self) -> float:
+        """Factor from the width and height of the stored images to those of the delivered ones."""
+        return 1.0
 
     @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:

@@ -93,6 +93,10 @@ class ReplayedTracker(Tracker):
         return len(self.frames)
 
     @property
+    def scale(self) -> float:
+        return self._reader.images.scale
+
+    @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
         return self._unreadable
 

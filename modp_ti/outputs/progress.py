@@ -32,7 +32,7 @@ class ProgressLine:
         self._state = ""
         self._logged = 0.0
         self._left = TimeLeft(None, clock=time.monotonic)
-        self._later: Callable[[], float] = _nothing
+        self._later: Callable[[float], float | None] = _nothing
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
@@ -62,14 +62,17 @@ class ProgressLine:
         finally:
             self.stop()
 
-    def start(self, what: str, total: int | None, done: int = 0, later: Callable[[], float] | None = None) -> None:
+    def start(
+        self, what: str, total: int | None, done: int = 0, later: Callable[[float], float | None] | None = None
+    ) -> None:
         """Begin the line of a stage.
 
         Args:
             what: Name of the stage.
             total: Number of its items, None if unknown.
             done: Number of items that are done already.
-            later: Returns the time that the following stages will take [s]; None for no time.
+            later: Returns the time that the following stages will take [s], given the recent time of an item [s].
+                While it returns None, no time is shown. None if nothing follows.
         """
         self.stop()
         self._left, self._later = TimeLeft(total, done, clock=time.monotonic), later or _nothing
@@ -86,15 +89,21 @@ class ProgressLine:
         self._progress.add_task(what, total=total, completed=done, state="", left="")
         self._progress.start()
 
-    def frame(self, report: FrameReport | None) -> None:
-        """Count a finished frame; `report` is None if it is held out."""
+    def frame(self, report: FrameReport | None, total: int | None = None) -> None:
+        """Count a finished frame.
+
+        Args:
+            report: What the frame did to the map, None if it is held out.
+            total: Number of frames as it is known now, None if it has not changed.
+        """
         if report is not None:
             psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
             gaussians = f"  {report.gaussians:,} Gaussians" if report.gaussians else ""
             self._state = f"{report.keyframes} keyframes{gaussians}{psnr}"
         frame_rate = self._progress.tasks[0].speed if self._progress is not None else None
         speed = f"  {frame_rate:.2f} frames/s" if frame_rate else ""
-        self._update(advance=1, state=self._state + speed)
+        changed = {} if total is None else {"total": total}
+        self._update(advance=1, state=self._state + speed, **changed)
 
     def step(self, step: int, psnr: float, gaussians: int | None = None) -> None:
         """Show a finished step of refinement or, with the number of Gaussians, of offline optimisation."""
@@ -128,9 +137,7 @@ class ProgressLine:
             raise RuntimeError("no progress is shown: call `start` first")
         task = self._progress.tasks[0]
         self._progress.update(task.id, **changes)
-        self._left.update(int(task.completed))
-        left = self._left.seconds()
-        text = "" if left is None or task.finished else f"  {duration(left + self._later())} left"
+        text = "" if task.finished else self._time_left(int(task.completed), task.total)
         self._progress.update(task.id, left=text)
         if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
             return
@@ -138,6 +145,16 @@ class ProgressLine:
         total = "" if task.total is None else f"/{task.total:.0f}"
         self.note(f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}{text}")
 
+    def _time_left(self, done: int, total: float | None) -> str:
+        """Return the words for the time left after `done` of `total` items, "" if it is not known."""
+        self._left.total = None if total is None else int(total)
+        self._left.update(done)
+        left, pace = self._left.seconds(), self._left.pace()
+        if left is None or pace is None:
+            return ""
+        later = self._later(pace)
+        return "" if later is None else f"  {duration(left + later)} left"
 
-def _nothing() -> float:
+
+def _nothing(_: float) -> float:
     return 0.0

@@ -1,16 +1,29 @@
-"""`TimeLeft`: estimate of the time that a stage still takes, from its recent pace."""
+"""Estimates of the time that a run still takes, from the recent pace of its stages."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-__all__ = ["TimeLeft", "duration"]
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SceneConfig
+    from pipelines.pipeline import Pipeline
+
+__all__ = ["TimeAfterMapping", "TimeLeft", "duration"]
 
 # Time that a stage must have run before an estimate is made [s].
 EARLIEST = 10.0
 # Share of the elapsed time whose items set the pace. Keyframes become slower as the map grows.
 RECENT = 1 / 3
+
+# Optimisation time before the time of a view is known [s].
+EARLIEST_VIEW = 1.0
+# Time of a view at its full size over that at mapping's mean pyramid level: 20 and 14 ms on the demo.
+FULL_SIZE = 1.4
+# Times of other work, in views at their full size: reading and scoring a frame (80 and 86 ms on the demo at 480x360),
+# and rendering a keyframe without a gradient.
+SCORED, RENDERED = 1.0, 0.5
 
 
 class TimeLeft:
@@ -23,11 +36,18 @@ class TimeLeft:
         total: Number of items; None if unknown.
         done: Number of items that are done already.
         clock: Returns the time [s].
+        earliest: Time before the first estimate [s].
+
+    Attributes:
+        total: As the argument. It may be changed.
     """
 
-    def __init__(self, total: int | None, done: int = 0, *, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, total: int | None, done: int = 0, *, clock: Callable[[], float], earliest: float = EARLIEST
+    ) -> None:
         self.total = total
         self._clock = clock
+        self._earliest = earliest
         self._began = clock()
         self._done = done
         # Times and counts, oldest first. The first one is the latest that lies before the recent third.
@@ -42,13 +62,66 @@ class TimeLeft:
         while len(self._history) > 2 and self._history[1][0] <= since:
             self._history.popleft()
 
-    def seconds(self) -> float | None:
-        """Return the estimated time until the last item is done [s], None if it is not known yet."""
+    def pace(self) -> float | None:
+        """Return the recent time of an item [s], None if it is not known yet."""
         now = self._clock()
         then, before = self._history[0]
-        if self.total is None or now - self._began < EARLIEST or self._done <= before:
+        if now - self._began < self._earliest or self._done <= before:
             return None
-        return (self.total - self._done) * (now - then) / (self._done - before)
+        return (now - then) / (self._done - before)
+
+    def seconds(self) -> float | None:
+        """Return the estimated time until the last item is done [s], None if it is not known yet."""
+        pace = self.pace()
+        return None if self.total is None or pace is None else (self.total - self._done) * pace
+
+
+class TimeAfterMapping:
+    """Estimates the time of what follows the last frame: the last steps, the refinement and the scores of the frames.
+
+    All of it is counted in views. The time of a view is that of the recent ones, since it grows with the map.
+
+    Args:
+        config: The run's settings.
+        pipeline: The run's map.
+    """
+
+    def __init__(self, config: SceneConfig, pipeline: Pipeline) -> None:
+        self._config = config
+        self._pipeline = pipeline
+        self._views = TimeLeft(
+            None,
+            pipeline.renderer.view_renders,
+            clock=lambda: pipeline.stopwatch.seconds.get("optimise", 0.0),
+            earliest=EARLIEST_VIEW,
+        )
+
+    def seconds(self, done: int, frames: int | None) -> float | None:
+        """Return the estimated time [s].
+
+        Args:
+            done: Number of frames that are mapped.
+            frames: Number of frames that there will be, None if unknown.
+
+        Returns:
+            The time; None if it is not known yet, and for an offline map, whose optimisation comes only then.
+        """
+        self._views.update(self._pipeline.renderer.view_renders)
+        pace = self._views.pace()
+        if self._config.mode == "offline" or pace is None or not done or frames is None:
+            return None
+        optimise, select, refine = self._config.mapping.optimise, self._config.mapping.views, self._config.refine
+        views = max(optimise.last_steps - optimise.steps, 0) * (1 + select.local_views + select.global_views)
+        if refine.steps:
+            views += refine.steps * refine.views
+        if refine.steps and refine.min_contribution:
+            views += RENDERED * len(self._pipeline.keyframes) * frames / done
+        return pace * FULL_SIZE * (views + self.scores(frames))
+
+    def scores(self, frames: int) -> float:
+        """Return the number of views that take as long as the scores of all frames in all versions of the map."""
+        versions = 2 if self._config.refine.steps and self._config.mode == "online" else 1
+        return SCORED * versions * frames
 
 
 def duration(seconds: float) -> str:

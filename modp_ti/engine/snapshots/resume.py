@@ -23,13 +23,16 @@ __all__ = ["load_resumed", "replay"]
 FREE = ("output", "threads", "snapshot_every", "source.prefetch", "evaluation", "export", "view")
 
 
-def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> tuple[SceneConfig, Snapshot]:
+def load_resumed(
+    output: Path, scene: Path | None, overrides: Iterable[str], preset: str | None = None
+) -> tuple[SceneConfig, Snapshot]:
     """Read the snapshot in an output folder and the settings to continue with.
 
     Args:
         output: The output folder of the interrupted run.
         scene: Scene file to take the settings from, None for those of the snapshot.
         overrides: `KEY=VALUE` settings that override them.
+        preset: Preset for the scene file. A snapshot holds every setting, which leaves a preset nothing to set.
 
     Returns:
         The settings and the snapshot.
@@ -45,9 +48,16 @@ def load_resumed(output: Path, scene: Path | None, overrides: Iterable[str]) -> 
             raise InputError(f"{output}: this run is finished; there is nothing to resume")
         raise InputError(f"{file}: there is no snapshot; start the run from its scene, and set `snapshot_every`")
     snapshot = Snapshot.read(file)
-    config = load_scene(scene, overrides) if scene else scene_from_data(snapshot.settings, str(file), overrides)
+    if scene is None:
+        config = scene_from_data(snapshot.settings, str(file), overrides)
+    else:
+        config = load_scene(scene, overrides, preset)
     config = config.model_copy(update={"output": output.resolve()})
-    before, now = _leaves(without_leftovers(snapshot.settings)), _leaves(config.model_dump(mode="json"))
+    before = _leaves(without_leftovers(snapshot.settings))
+    scale = before.get("source.scale")
+    if isinstance(scale, float):  # the run's number, which `auto` in the scene file became
+        config = config.resolved(scale)
+    now = _leaves(config.model_dump(mode="json"))
     for key in [*now, *(key for key in before if key not in now)]:
         if before.get(key) != now.get(key) and not any(key == free or key.startswith(f"{free}.") for free in FREE):
             raise InputError(

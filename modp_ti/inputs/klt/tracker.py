@@ -179,7 +179,7 @@ class KltTracker(Tracker):
         reader: Reads the images with their masks.
         names: Names of the images as they arrive.
         intrinsics: Camera and lens distortion of the stored images.
-        source: Settings of the images: scale, held-out frames.
+        source: Settings of the images: held-out frames.
         seed: Seed of RANSAC.
         notes: Notes to begin with.
     """
@@ -202,12 +202,13 @@ class KltTracker(Tracker):
         self._source = source
         camera = intrinsics.camera
         self._followed = intrinsics.undistorter(_followed_scale(camera.width, camera.height))
-        self._delivered = intrinsics.undistorter(source.scale)
+        self._delivered = intrinsics.undistorter(reader.images.scale)
         self._odometry = Odometry([Lens.pinhole(self._followed.camera)], seed)
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable: dict[str, UnreadableImageError] = {}
         self._progress = self._tracked()
         self._ended = False
+        self._skipped = 0
 
     def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
         """Iterate once over frames, when their poses are known, and corrections of earlier ones.
@@ -229,6 +230,15 @@ class KltTracker(Tracker):
     def notes(self) -> list[str]:
         """Notes of the source, and of the tracker so far."""
         return [*self._reader.images.notes, *self._notes]
+
+    @property
+    def frame_count(self) -> int | None:
+        """Number of images without those skipped so far, so that it may still become smaller. None for live images."""
+        return None if self._source.stream is not None else len(self._names.there) - self._skipped
+
+    @property
+    def scale(self) -> float:
+        return self._reader.images.scale
 
     @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
@@ -256,10 +266,12 @@ class KltTracker(Tracker):
             if self._trajectory is None:
                 self._trajectory = DeliveredTrajectory(tracking, self._delivered)
             yield from self._trajectory.corrections()
+            self._skipped = len(names) - len(self._trajectory.frames) - len(views)
             for view in views:
                 yield self._deliver(self._trajectory, names[view.number], view, raw if view.number == number else None)
         self._ended = True
         if self._trajectory is not None:
+            self._skipped = len(names) - len(self._trajectory.frames)
             yield from self._trajectory.corrections(last=True)
         self._sum_up(names)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from modp_ti.files.errors import InputError
+from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources.data_sets import (
     RELEASE_IMAGES,
     find_replica_images,
@@ -45,7 +45,9 @@ __all__ = [
 
 
 def open_source(source: SourceSettings) -> ImageSource:
-    """Open the configured images. `source.intrinsics` override the source's own camera.
+    """Open the configured images and set their camera and scale.
+
+    `source.intrinsics` override the source's own camera.
 
     Args:
         source: Settings of the images.
@@ -58,7 +60,7 @@ def open_source(source: SourceSettings) -> ImageSource:
 
         live = LiveSource(source.stream)
         try:
-            return _with_camera(live, source)
+            return _scaled(_with_camera(live, source), source)
         except InputError:
             live.close()
             raise
@@ -67,7 +69,7 @@ def open_source(source: SourceSettings) -> ImageSource:
     images = _OPENERS[kind](path, source)
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
         images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
-    return _with_camera(images, source)
+    return _scaled(_with_camera(images, source), source)
 
 
 def recognised_kind(path: Path) -> str:
@@ -139,3 +141,36 @@ def _with_camera(images: ImageSource, source: SourceSettings) -> ImageSource:
             "give source.intrinsics where the tracker brings no camera"
         )
     return images
+
+
+def _scaled(images: ImageSource, source: SourceSettings) -> ImageSource:
+    """Set the scale of the images, with a note if `auto` shrinks them."""
+    if source.scale != "auto":
+        images.scale = source.scale
+        return images
+    size = _first_size(images, source)
+    if size is None:  # the tracker says what is wrong with the images
+        return images
+    width, height = size
+    images.scale = source.scale_for(width, height)
+    if images.scale < 1.0:
+        images.add_note(
+            f"images of {width}x{height} are mapped at {round(width * images.scale)}x{round(height * images.scale)}: "
+            f"source.scale is auto, which makes it {images.scale:.4g}"
+        )
+    return images
+
+
+def _first_size(images: ImageSource, source: SourceSettings) -> tuple[int, int] | None:
+    """Return the size (width, height) of the first readable image of those selected, or None."""
+    names = images.names[source.start : source.stop : source.step]
+    if not names and images.names:
+        return None
+    if not names:  # a live source
+        return images.frame_size
+    for name in names:
+        try:
+            return images.size(name)
+        except UnreadableImageError:
+            continue
+    return None

@@ -32,6 +32,7 @@ class ImageSource(ABC):
             view. None if unknown.
         T_device_camera: Pose (4, 4) of the camera on a device with other sensors, camera to device, OpenCV axes. None
             for a camera alone.
+        scale: Factor from the stored images' width and height to those of the frames, as `source.scale` says.
     """
 
     def __init__(self, path: Path, names: Iterable[str] = (), times: Iterable[float] = ()) -> None:
@@ -39,6 +40,7 @@ class ImageSource(ABC):
         self.intrinsics: Intrinsics | None = None
         self.vignette: NDArray[np.float32] | None = None
         self.T_device_camera: NDArray[np.float64] | None = None
+        self.scale = 1.0
         self._notes: list[str] = []
         self._names: list[str] = []
         self._times: list[float] = []

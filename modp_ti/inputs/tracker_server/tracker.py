@@ -117,6 +117,11 @@ class TrackerServer(Tracker):
     def notes(self) -> list[str]:
         return self._notes
 
+    @property
+    def scale(self) -> float:
+        """Factor on the sent images' sides. `source.scale: auto` keeps them, since their sender chooses their size."""
+        return 1.0 if self._source.scale == "auto" else self._source.scale
+
     def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
         """Iterate once over frames and corrections as they arrive.
 
@@ -278,7 +283,7 @@ class TrackerServer(Tracker):
         """Prepare to receive images of this camera. Raises InputError if the settings do not fit it."""
         if self._spool is not None:
             self._spool.close()  # left by a connection that sent no frame
-        undistorter = hello.intrinsics.undistorter(self._source.scale)
+        undistorter = hello.intrinsics.undistorter(self.scale)
         spool = Spool(hello)
         self._reader = FrameReader(spool, self._source)
         self._undistorter, self._spool = undistorter, spool

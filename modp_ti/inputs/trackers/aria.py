@@ -77,7 +77,7 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
     T_world_camera = np.stack(
         [device.T_world_device[rows[name]] @ mounts.at(device.times[rows[name]]) for name in names]
     )
-    undistorter = require_intrinsics(images).undistorter(source.scale)
+    undistorter = require_intrinsics(images).undistorter(images.scale)
     reader = checked_reader(images, source, [(name, undistorter) for name in names], "source.intrinsics")
     frames = [PosedImage(name, undistorter, T) for name, T in zip(names, inverse_poses(T_world_camera), strict=True)]
     notes = [*missing_frames_note(selected, rows, file.name), *_notes(device, mounts, file), *missing]

@@ -43,7 +43,7 @@ def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTrac
     if not stated:
         raise InputError(f"{folder}: the COLMAP model holds no image{' with a pose' if model.images else ''}")
     posed, notes = matched_entries(images, source, stated, folder, str(folder), "images")
-    undistorters = {i: _undistorter(camera, source.scale, folder) for i, camera in model.cameras.items()}
+    undistorters = {i: _undistorter(camera, images.scale, folder) for i, camera in model.cameras.items()}
     cameras = [(name, undistorters[image.camera_id]) for name, image in posed.items()]
     reader = checked_reader(images, source, cameras, str(folder))
 

@@ -167,7 +167,7 @@ def replay_poses(
     Raises:
         InputError: If the camera is unknown, images do not match it, or the point file is invalid.
     """
-    undistorter = require_intrinsics(images).undistorter(source.scale)
+    undistorter = require_intrinsics(images).undistorter(images.scale)
     names = sorted(poses, key=images.position)
     reader = checked_reader(images, source, [(name, undistorter) for name in names], "source.intrinsics")
     frames = [PosedImage(name, undistorter, poses[name]) for name in names]

@@ -57,7 +57,7 @@ def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
     stated = ((image, (number, T)) for number, (image, T) in enumerate(cameras))
     entries, notes = matched_entries(images, source, stated, file, file.name, "cameras")
     numbers = [number for number, _ in entries.values()]
-    undistorter = require_intrinsics(images).undistorter(source.scale)
+    undistorter = require_intrinsics(images).undistorter(images.scale)
     reader = checked_reader(images, source, [(name, undistorter) for name in entries], "source.intrinsics")
     xyz = [_read_cloud(clouds[number]) if number in clouds else np.zeros((0, 3)) for number in numbers]
     if not any(len(each) for each in xyz):

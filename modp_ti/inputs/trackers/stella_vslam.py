@@ -54,7 +54,7 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
     rows = rows_at_frames(images, selected, trajectory.path, trajectory.times, tracker)
 
     intrinsics, said_by = _intrinsics(images, world, source)
-    undistorter = intrinsics.undistorter(source.scale)
+    undistorter = intrinsics.undistorter(images.scale)
     names = sorted(rows, key=images.position)
     reader = checked_reader(images, source, [(name, undistorter) for name in names], said_by)
 

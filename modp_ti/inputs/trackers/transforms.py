@@ -56,7 +56,7 @@ def open_transforms(
     frames = []
     for name, entry in entries.items():
         raw, distortion = _intrinsics({**data, **entry}, images, name, file)
-        undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, source.scale))
+        undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, images.scale))
         frames.append(PosedImage(name, undistorter, _pose(entry, file)))
     reader = checked_reader(images, source, [(frame.name, frame.undistorter) for frame in frames], str(file))
 

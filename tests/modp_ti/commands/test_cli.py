@@ -20,6 +20,7 @@ import modp_ti
 from modp_ti.commands import app as cli
 from modp_ti.commands import run as run_module
 from modp_ti.commands import shared as command_line
+from modp_ti.config.presets import PRESETS
 from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
@@ -91,6 +92,25 @@ def test_run_maps_the_scene_and_says_where_the_result_lies(scene, session):
 def test_overrides_may_follow_each_other_or_repeat_the_option(scene, session):
     invoke(scene, "--set", "seed=4", "source.scale=0.5", "--set", "threads=1")
     assert (session[0].seed, session[0].source.scale, session[0].threads) == (4, 0.5, 1)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_set_what_is_not_given(scene, session, preset):
+    invoke(scene, f"--{preset}", "--set", "refine.steps=9")
+    assert session[0].refine.steps == 9
+    assert session[0].mapping.optimise.steps == PRESETS[preset].settings["mapping.optimise.steps"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["scene.yaml", "--fast", "--best"], "--fast and --best are two presets: give one of them"),
+        (["--resume", "out", "--fast"], "--fast is for a scene file: a run that goes on has its settings already"),
+    ],
+)
+def test_presets_that_do_not_apply_are_refused(session, arguments, said):
+    result = invoke(*arguments)
+    assert (result.exit_code, result.stderr, session) == (2, f"error: {said}\n", [])
 
 
 @pytest.mark.parametrize(
@@ -329,7 +349,7 @@ HEAVY_TO_COMPLETE = "('taichi', 'torch', 'open3d', 'pycolmap', 'matplotlib')"
         ("modp-ti run scene.yaml --q", ["--quiet"]),
         ("modp-ti export out --format sp", ["splat", "spz"]),
         ("modp-ti render out --path ", ["recorded", "smoothed", "orbit"]),
-        ("modp-ti run scene.yaml --set source.sc", ["source.scale=1.0"]),
+        ("modp-ti run scene.yaml --set source.sc", ["source.scale=auto"]),
         ("modp-ti run scene.yaml --set tracker.kind=t", ["tracker.kind=transforms", "tracker.kind=tum"]),
     ],
 )

@@ -10,6 +10,7 @@ import yaml
 from pydantic import ValidationError
 
 from modp_ti.config.keys import documented_keys, documented_values, markdown_of_keys, variants_of
+from modp_ti.config.presets import markdown_of_presets
 from modp_ti.config.scene_file import dump_scene, load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.config.tracker_settings import KltSettings, TumSettings
@@ -42,7 +43,7 @@ def test_three_keys_are_enough_and_paths_are_relative_to_the_file(scene, tmp_pat
     config = load_scene(file)
     assert config.source.path == (tmp_path / "images").resolve()
     assert config.output == (tmp_path / "out" / "here").resolve()
-    assert (config.source.scale, config.source.holdout, config.source.fps) == (1.0, None, 30.0)
+    assert (config.source.scale, config.source.holdout, config.source.fps) == ("auto", None, 30.0)
     assert (config.seed, config.threads, config.tracker.path) == (0, None, None)
 
 
@@ -142,6 +143,44 @@ def test_wrong_override_is_named_as_it_was_typed(scene, override, parts):
 )
 def test_wrong_value_is_refused_with_its_key(scene, key, value):
     assert key in failure(scene(MINIMAL), f"{key}={value}")
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("source.scale=7", "source.scale: must be less than or equal to 1, not 7"),
+        ("source.scale=half", "source.scale: must be 'auto' or a valid number, not \"half\""),
+        ("source.stream=[1]", "source.stream: must be a valid integer or a valid string, not [1]"),
+        ("source.mask_colour=[1, 2, x]", 'source.mask_colour.2: must be a valid integer, not "x"'),
+        ("mapping.exposure.enabled=3", "mapping.exposure.enabled: must be a valid boolean, not 3"),
+    ],
+)
+def test_value_of_several_types_is_refused_in_one_sentence(scene, override, said):
+    assert failure(scene(MINIMAL), override).endswith(f": {said}")
+
+
+@pytest.mark.parametrize(
+    ("given", "size", "scale"),
+    [
+        ("auto", (1920, 1080), 0.25),
+        ("auto", (1080, 1920), 0.25),
+        ("auto", (640, 480), 0.75),
+        ("auto", (480, 270), 1.0),
+        ("auto", (80, 60), 1.0),
+        ("0.5", (1920, 1080), 0.5),
+        ("1", (1920, 1080), 1.0),
+    ],
+)
+def test_scale_is_chosen_from_the_size_of_the_images_unless_it_is_given(scene, given, size, scale):
+    config = load_scene(scene(MINIMAL), [f"source.scale={given}"])
+    assert config.source.scale_for(*size) == scale
+
+
+def test_resolved_settings_hold_a_number_for_the_scale(scene):
+    config = load_scene(scene(MINIMAL))
+    assert config.resolved(0.25).source.scale == 0.25
+    assert config.resolved(0.25).model_copy(update={"source": config.source}) == config
+    assert load_scene(scene(MINIMAL), ["source.scale=0.5"]).resolved(0.25).source.scale == 0.5
 
 
 def test_wrong_value_in_the_file_is_named_with_its_line(scene):
@@ -284,7 +323,7 @@ def test_every_key_is_documented_with_its_meaning_and_default():
         assert entry.description, f"{entry.key} has no description"
         assert f"| `{entry.key}` |" in text
     defaults = {entry.key: entry.default for entry in documented_keys(SceneConfig)}
-    assert (defaults["source.scale"], defaults["source.holdout"], defaults["output"]) == ("1.0", "", None)
+    assert (defaults["source.scale"], defaults["source.holdout"], defaults["output"]) == ('"auto"', "", None)
     assert (defaults["tracker.kind"], defaults["tracker.patience"]) == (None, "120.0")
 
 
@@ -307,4 +346,5 @@ def test_every_setting_is_told_with_its_value(scene):
 
 def test_reference_of_the_keys_is_up_to_date():
     page = Path(__file__).resolve().parents[3] / "docs" / "configuration.md"
-    assert page.read_text() == markdown_of_keys(SceneConfig), "run: python -m modp_ti.config > docs/configuration.md"
+    reference = markdown_of_keys(SceneConfig) + "\n" + markdown_of_presets()
+    assert page.read_text() == reference, "run: python -m modp_ti.config > docs/configuration.md"

@@ -52,7 +52,7 @@ def test_the_time_left_includes_that_of_later_stages(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     console = Console(file=io.StringIO(), width=100)
     line = ProgressLine(console)
-    line.start("mapping", 90, later=lambda: 180.0)
+    line.start("mapping", 90, later=lambda _: 180.0)
     for index in range(30):
         now[0] += 2.0
         line.frame(FrameReport(index, True, index + 1, 1200, 20.5))
@@ -60,3 +60,43 @@ def test_the_time_left_includes_that_of_later_stages(monkeypatch: pytest.MonkeyP
     text = console.file.getvalue()
     assert "mapping 30/90" in text and text.split("mapping 30/90")[1].splitlines()[0].endswith("5 min left")
     assert "left" not in text.split("mapping 5/90")[0], "no estimate in the first ten seconds"
+
+
+def log_of(monkeypatch: pytest.MonkeyPatch, totals: list[int], later: float | None) -> str:
+    """The log of frames of 2 s each, after each of which that many frames are expected."""
+    now = [0.0]
+    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    console = Console(file=io.StringIO(), width=100)
+    line = ProgressLine(console)
+    line.start("mapping", totals[0], later=lambda _: later)
+    for index, frames in enumerate(totals):
+        now[0] += 2.0
+        line.frame(FrameReport(index, True, index + 1, 1200, 20.5), frames)
+    line.stop()
+    return console.file.getvalue()
+
+
+def test_frames_that_the_tracker_skips_are_no_longer_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = log_of(monkeypatch, [100] * 20 + [60] * 10, later=0.0)
+    for place, left in (("mapping 20/100", "3 min left"), ("mapping 30/60", "1 min left")):
+        assert log.split(place)[1].splitlines()[0].endswith(left)
+
+
+def test_no_time_is_shown_while_that_of_later_stages_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "left" not in log_of(monkeypatch, [100] * 20, later=None)
+
+
+def test_what_follows_may_be_told_from_the_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of 3 s, and afterwards as much work as 20 of them."""
+    now = [0.0]
+    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    console = Console(file=io.StringIO(), width=100)
+    line = ProgressLine(console)
+    line.start("refining", 40, later=lambda step: 20 * step)
+    for step in range(1, 21):
+        now[0] += 3.0
+        line.step(step, 25.0)
+    line.stop()
+    assert console.file.getvalue().split("refining 20/40")[1].splitlines()[0].endswith("2 min left")

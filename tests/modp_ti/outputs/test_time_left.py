@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 
-from modp_ti.outputs.time_left import TimeLeft, duration
+from modp_ti.config.settings import SceneConfig
+from modp_ti.outputs.time_left import FULL_SIZE, RENDERED, SCORED, TimeAfterMapping, TimeLeft, duration
+from pipelines.pipeline import Pipeline
 
 
 class Clock:
@@ -58,6 +63,68 @@ def test_no_item_for_long_is_no_estimate() -> None:
     left = TimeLeft(100, clock=clock)
     clock.now += 60.0
     assert left.seconds() is None
+
+
+class MadeUpMap:
+    """A map whose clock, views and keyframes a test sets."""
+
+    def __init__(self) -> None:
+        self.stopwatch = SimpleNamespace(seconds={})
+        self.renderer = SimpleNamespace(view_renders=0)
+        self.keyframes: list[int] = []
+
+    def keyframe(self, views: int, seconds: float) -> None:
+        """Add a keyframe with as many views of so many seconds each."""
+        self.keyframes.append(len(self.keyframes))
+        self.renderer.view_renders += views
+        self.stopwatch.seconds["optimise"] = self.stopwatch.seconds.get("optimise", 0.0) + views * seconds
+
+
+def after_mapping(made: MadeUpMap, **settings: object) -> TimeAfterMapping:
+    config = SceneConfig.model_validate(
+        {"source": {"path": "x"}, "tracker": {"kind": "klt"}, "output": "out", **settings}, strict=False
+    )
+    return TimeAfterMapping(config, cast(Pipeline, made))
+
+
+def test_what_follows_the_last_frame_is_estimated_from_the_views_so_far() -> None:
+    """Every second frame a keyframe; 100 of 400 frames done: there will be 200 keyframes."""
+    made = MadeUpMap()
+    later = after_mapping(made, mapping={"optimise": {"steps": 4, "last_steps": 14}}, refine={"steps": 200, "views": 4})
+    assert later.seconds(0, 400) is None
+    for done in range(2, 102, 2):
+        made.keyframe(24, 0.01)
+        found = later.seconds(done, 400)
+    views = 10 * 6 + 200 * 4 + RENDERED * 200 + SCORED * 2 * 400
+    assert found == pytest.approx(0.01 * FULL_SIZE * views)
+
+
+def test_views_that_become_slower_count_as_the_recent_ones() -> None:
+    made = MadeUpMap()
+    later = after_mapping(made, refine={"steps": 100, "views": 1, "min_contribution": 0.0})
+    for done, seconds in enumerate([0.01] * 30 + [0.03] * 30, 1):
+        made.keyframe(10, seconds)
+        found = later.seconds(done, 60)
+    assert found == pytest.approx(0.03 * FULL_SIZE * (15 * 6 + 100 + SCORED * 2 * 60))
+
+
+def test_without_refinement_the_scores_remain() -> None:
+    made = MadeUpMap()
+    later = after_mapping(
+        made, mapping={"optimise": {"steps": 40, "last_steps": 40}}, refine={"steps": 0, "min_contribution": 0.5}
+    )
+    for done in range(1, 21):
+        made.keyframe(10, 0.02)
+        found = later.seconds(done, 50)
+    assert found == pytest.approx(0.02 * FULL_SIZE * SCORED * 50)
+
+
+def test_of_a_stream_and_of_an_offline_map_nothing_is_promised() -> None:
+    made = MadeUpMap()
+    online, offline = after_mapping(made), after_mapping(made, mode="offline")
+    for done in range(1, 21):
+        made.keyframe(10, 0.02)
+        assert online.seconds(done, None) is None and offline.seconds(done, 50) is None
 
 
 @pytest.mark.parametrize(

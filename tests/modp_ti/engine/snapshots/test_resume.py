@@ -195,7 +195,7 @@ def stopped(tmp_path: Path) -> Path:
     config = load_scene(tmp_path / "scene.yaml")
     (tmp_path / "out").mkdir()
     about = {
-        "settings": config.model_dump(mode="json"),
+        "settings": config.resolved(1.0).model_dump(mode="json"),
         "position": {"events": 1, "digest": 5, "finished": False, "refined": 0},
         "numbers": {},
     }
@@ -226,6 +226,11 @@ def test_an_output_folder_that_was_moved_is_written_where_it_is_now(stopped: Pat
 def test_a_snapshot_of_another_scene_is_refused_with_what_differs(stopped: Path, change: str, said: str) -> None:
     with pytest.raises(InputError, match=f"the snapshot was made with {said}"):
         load_resumed(stopped, stopped.parent / "scene.yaml", [change])
+
+
+def test_the_scale_that_auto_became_is_kept(stopped: Path) -> None:
+    config, _ = load_resumed(stopped, stopped.parent / "scene.yaml", [])
+    assert config.source.scale == load_resumed(stopped, None, [])[0].source.scale == 1.0
 
 
 def test_settings_that_this_version_does_not_have_are_refused(stopped: Path) -> None:

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.slow
 
 def known_camera(folder: Path, box_room, **settings) -> KltTracker:
     source, images = SourceSettings(path=folder, **settings), ImageFolder(folder)
+    images.scale = settings.get("scale", 1.0)
     intrinsics = Intrinsics(box_room.camera)
     return KltTracker(FrameReader(images, source), ArrivingNames(images, source), intrinsics, source)
 
@@ -35,8 +36,9 @@ def delivered(box_room, box_walk, tmp_path_factory):
 
 
 def test_frames_keep_the_contract_of_a_tracker(delivered, box_room, box_walk):
-    _, events, _ = delivered
+    tracker, events, _ = delivered
     frames = [event for event in events if isinstance(event, TrackedFrame)]
+    assert tracker.frame_count == len(frames)
     assert [frame.index for frame in frames] == list(range(60))
     assert [frame.name for frame in frames] == [f"{i:04d}.png" for i in range(60)]
     assert [frame.index for frame in frames if frame.held_out] == list(range(0, 60, 8))
@@ -82,6 +84,17 @@ def test_iterating_alone_tracks_too_and_gives_the_same(delivered, box_room, box_
     for one, other in zip(frames, last, strict=True):
         np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
         np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
+
+
+def test_the_number_of_frames_is_known_from_the_start_and_shrinks_by_those_without_a_pose(box_room, box_walk, tmp_path):
+    folder = box_walk.written(tmp_path / "images")
+    for i in range(35, 38):
+        cv2.imwrite(str(folder / f"{i:04d}.png"), np.zeros((240, 320, 3), np.uint8))
+    tracker = known_camera(folder, box_room, stop=45)
+    assert tracker.frame_count == 45
+    expected = [tracker.frame_count for event in tracker.events() if isinstance(event, TrackedFrame)]
+    assert expected[:30] == [45] * 30
+    assert len(expected) == tracker.frame_count == expected[-1] < 45
 
 
 def test_no_point_is_delivered_where_the_mask_is_black(box_room, box_walk, tmp_path):

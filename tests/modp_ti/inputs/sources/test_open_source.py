@@ -132,3 +132,25 @@ def test_settings_that_contradict_each_other_are_refused_by_line(tmp_path, sourc
         load_scene(file)
     assert message in str(caught.value)
     assert str(caught.value).startswith(str(file))
+
+
+def test_scale_is_chosen_from_the_first_image_that_can_be_read_and_said(tmp_path):
+    (tmp_path / "0.png").write_bytes(b"no image")
+    image(tmp_path / "1.png", 1920, 1080)
+    images = open_source(SourceSettings(path=tmp_path))
+    assert images.scale == 0.25
+    assert images.notes == ["images of 1920x1080 are mapped at 480x270: source.scale is auto, which makes it 0.25"]
+    assert open_source(SourceSettings(path=tmp_path, stop=1)).scale == 1.0
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_scale_that_is_given_is_taken_without_a_word(tmp_path, scale):
+    image(tmp_path / "a.png", 1920, 1080)
+    images = open_source(SourceSettings(path=tmp_path, scale=scale))
+    assert (images.scale, images.notes) == (scale, [])
+
+
+def test_small_images_keep_their_size_without_a_word(tmp_path):
+    image(tmp_path / "a.png", 480, 270)
+    images = open_source(SourceSettings(path=tmp_path))
+    assert (images.scale, images.notes) == (1.0, [])

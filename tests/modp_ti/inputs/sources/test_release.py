@@ -21,7 +21,7 @@ def release(tmp_path):
 
 
 def test_images_and_camera_are_those_of_the_release(release):
-    made = open_source(SourceSettings(path=release))
+    made = open_source(SourceSettings(path=release, scale=1.0))
     assert tuple(made.names) == ("2.png", "10.png")
     camera = made.intrinsics.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) == (400, 400, 400, 400, 800, 800)

@@ -20,7 +20,7 @@ def room(folder, width=1200, height=680):
 
 
 def test_colour_images_are_listed_with_the_data_sets_camera(tmp_path):
-    made = open_source(SourceSettings(path=room(tmp_path), fps=10))
+    made = open_source(SourceSettings(path=room(tmp_path), fps=10, scale=1.0))
     assert tuple(made.names) == ("frame000000.jpg", "frame000001.jpg", "frame000010.jpg")
     assert [made.timestamp(name) for name in made.names] == [0.0, 0.1, 0.2]
     assert made.find("results/frame000010.jpg") == "frame000010.jpg"

@@ -24,7 +24,7 @@ NAMES = ("frame-000002.color.png", "frame-000004.color.png", "frame-000011.color
 @pytest.mark.parametrize("inside", [".", "images"])
 def test_colour_images_are_taken_alone_and_timed_by_their_number(tmp_path, inside):
     sequence(tmp_path / inside, *NAMES, "frame-000002.depth.png", "other.png")
-    made = open_source(SourceSettings(path=tmp_path))
+    made = open_source(SourceSettings(path=tmp_path, scale=1.0))
     assert tuple(made.names) == NAMES
     np.testing.assert_allclose([made.timestamp(name) for name in NAMES], np.array([2, 4, 11]) / 30)
     camera = made.intrinsics.camera
@@ -34,7 +34,7 @@ def test_colour_images_are_taken_alone_and_timed_by_their_number(tmp_path, insid
 
 def test_a_tracker_that_relies_on_the_nominal_camera_says_so(tmp_path):
     sequence(tmp_path, *NAMES)
-    made = open_source(SourceSettings(path=tmp_path))
+    made = open_source(SourceSettings(path=tmp_path, scale=1.0))
     assert require_intrinsics(made) is made.intrinsics
     assert "nominal intrinsics (f = 525 px, no distortion)" in made.notes[-1]
 

@@ -52,7 +52,7 @@ def test_colmap_points_project_onto_their_pixels(shared_data, name, frames, size
 
 def test_frames_of_redkitchen_without_pose_are_counted_and_keep_their_times(shared_data):
     tracker = open_colmap(
-        SourceSettings(path=shared_data("redkitchen") / "images", start=0, stop=50),
+        SourceSettings(path=shared_data("redkitchen") / "images", start=0, stop=50, scale=1.0),
         ColmapSettings(),
     )
     assert tracker.notes[0].startswith("40 of 50 images have no pose")

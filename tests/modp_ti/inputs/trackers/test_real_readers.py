@@ -58,7 +58,7 @@ def test_tum_poses_carry_one_frame_s_depth_into_the_last(shared_data, tmp_path):
     T[:3, :3], T[:3, 3] = Rotation.from_quat(row[4:]).as_matrix(), row[1:4]
     points = cloud_file(tmp_path / "points.txt", depth_image(depths[0], 5000), (517.3, 516.5, 319.1, 255.8), T)
     settings = TumSettings(points=points, max_points=3000)
-    tracker = open_tum(SourceSettings(path=data), settings)
+    tracker = open_tum(SourceSettings(path=data, scale=1.0), settings)
     assert [frame.name for frame in tracker.frames] == [f"rgb/{name.name}" for name in names]
     assert any("images that" in note and "are not there" in note for note in tracker.notes)
     first, last = (depth_ratio(tracker.frames[i], depth_image(depths[i], 5000)) for i in (0, -1))
@@ -76,7 +76,7 @@ def test_sevenscenes_poses_carry_one_frame_s_depth_into_a_later(shared_data, tmp
     depths = [depth_image(data / "depth" / f"frame-{i:06d}.depth.png", 1000) for i in (100, 140)]
     points = cloud_file(tmp_path / "points.txt", depths[0], K, T)
     camera = IntrinsicsSettings(fx=585.0)  # of the depth camera: it is what the poses are of
-    source = SourceSettings(path=data, start=100, stop=141, step=40, intrinsics=camera)
+    source = SourceSettings(path=data, start=100, stop=141, step=40, scale=1.0, intrinsics=camera)
     tracker = open_sevenscenes(source, SevenScenesSettings(points=points, max_points=3000))
     assert any("those of the depth camera" in note for note in tracker.notes)
     ratio = depth_ratio(tracker.frames[1], depths[1])

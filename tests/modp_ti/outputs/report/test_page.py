@@ -161,7 +161,7 @@ def test_the_pictures_are_those_of_the_held_out_frames_the_worst_first(made) -> 
 def test_the_settings_that_were_changed_are_named_with_their_defaults(made) -> None:
     run, page, _ = made
     rows = {row[0]: row[1:] for row in page.tables["settings"][1:]}
-    assert rows["source.scale"] == ["0.5", "1.0"]
+    assert rows["source.scale"] == ["0.5", '"auto"']
     assert rows["source.holdout"] == ["4", "empty"]
     assert rows["tracker.kind"] == ['"transforms"', "none"]
     assert rows["output"] == [f'"{run.config.output}"', "none"]
