@@ -106,11 +106,10 @@ class FrameGate:
 
     def state(self) -> dict[str, Any]:
         """Return the state as JSON-compatible values, for `restore`."""
-        before = [None if b is None else [b, self.trajectory[b].tolist()] for b in (self._seen, self._accepted)]
         return {
             "refused": dict(self.refused),
             "picture": self._picture,
-            "before": before,
+            "before": [self._seen, self._accepted],
             "motions": list(self._motions),
         }
 
@@ -122,7 +121,7 @@ class FrameGate:
         """
         self.refused |= {name: int(count) for name, count in state["refused"].items()}
         self._picture = int(state["picture"])
-        self._seen, self._accepted = (None if b is None else int(b[0]) for b in state["before"])
+        self._seen, self._accepted = (None if b is None else int(b) for b in state["before"])
         for index in (self._seen, self._accepted):
             if index is not None and index not in self.trajectory:
                 raise ValueError(f"frame {index} has no tracked pose")

@@ -39,7 +39,8 @@ def frame(index: int, x: float = 0.0, yaw: float = 0.0, points: int = 30) -> Tra
 
 def decisions(frames: list[TrackedFrame], **settings: Any) -> list[bool]:
     """What becomes of every frame of a stream."""
-    trajectory, store = Trajectory(), KeyframeStore()
+    trajectory = Trajectory()
+    store = KeyframeStore(trajectory=trajectory)
     selector = KeyframeSelector(KeyframeSettings(**settings), trajectory)
     result = []
     for f in frames:
