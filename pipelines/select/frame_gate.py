@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.pixel_metric import pixel_metric
 from fields.geometry.se3 import inverse_se3, log_se3
 from fields.map.keyframes import Keyframe
 from fields.map.trajectory import Trajectory
-from pipelines.optimise.pose_refinement import pixel_metric
 from pipelines.render.renderer import Renderer
 from pipelines.settings import GateSettings
 
@@ -90,7 +90,7 @@ class FrameGate:
         if last is None or seen is None or self._accepted is None:
             self._accepted = self._seen
             return None
-        W = pixel_metric(last)
+        W = pixel_metric(last.camera, last.median_depth)
         motion = min(_motion(W, before, self.trajectory[before], frame) for before in (seen, self._accepted))
         limit = max(
             self.settings.jump * float(np.median(self._motions)) if len(self._motions) >= LEAST else np.inf,
