@@ -189,7 +189,7 @@ def _colours(name: str, image: ArrayLike) -> NDArray[np.float32]:
     if image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"{name}: image has shape {image.shape}, expected (H, W, 3)")
     if image.dtype == np.uint8:
-        return image.astype(np.float32) / np.float32(255.0)
+        return np.divide(image.astype(np.float32), np.float32(255.0), dtype=np.float32)
     if not (image.min() >= 0.0 and image.max() <= 1.0):
         raise ValueError(f"{name}: a float32 image holds 0 to 1, this one {image.min():g} to {image.max():g}")
     return image

@@ -118,7 +118,7 @@ def _check(
     """Raise TypeError or ValueError for the first tensor that does not fit the others or the device."""
     if (sh is None) == (colour is None):
         raise TypeError("rasterize takes either sh or colour")
-    tensors = geometry | ({"sh": sh} if sh is not None else {"colour": colour})
+    tensors = geometry | {name: tensor for name, tensor in (("sh", sh), ("colour", colour)) if tensor is not None}
     given = tensors | {"T_camera_world": T_camera_world}
     given |= {} if background is None else {"background": background}
     for name, tensor in given.items():
