@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
 from fields.map.gaussian_motion import GaussianMotion
 from fields.map.keyframes import NO_MOTION, Keyframe, KeyframeStore
-from fields.map.trajectory import Trajectory
 from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation
 from pipelines.settings import CorrectionSettings
@@ -73,11 +71,11 @@ class CorrectionReport:
     """Result of a correction.
 
     Attributes:
-        motion: Motion of the frames and of the world.
+        around: Similarity S_after_before (4, 4) of the world around every frame, by index.
         moved: Whether Gaussians have moved.
     """
 
-    motion: WorldMotion
+    around: dict[int, NDArray[np.float64]]
     moved: bool
 
 
@@ -90,33 +88,31 @@ class MapCorrector:
     Args:
         keyframes: The keyframes of the map.
         densifier: Owner of the map's anchors and voxels.
-        trajectory: Tracked poses of all frames so far.
 
     Attributes:
         motion: Moves the Gaussians.
     """
 
-    def __init__(self, keyframes: KeyframeStore, densifier: Densifier, trajectory: Trajectory) -> None:
+    def __init__(self, keyframes: KeyframeStore, densifier: Densifier) -> None:
         self.keyframes = keyframes
         self.densifier = densifier
-        self.trajectory = trajectory
         self.motion = GaussianMotion(densifier.gaussians)
 
     def correct(
         self, correction: PoseCorrection, settings: CorrectionSettings
-    ) -> tuple[WorldMotion, NDArray[np.int64]]:
+    ) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64]]:
         """Apply poses and points that the tracker has revised. Call it between two steps.
 
         Returns:
-            Motion of the frames and of the world, and the keyframes (N,) whose Gaussians moved, as places in the store.
+            Motion of the world as `revise` returns it, and the keyframes (N,) whose Gaussians moved, as places in the
+            store.
         """
-        motion = revise(self.keyframes, self.trajectory, correction)
-        self.trajectory.revise(lambda index, T: motion.of(index, T)[0])
+        around = revise(self.keyframes, correction)
         pending = np.array([pending_motion_in_pixels(view) for view in self.keyframes])
         if not (settings.enabled and (pending > settings.min_pixels).any()):
-            return motion, np.zeros(0, dtype=np.int64)
+            return around, np.zeros(0, dtype=np.int64)
         self._move_gaussians()
-        return motion, np.flatnonzero(pending > 0)
+        return around, np.flatnonzero(pending > 0)
 
     def _move_gaussians(self) -> None:
         """Move the Gaussians by the pending motion of their anchors, and mark the voxels again."""
@@ -139,30 +135,35 @@ class MapCorrector:
             view.pending_motion = NO_MOTION
 
 
-def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], correction: PoseCorrection) -> WorldMotion:
-    """Apply a correction to the poses, points and depths of the keyframes.
+def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArray[np.float64]]:
+    """Apply a correction to the tracked poses of all frames, and to the poses, points and depths of the keyframes.
 
-    The Gaussians are not moved. Each keyframe's `pending_motion` accumulates the motion that they have to follow.
+    Corrected frames take the pose that the correction names, and all others move with the world around them. The
+    Gaussians are not moved. Each keyframe's `pending_motion` accumulates the motion that they have to follow.
 
     Args:
-        store: The keyframes.
-        tracked: Former tracked T_camera_world (4, 4) of all frames so far, by index. Corrected frames that it does not
-            contain are ignored.
+        store: The keyframes, with the trajectory. Corrected frames that it does not contain are ignored.
         correction: The correction.
 
     Returns:
-        Motion of the frames and of the world.
+        Similarity S_after_before (4, 4) of the world around every frame, by index.
     """
-    known = np.array([int(i) in tracked for i in correction.index])
+    trajectory = store.trajectory
+    # Held-out frames take their corrected poses as well, but must not move the map.
+    known = np.array([int(i) in trajectory and int(i) not in trajectory.held_out for i in correction.index])
     index, T_after = correction.index[known], correction.T_camera_world[known]
     order = np.argsort(correction.ids, kind="stable")
     ids, xyz = correction.ids[order], correction.xyz[order]
     scale = _scales(store, index, T_after, ids, xyz)
-    S = [motion_around(tracked[int(i)], T, s) for i, T, s in zip(index, T_after, scale, strict=True)]
+    S = [motion_around(trajectory[int(i)], T, s) for i, T, s in zip(index, T_after, scale, strict=True)]
     motion = WorldMotion(index, T_after, np.array(S).reshape(-1, 4, 4))
+    before = dict(trajectory)
+    after = {i: motion.of(i, T) for i, T in before.items()}
+    named = dict(zip(correction.index.tolist(), correction.T_camera_world.copy(), strict=True))
+    trajectory.revise({i: T for i, (T, _) in after.items()} | named)
+    around = {i: S for i, (_, S) in after.items()}
     for keyframe in store:
-        T, around = motion.of(keyframe.index, keyframe.T_tracked)
-        keyframe.revise(T, around)
+        keyframe.follow(before[keyframe.index], around[keyframe.index])
         mine, theirs = _matches(keyframe.points, ids)
         if len(mine):
             moved = keyframe.points.xyz.copy()
@@ -170,7 +171,7 @@ def revise(store: KeyframeStore, tracked: Mapping[int, NDArray[np.float64]], cor
             if not np.array_equal(moved, keyframe.points.xyz):
                 keyframe.revise_points(replace(keyframe.points, xyz=moved))
     store.take_in_depths()
-    return motion
+    return around
 
 
 def pending_motion_in_pixels(view: Keyframe) -> float:

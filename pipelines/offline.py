@@ -13,6 +13,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.trajectory import Trajectory
 from pipelines.corrections import CorrectionReport, revise
 from pipelines.densify.adaptive_density import AdaptiveDensity
 from pipelines.densify.point_initialisation import initialise, union_of_points
@@ -139,7 +140,8 @@ class OfflineMapper(Pipeline):
         self.adam = Adam(self.gaussians)
         self.safeguards = Safeguards()
         self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
-        self.keyframes = KeyframeStore()
+        self.trajectory = Trajectory()
+        self.keyframes = KeyframeStore(trajectory=self.trajectory)
 
     @property
     def near(self) -> float:
@@ -159,8 +161,7 @@ class OfflineMapper(Pipeline):
 
     def correct(self, correction: PoseCorrection) -> CorrectionReport:
         """Apply revised poses and points to the stored frames. The map is built later, so no Gaussians move."""
-        motion = revise(self.keyframes, {view.index: view.T_tracked for view in self.keyframes}, correction)
-        return CorrectionReport(motion, moved=False)
+        return CorrectionReport(revise(self.keyframes, correction), moved=False)
 
     def initialise(self) -> None:
         """Create the initial Gaussians from the tracked points of all frames.

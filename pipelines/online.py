@@ -146,10 +146,10 @@ class OnlineMapper(OnlineMap):
         settings = self.settings.corrections
         with self.stopwatch.measure("correct"):
             self.optimiser.settle()
-            motion, moved = self.corrector.correct(correction, settings)
+            around, moved = self.corrector.correct(correction, settings)
         if len(moved):
             self._optimise_evenly(moved, settings.steps, settings.views)
-        return CorrectionReport(motion, moved=len(moved) > 0)
+        return CorrectionReport(around, moved=len(moved) > 0)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
         """Finish the map after the last frame: further steps on the last keyframe, then a final pruning.

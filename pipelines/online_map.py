@@ -61,15 +61,15 @@ class OnlineMap(Pipeline):
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
         self.loss = self.optimiser.loss
         self.contribution = Contribution(self.gaussians, self.renderer)
-        self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side)
         self.trajectory = Trajectory()
+        self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side, self.trajectory)
         self.gate = FrameGate(settings.gate, self.trajectory)
         self.selector = KeyframeSelector(settings.keyframes, self.trajectory)
         depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
         self.budget = self.densifier.budget
         self.views = views or LocalGlobalViews(settings.views, self.rng)
-        self.corrector = MapCorrector(self.keyframes, self.densifier, self.trajectory)
+        self.corrector = MapCorrector(self.keyframes, self.densifier)
         self.frame_count = 0
 
     @property

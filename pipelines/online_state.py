@@ -45,8 +45,7 @@ def state_of(mapper: OnlineMap) -> MapState:
         groups["voxels"] = {"places": places, "words": words}
         numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
     if mapper.selector.previous is not None:
-        index = mapper.selector.previous
-        groups["previous"] = {"index": np.array(index), "T": mapper.trajectory[index]}
+        groups["previous"] = {"index": np.array(mapper.selector.previous)}
     return MapState.of(groups, numbers)
 
 
@@ -62,6 +61,7 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     Raises:
         KeyError, TypeError, ValueError: If the state does not fit. The map is then unusable.
     """
+    mapper.trajectory.restore(state.group("tracked"))
     rows = KeyframeRows(state.group("keyframes"))
     for frame in frames:
         if frame.index in rows.rows:
@@ -75,7 +75,6 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     mapper.densifier.anchors = [Anchor(mapper.keyframes[row], spacing) for row, spacing in pairs]
     if len(mapper.gaussians) and mapper.gaussians.anchors().max() >= len(mapper.densifier.anchors):
         raise ValueError("a Gaussian has an anchor that the state does not contain")
-    mapper.trajectory.restore(state.group("tracked"))
     if mapper.densifier.voxels is not None:
         mapper.densifier.voxels.settle(state.numbers["coarsest"], state.numbers["origin"])
         mapper.densifier.voxels.restore(**state.group("voxels"))

@@ -11,6 +11,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
+from fields.map.trajectory import Trajectory
 from pipelines.corrections import CorrectionReport
 from pipelines.optimise.losses import PhotometricLoss
 from pipelines.optimise.safeguards import Safeguards
@@ -57,6 +58,7 @@ class Pipeline(ABC):
 
     gaussians: GaussianField
     keyframes: KeyframeStore
+    trajectory: Trajectory
     renderer: Renderer
     loss: PhotometricLoss
     stopwatch: Stopwatch

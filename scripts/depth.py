@@ -22,12 +22,15 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import load_scene
+from modp_ti.config.settings import SceneConfig
 from modp_ti.inputs.trackers import open_tracker
 from pipelines.densify.depth import DepthEstimate, DepthEstimator, FusedDepth, GaussianProcessDepth
 from pipelines.online import OnlineMapper
 
 # Deviation below which version 0.1.0, which only had the constant process, accepted a depth.
 FIRST_LIMIT = 0.06
+# Index of a keyframe, width of its image, pixels (N, 2), and the answer of each estimator there.
+Record = tuple[int, int, NDArray, dict[str, DepthEstimate]]
 
 
 class Recorder:
@@ -37,7 +40,7 @@ class Recorder:
         self.fused = fused
         self.sources: dict[str, DepthEstimator] = {"constant process": constant}
         self.sources |= {type(e).__name__: e for e in fused.estimators}
-        self.records: list[tuple[int, int, NDArray, dict[str, DepthEstimate]]] = []
+        self.records: list[Record] = []
 
     def estimate(self, view, neighbours, pixels) -> DepthEstimate:
         """See `DepthEstimator`."""
@@ -76,9 +79,8 @@ def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
     return ratio[np.isfinite(ratio)]
 
 
-@documented_ending()
-def main() -> None:
-    """Map the scene, compare the estimators and print the table."""
+def parsed_arguments() -> argparse.Namespace:
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         epilog="example: scripts/depth redkitchen.yaml data/redkitchen/depth --frames 200",
@@ -95,10 +97,11 @@ def main() -> None:
     parser.add_argument("--offset", type=float, nargs=3, default=offset, help="depth to colour camera [m]")
     parser.add_argument("--frames", type=int, default=10**9, help="map only so many")
     parser.add_argument("--set", action="append", default=[], help="override a setting, key=value")
-    arguments = parser.parse_args()
-    config = load_scene(arguments.scene, arguments.set)
-    initialise(config.device, config.threads, config.seed)
-    frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
+    return parser.parse_args()
+
+
+def record_scene(config: SceneConfig, frames: list[TrackedFrame]) -> list[Record]:
+    """Map the frames, and return what the estimators answered at every keyframe."""
     mapper = OnlineMapper(config.mapping, frames[0].camera.width, frames[0].camera.height, config.seed)
     constant = GaussianProcessDepth(config.mapping.depth, np.random.default_rng(config.seed))
     mapper.densifier.depth = recorder = Recorder(mapper.densifier.depth, constant)
@@ -106,22 +109,23 @@ def main() -> None:
         mapper.process(frame)
         print(f"\r{n + 1} of {len(frames)} frames", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
+    return recorder.records
 
-    by_index = {f.index: f for f in frames}
-    turn = cv2.Rodrigues(np.radians(arguments.rotation))[0]
-    truth, ratios = {}, []
-    for index, *_ in recorder.records:
-        depth = sensor_depth(arguments.sensor, by_index[index], arguments.focal, turn, np.array(arguments.offset))
-        if depth is not None:
-            truth[index] = depth
-            ratios.append(tracked_ratio(by_index[index], depth))
-    scale = np.median(np.concatenate(ratios))
-    floor = np.median(np.abs(np.concatenate(ratios) / scale - 1))
 
-    names = list(recorder.records[0][3])
+def print_table(records: list[Record], truth: dict[int, NDArray], scale: float, limit: float, floor: float) -> None:
+    """Print the errors of the estimators.
+
+    Args:
+        records: What the estimators answered.
+        truth: Sensor depth (H, W) [m] of the keyframes that have one.
+        scale: Metres per unit of the map.
+        limit: Deviation up to which the mapper accepts a depth.
+        floor: Median relative error of the tracked points.
+    """
+    names = list(records[0][3])
     error: dict[str, list[NDArray]] = {name: [] for name in names}
     deviation: dict[str, list[NDArray]] = {name: [] for name in names}
-    for index, width, pixels, said in recorder.records:
+    for index, width, pixels, said in records:
         if index not in truth:
             continue
         depth = truth[index]
@@ -131,7 +135,6 @@ def main() -> None:
         for name in names:
             error[name].append(np.abs(said[name].depth[seen] * scale / there[seen] - 1))
             deviation[name].append(said[name].deviation[seen])
-    limit = config.mapping.depth.max_deviation
     sure = np.concatenate(deviation["fused"]) < limit
     print(f"{len(sure)} pixels of {len(truth)} keyframes; tracked points themselves: {100 * floor:.2f} %\n")
     print("| estimator | accepted below | pixels | median error there | 90th percentile | where fused is sure |")
@@ -143,6 +146,28 @@ def main() -> None:
         there = f"{100 * np.median(e[own]):.2f} % | {100 * np.percentile(e[own], 90):.1f} %" if own.any() else "– | –"
         where_fused = f"{100 * np.median(e[both]):.2f} %" if both.any() else "–"
         print(f"| {name} | {below:g} | {100 * own.mean():.0f} % | {there} | {where_fused} |")
+
+
+@documented_ending()
+def main() -> None:
+    """Map the scene, compare the estimators and print the table."""
+    arguments = parsed_arguments()
+    config = load_scene(arguments.scene, arguments.set)
+    initialise(config.device, config.threads, config.seed)
+    frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
+    records = record_scene(config, frames)
+
+    by_index = {f.index: f for f in frames}
+    turn = cv2.Rodrigues(np.radians(arguments.rotation))[0]
+    truth, ratios = {}, []
+    for index, *_ in records:
+        depth = sensor_depth(arguments.sensor, by_index[index], arguments.focal, turn, np.array(arguments.offset))
+        if depth is not None:
+            truth[index] = depth
+            ratios.append(tracked_ratio(by_index[index], depth))
+    scale = np.median(np.concatenate(ratios))
+    floor = np.median(np.abs(np.concatenate(ratios) / scale - 1))
+    print_table(records, truth, float(scale), config.mapping.depth.max_deviation, float(floor))
 
 
 if __name__ == "__main__":

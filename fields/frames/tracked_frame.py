@@ -153,48 +153,15 @@ class TrackedFrame:
             ValueError: If a shape or value is wrong. The message is one line and names the frame.
         """
         name = f"frame {index}" if name is None else name
-        image = np.asarray(image)
-        if image.dtype not in (np.uint8, np.float32):
-            raise TypeError(f"{name}: image is {image.dtype}, expected uint8, or float32 in [0, 1]")
-        if image.ndim != 3 or image.shape[2] != 3:
-            raise ValueError(f"{name}: image has shape {image.shape}, expected (H, W, 3)")
-        if image.dtype == np.uint8:
-            image = image.astype(np.float32) / np.float32(255.0)
-        elif not (image.min() >= 0.0 and image.max() <= 1.0):
-            raise ValueError(f"{name}: a float32 image holds 0 to 1, this one {image.min():g} to {image.max():g}")
-        T = np.array(T_camera_world, dtype=np.float64)
-        if T.shape != (4, 4) or not _is_rigid(T):
-            raise ValueError(f"{name}: T_camera_world must be a rigid 4x4 matrix: [R t; 0 0 0 1], R a rotation")
-        intrinsics = np.asarray(intrinsics, dtype=np.float64)
-        if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all():
-            raise ValueError(f"{name}: intrinsics must be four numbers: fx, fy, cx, cy")
+        timestamp = float(index) if timestamp is None else timestamp
+        colours = _colours(name, image)
+        T = _pose(name, T_camera_world)
+        camera = _camera(name, intrinsics, *colours.shape[:2])
         if mask is not None and mask.dtype != np.bool_:
             raise TypeError(f"{name}: mask is {mask.dtype}, expected bool, True where the pixel is valid")
-        height, width = image.shape[:2]
-        xyz, pixels = (np.array(array, dtype=np.float64) for array in (xyz, pixels))
-        if xyz.ndim != 2 or xyz.shape[1] != 3 or pixels.shape != (len(xyz), 2):
-            raise ValueError(f"{name}: xyz has shape {xyz.shape}, pixels {pixels.shape}, expected (N, 3) and (N, 2)")
-        numbers = index * IDS_PER_FRAME + np.arange(len(xyz)) if ids is None else np.asarray(ids)
-        if numbers.shape != (len(xyz),) or numbers.dtype.kind not in "iu":
-            raise ValueError(f"{name}: ids are {numbers.shape} {numbers.dtype}, expected ({len(xyz)},) integers")
-        try:
-            fx, fy, cx, cy = intrinsics.tolist()
-            camera = PinholeCamera(fx, fy, cx, cy, width, height)
-            points = SparsePoints(xyz, pixels, numbers.astype(np.int64))
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
-        outside = ~camera.contains(pixels)
-        if outside.any():
-            at = int(np.argmax(outside))
-            raise ValueError(f"{name}: pixel {at}, {tuple(pixels[at].tolist())}, is not in the {width}x{height} image")
-        behind = int(np.count_nonzero(points.depths(T) <= 0))
-        if 2 * behind > len(points):
-            raise ValueError(
-                f"{name}: {behind} of {len(points)} points lie behind the camera: T_camera_world takes the world to "
-                "the camera (x right, y down, z forward); is it the inverse, or OpenGL's?"
-            )
-        timestamp = float(index) if timestamp is None else timestamp
-        return cls(index, timestamp, name, image, camera, T, points, mask, held_out=held_out)
+        points = _points(name, index, xyz, pixels, ids)
+        _check_observations(name, points, T, camera)
+        return cls(index, timestamp, name, colours, camera, T, points, mask, held_out=held_out)
 
     @cached_property
     def rgba(self) -> NDArray[np.uint8]:
@@ -211,8 +178,72 @@ class TrackedFrame:
         return build_pyramid(self.rgba, self.camera)
 
 
+# ---- checks of `TrackedFrame.from_arrays`, each with the frame's name for the message --------------------------------
+
+
+def _colours(name: str, image: ArrayLike) -> NDArray[np.float32]:
+    """The image (H, W, 3) as float32 in [0, 1]."""
+    image = np.asarray(image)
+    if image.dtype not in (np.uint8, np.float32):
+        raise TypeError(f"{name}: image is {image.dtype}, expected uint8, or float32 in [0, 1]")
+    if image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"{name}: image has shape {image.shape}, expected (H, W, 3)")
+    if image.dtype == np.uint8:
+        return np.divide(image.astype(np.float32), np.float32(255.0), dtype=np.float32)
+    if not (image.min() >= 0.0 and image.max() <= 1.0):
+        raise ValueError(f"{name}: a float32 image holds 0 to 1, this one {image.min():g} to {image.max():g}")
+    return image
+
+
+def _pose(name: str, T_camera_world: ArrayLike) -> NDArray[np.float64]:
+    T = np.array(T_camera_world, dtype=np.float64)
+    if T.shape != (4, 4) or not _is_rigid(T):
+        raise ValueError(f"{name}: T_camera_world must be a rigid 4x4 matrix: [R t; 0 0 0 1], R a rotation")
+    return T
+
+
 def _is_rigid(T: NDArray[np.float64]) -> bool:
     """Whether T (4, 4) is a rigid motion, up to `MAX_DRIFT`."""
     R = T[:3, :3]
     off = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
     return bool(np.isfinite(T).all() and off < MAX_DRIFT and np.linalg.det(R) > 0)
+
+
+def _camera(name: str, intrinsics: ArrayLike, height: int, width: int) -> PinholeCamera:
+    numbers = np.asarray(intrinsics, dtype=np.float64)
+    if numbers.shape != (4,) or not np.isfinite(numbers).all():
+        raise ValueError(f"{name}: intrinsics must be four numbers: fx, fy, cx, cy")
+    fx, fy, cx, cy = numbers.tolist()
+    try:
+        return PinholeCamera(fx, fy, cx, cy, width, height)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def _points(name: str, index: int, xyz: ArrayLike, pixels: ArrayLike, ids: ArrayLike | None) -> SparsePoints:
+    """The points; ids that no other frame has if `ids` is None."""
+    xyz, pixels = (np.array(array, dtype=np.float64) for array in (xyz, pixels))
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or pixels.shape != (len(xyz), 2):
+        raise ValueError(f"{name}: xyz has shape {xyz.shape}, pixels {pixels.shape}, expected (N, 3) and (N, 2)")
+    numbers = index * IDS_PER_FRAME + np.arange(len(xyz)) if ids is None else np.asarray(ids)
+    if numbers.shape != (len(xyz),) or numbers.dtype.kind not in "iu":
+        raise ValueError(f"{name}: ids are {numbers.shape} {numbers.dtype}, expected ({len(xyz)},) integers")
+    try:
+        return SparsePoints(xyz, pixels, numbers.astype(np.int64))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def _check_observations(name: str, points: SparsePoints, T: NDArray[np.float64], camera: PinholeCamera) -> None:
+    """Raise ValueError if a pixel is outside the image, or most points are behind the camera."""
+    outside = ~camera.contains(points.pixels)
+    if outside.any():
+        at = int(np.argmax(outside))
+        pixel, size = tuple(points.pixels[at].tolist()), f"{camera.width}x{camera.height}"
+        raise ValueError(f"{name}: pixel {at}, {pixel}, is not in the {size} image")
+    behind = int(np.count_nonzero(points.depths(T) <= 0))
+    if 2 * behind > len(points):
+        raise ValueError(
+            f"{name}: {behind} of {len(points)} points lie behind the camera: T_camera_world takes the world to "
+            "the camera (x right, y down, z forward); is it the inverse, or OpenGL's?"
+        )

@@ -15,7 +15,6 @@ __all__ = ["KeyframeRows", "keyframe_arrays"]
 # Scalars and small matrices of a `Keyframe`, with their shapes.
 NUMBERS: dict[str, tuple[int, ...]] = {
     "index": (),
-    "T_tracked": (4, 4),
     "T_camera_world": (4, 4),
     "median_depth": (),
     "error": (),

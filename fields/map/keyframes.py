@@ -15,6 +15,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.geometry.similarity import moved_points, scale_of
 from fields.map.running_median import RunningMedian
+from fields.map.trajectory import Trajectory
 
 __all__ = ["NO_MOTION", "Keyframe", "KeyframeStore"]
 
@@ -40,7 +41,7 @@ class Keyframe:
         index: Index of the frame.
         rgba: Image (H, W, 4) uint8; the last channel is 255 at valid pixels.
         camera: Camera of `rgba`.
-        T_tracked: Pose T_camera_world (4, 4) from the tracker.
+        trajectory: The tracked poses of all frames.
         T_camera_world: Refined pose (4, 4).
         points: Tracked points.
         median_depth: Median depth of the tracked points [scene units].
@@ -62,7 +63,7 @@ class Keyframe:
     index: int
     rgba: NDArray[np.uint8]
     camera: PinholeCamera
-    T_tracked: NDArray[np.float64]
+    trajectory: Trajectory = field(repr=False)
     T_camera_world: NDArray[np.float64]
     points: SparsePoints
     median_depth: float
@@ -95,26 +96,31 @@ class Keyframe:
         return replace(self, rgba=image.rgba, camera=image.camera, points=points, pyramid=(image,))
 
     @property
+    def T_tracked(self) -> NDArray[np.float64]:  # noqa: N802  # a transform is named by its ends
+        """Pose T_camera_world (4, 4) from the tracker, with all of its corrections so far."""
+        return self.trajectory[self.index]
+
+    @property
     def correction(self) -> NDArray[np.float64]:
         """Rigid motion (4, 4) that refinement applied on the left of the tracked pose."""
         return self.T_camera_world @ inverse_se3(self.T_tracked)
 
-    def revise(self, T_tracked: NDArray[np.float64], S: NDArray[np.float64]) -> None:
-        """Apply a revised pose of the tracker.
+    def follow(self, T_before: NDArray[np.float64], S: NDArray[np.float64]) -> None:
+        """Follow the tracked pose after the tracker has revised it.
 
         The refinement of the pose is kept, with its translation scaled by S. Adam's moments are kept unchanged, since
         they are in pixels of this camera. The tracked points and the median depth move with the world.
 
         Args:
-            T_tracked: Revised pose T_camera_world (4, 4).
+            T_before: Tracked pose T_camera_world (4, 4) before the revision.
             S: Similarity S_after_before (4, 4) of the world around the keyframe.
         """
-        if np.array_equal(S, np.eye(4)) and np.array_equal(T_tracked, self.T_tracked):
+        T_tracked = self.T_tracked
+        if np.array_equal(S, np.eye(4)) and np.array_equal(T_tracked, T_before):
             return
-        correction = self.correction
+        correction = self.T_camera_world @ inverse_se3(T_before)
         correction[:3, 3] *= scale_of(S)
-        unrefined = np.array_equal(self.T_camera_world, self.T_tracked)
-        self.T_tracked = T_tracked.copy()
+        unrefined = np.array_equal(self.T_camera_world, T_before)
         self.T_camera_world = T_tracked.copy() if unrefined else orthonormalised(correction @ T_tracked)
         self.points = replace(self.points, xyz=moved_points(S, self.points.xyz))
         self.median_depth *= float(scale_of(S))
@@ -144,18 +150,21 @@ class KeyframeStore:
     few microseconds.
 
     Attributes:
+        trajectory: The tracked poses of all frames, those of the keyframes included.
         nbytes: Bytes of the keyframes' images and points.
     """
 
-    def __init__(self, levels: int = 1, min_side: int = 1) -> None:
+    def __init__(self, levels: int = 1, min_side: int = 1, trajectory: Trajectory | None = None) -> None:
         """Create an empty store.
 
         Args:
             levels: Number of pyramid levels that a keyframe keeps.
             min_side: Minimum side length of all levels but the first [px].
+            trajectory: The tracked poses of all frames; None for a new one.
         """
         self.levels = levels
         self.min_side = min_side
+        self.trajectory = Trajectory() if trajectory is None else trajectory
         self._keyframes: list[Keyframe] = []
         self._depths = RunningMedian()
         self.nbytes = 0
@@ -189,6 +198,7 @@ class KeyframeStore:
 
     def append(self, frame: TrackedFrame) -> Keyframe:
         """Add a frame as a keyframe. Its error starts at the mean of the others (1 for the first keyframe)."""
+        self.trajectory.add(frame)
         keyframe = self.view(frame, self.levels)
         self._keyframes.append(keyframe)
         self.nbytes += _nbytes(keyframe.pyramid, keyframe.points)
@@ -214,7 +224,7 @@ class KeyframeStore:
             index=frame.index,
             rgba=frame.rgba,
             camera=frame.camera,
-            T_tracked=frame.T_camera_world,
+            trajectory=self.trajectory,
             T_camera_world=self.corrected(frame.index, frame.T_camera_world),
             points=frame.points,
             median_depth=_median_depth(frame.points, frame.T_camera_world, self.scene_depth),

@@ -63,7 +63,7 @@ class Mapper:
             self.pipeline = OfflineMapper(settings, width, height, seed)
         else:
             self.pipeline = OnlineMapper(settings or MappingSettings(), width, height, seed)
-        self.frames = DeliveredFrames()
+        self.frames = DeliveredFrames(trajectory=self.pipeline.trajectory)
         self._finished = True
 
     def add(self, frame: TrackedFrame) -> FrameReport | None:
@@ -102,7 +102,7 @@ class Mapper:
                 "before it has come"
             )
         report = self.pipeline.correct(correction)
-        self.frames.correct(correction, report.motion, report.moved)
+        self.frames.correct(correction, report.around, report.moved)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> None:
         """Run what follows the last frame of the online loop, or the whole optimisation of the offline baseline.
@@ -157,7 +157,7 @@ class Mapper:
 
         Args:
             state: The other mapper's `pipeline.state()`.
-            frames: The other mapper's `frames`.
+            frames: The other mapper's `frames`, with the trajectory of this mapper's pipeline.
             again: The frames that it processed, without the held-out ones.
             finished: The other mapper's `finished`.
 
@@ -165,6 +165,8 @@ class Mapper:
             KeyError, TypeError, ValueError: If the state does not fit this mapper.
         """
         self.pipeline.restore(state, again)
+        if list(self.pipeline.trajectory) != frames.index:
+            raise ValueError("the frames differ from those with tracked poses")
         self.frames = frames
         self.pipeline.count_beside(frames.points.nbytes)
         self._finished = finished
@@ -172,7 +174,7 @@ class Mapper:
     def trajectory(self) -> list[NDArray[np.float64]]:
         """Return the refined T_camera_world (4, 4) of every frame so far."""
         store = self.pipeline.keyframes
-        return [store.corrected(i, T) for i, T in zip(self.frames.index, self.frames.T_tracked, strict=True)]
+        return [store.corrected(i, T) for i, T in self.pipeline.trajectory.items()]
 
     def render(
         self,
@@ -197,7 +199,7 @@ class Mapper:
             if not self.frames.index:
                 raise ValueError("there is no frame yet whose place to look from: give T_camera_world")
             last = self.frames.index[-1]
-            T_camera_world = self.pipeline.keyframes.corrected(last, self.frames.T_tracked[-1])
+            T_camera_world = self.pipeline.keyframes.corrected(last, self.pipeline.trajectory[last])
         return self.pipeline.renderer.render(camera, T_camera_world, self.pipeline.near, background)
 
     def version(self) -> MapVersion:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,15 +11,15 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from fields.map.trajectory import Trajectory
 from modp_ti.inputs.tracked_points import TrackedPoints
-from pipelines.corrections import WorldMotion
 
 __all__ = ["DeliveredFrames"]
 
 
 @dataclass
 class DeliveredFrames:
-    """Metadata, tracked poses and observed points of all delivered frames, in order. Images are not kept.
+    """Metadata and observed points of all delivered frames, in order. Images are not kept.
 
     Attributes:
         index: Index of each frame, as in `TrackedFrame.index`.
@@ -26,7 +27,7 @@ class DeliveredFrames:
         timestamp: Time of each frame [s].
         camera: Camera of each frame.
         held_out: Whether each frame is only for evaluation.
-        T_tracked: Tracked pose T_camera_world (4, 4) of each frame, including all corrections so far.
+        trajectory: Tracked pose of each frame, shared with the map.
         points: Points and the frames that observed them.
         corrections: Number of pose corrections received, and of those that moved the map.
     """
@@ -36,12 +37,17 @@ class DeliveredFrames:
     timestamp: list[float] = field(default_factory=list)
     camera: list[PinholeCamera] = field(default_factory=list)
     held_out: list[bool] = field(default_factory=list)
-    T_tracked: list[NDArray[np.float64]] = field(default_factory=list)
+    trajectory: Trajectory = field(default_factory=Trajectory)
     points: TrackedPoints = field(default_factory=TrackedPoints)
     corrections: dict[str, int] = field(default_factory=lambda: {"received": 0, "moved": 0})
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @property
+    def T_tracked(self) -> list[NDArray[np.float64]]:  # noqa: N802  # a transform is named by its ends
+        """Tracked pose T_camera_world (4, 4) of each frame, with all corrections so far."""
+        return [self.trajectory[index] for index in self.index]
 
     def add(self, frame: TrackedFrame, with_points: bool = True) -> None:
         """Record the next frame without its image.
@@ -55,26 +61,22 @@ class DeliveredFrames:
         self.timestamp.append(frame.timestamp)
         self.camera.append(frame.camera)
         self.held_out.append(frame.held_out)
-        self.T_tracked.append(frame.T_camera_world)
+        self.trajectory.add(frame)
         if with_points:
             self.points.add(frame)
         else:
             self.points.leave_out(frame)
 
-    def correct(self, correction: PoseCorrection, motion: WorldMotion, moved: bool) -> None:
-        """Apply a pose correction.
+    def correct(self, correction: PoseCorrection, around: Mapping[int, NDArray[np.float64]], moved: bool) -> None:
+        """Apply a correction to the points. The map has applied it to the trajectory.
 
-        Frames and points named in the correction take the corrected values. All others move with the world around
-        them.
+        Points named in the correction take the corrected positions. All others move with the world around their frames.
 
         Args:
             correction: The correction from the tracker.
-            motion: Motion of frames and world that the correction implies.
+            around: Similarity S_after_before (4, 4) of the world around each frame, by index.
             moved: Whether the correction moved the map.
         """
-        named = {int(i): T for i, T in zip(correction.index, correction.T_camera_world, strict=True)}
-        around = [motion.of(index, T) for index, T in zip(self.index, self.T_tracked, strict=True)]
-        self.T_tracked = [named.get(index, T) for index, (T, _) in zip(self.index, around, strict=True)]
-        self.points.correct(correction.ids, correction.xyz, [S for _, S in around])
+        self.points.correct(correction.ids, correction.xyz, [around[index] for index in self.index])
         self.corrections["received"] += 1
         self.corrections["moved"] += moved

@@ -110,16 +110,67 @@ class DevicePhotometricLoss(PhotometricLoss):
             value = buffer[start + (y + PAD) * self.images.stride + x + PAD]
         return value
 
+    @ti.func
+    def _replace_masked(self, p):
+        """Replace the colour of a pixel by the reference as far as the pixel is masked."""
+        plane = ti.static(self.images.plane)
+        if self.images.valid[p] < 1.0:
+            for c in ti.static(range(3)):
+                r = self.images.reference[c * plane + p]
+                d = self.images.colour[c * plane + p] - r
+                self.images.colour[c * plane + p] = r + d * self.images.valid[p]
+
+    @ti.func
+    def _row_moments(self, at, a: ti.template(), b: ti.template(), band: ti.template()):
+        """Write the moments of a horizontal window to `band`: the means of a and b, of a^2 + b^2, and of a b."""
+        source = (at >> ROW_BITS) * SIDE + (at & (TILE_WIDTH - 1))
+        mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
+        for q in ti.static(range(2 * RADIUS + 1)):
+            va, vb = a[source + q], b[source + q]
+            wa, wb = self.weights[q] * va, self.weights[q] * vb
+            mu_x, mu_y = mu_x + wa, mu_y + wb
+            squares, xy = squares + (wa * va + wb * vb), xy + wa * vb
+        band[at] = mu_x
+        band[BAND + at] = mu_y
+        band[2 * BAND + at] = squares
+        band[3 * BAND + at] = xy
+
+    @ti.func
+    def _window_moments(self, thread, band: ti.template()):
+        """Moments of a pixel's window, from those of its rows."""
+        mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
+        for q in ti.static(range(2 * RADIUS + 1)):
+            at = thread + q * TILE_WIDTH
+            mu_x += self.weights[q] * band[at]
+            mu_y += self.weights[q] * band[BAND + at]
+            squares += self.weights[q] * band[2 * BAND + at]
+            xy += self.weights[q] * band[3 * BAND + at]
+        return mu_x, mu_y, squares, xy
+
+    @ti.func
+    def _write_ssim(self, start, p, mu_x, mu_y, squares, xy):
+        """Write the SSIM of a pixel and its derivatives with respect to the moments. Returns the SSIM."""
+        plane = ti.static(self.images.plane)
+        mean_square = mu_x * mu_x + mu_y * mu_y
+        variances, covariance = squares - mean_square, xy - mu_x * mu_y
+        # S = (A1 A2) / (B1 B2)
+        A1, B1 = 2.0 * mu_x * mu_y + C1, mean_square + C1
+        A2, B2 = 2.0 * covariance + C2, variances + C2
+        inv = 1.0 / (B1 * B2)
+        S = A1 * A2 * inv
+        valid = self.images.valid[p]
+        d_mu = 2.0 * inv * (mu_y * (A2 - A1) - mu_x * S * (B2 - B1))
+        self.images.ssim_partial[3 * start + p] = d_mu * valid
+        self.images.ssim_partial[3 * start + plane + p] = -S * B1 * inv * valid
+        self.images.ssim_partial[3 * start + 2 * plane + p] = 2.0 * A1 * inv * valid
+        self.images.ssim[start + p] = S
+        return S
+
     @ti.kernel
     def _compare_tiles(self, width: ti.i32, height: ti.i32, partial: NUMBERS):
         plane = ti.static(self.images.plane)
         for i in range(width * height):
-            p = (i // width + PAD) * self.images.stride + i % width + PAD
-            if self.images.valid[p] < 1.0:
-                for c in ti.static(range(3)):
-                    r = self.images.reference[c * plane + p]
-                    d = self.images.colour[c * plane + p] - r
-                    self.images.colour[c * plane + p] = r + d * self.images.valid[p]
+            self._replace_masked((i // width + PAD) * self.images.stride + i % width + PAD)
 
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
         tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
@@ -142,46 +193,18 @@ class DevicePhotometricLoss(PhotometricLoss):
                 b[at] = self._at(self.images.reference, start, x, y, width, height)
             ti.simt.block.sync()
             for k in range((BAND - thread + THREADS - 1) >> THREAD_BITS):
-                at = thread + k * THREADS
-                source = (at >> ROW_BITS) * SIDE + (at & (TILE_WIDTH - 1))
-                mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
-                for q in ti.static(range(2 * RADIUS + 1)):
-                    va, vb = a[source + q], b[source + q]
-                    wa, wb = self.weights[q] * va, self.weights[q] * vb
-                    mu_x, mu_y = mu_x + wa, mu_y + wb
-                    squares, xy = squares + (wa * va + wb * vb), xy + wa * vb
-                band[at] = mu_x
-                band[BAND + at] = mu_y
-                band[2 * BAND + at] = squares
-                band[3 * BAND + at] = xy
+                self._row_moments(thread + k * THREADS, a, b, band)
             ti.simt.block.sync()
-            mu_x, mu_y, squares, xy = 0.0, 0.0, 0.0, 0.0
-            for q in ti.static(range(2 * RADIUS + 1)):
-                at = thread + q * TILE_WIDTH
-                mu_x += self.weights[q] * band[at]
-                mu_y += self.weights[q] * band[BAND + at]
-                squares += self.weights[q] * band[2 * BAND + at]
-                xy += self.weights[q] * band[3 * BAND + at]
+            mu_x, mu_y, squares, xy = self._window_moments(thread, band)
             l1, ssim, square, valid = 0.0, 0.0, 0.0, 0.0
             x, y = left + (thread & (TILE_WIDTH - 1)), top + (thread >> ROW_BITS)
             if x < width and y < height:
-                mean_square = mu_x * mu_x + mu_y * mu_y
-                variances, covariance = squares - mean_square, xy - mu_x * mu_y
-                # S = (A1 A2) / (B1 B2)
-                A1, B1 = 2.0 * mu_x * mu_y + C1, mean_square + C1
-                A2, B2 = 2.0 * covariance + C2, variances + C2
-                inv = 1.0 / (B1 * B2)
-                S = A1 * A2 * inv
                 p = (y + PAD) * self.images.stride + x + PAD
                 valid = self.images.valid[p]
-                d_mu = 2.0 * inv * (mu_y * (A2 - A1) - mu_x * S * (B2 - B1))
-                self.images.ssim_partial[3 * start + p] = d_mu * valid
-                self.images.ssim_partial[3 * start + plane + p] = -S * B1 * inv * valid
-                self.images.ssim_partial[3 * start + 2 * plane + p] = 2.0 * A1 * inv * valid
-                self.images.ssim[start + p] = S
+                ssim = self._write_ssim(start, p, mu_x, mu_y, squares, xy) * valid
                 centre = ((thread >> ROW_BITS) + RADIUS) * SIDE + (thread & (TILE_WIDTH - 1)) + RADIUS
                 d = a[centre] - b[centre]
-                l1, ssim, square = ti.abs(d), S * valid, d * d
+                l1, square = ti.abs(d), d * d
             ti.simt.block.sync()
             band[thread] = l1
             band[THREADS + thread] = ssim

@@ -2,67 +2,18 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.camera import PinholeCamera
+from fields.geometry.pixel_metric import pixel_jacobian, pixel_metric
 from fields.geometry.se3 import exp_se3, log_se3, orthonormalised
 from fields.map.keyframes import Keyframe
 from pipelines.optimise.safeguards import Safeguards
 
-__all__ = ["PoseRefinement", "pixel_jacobian", "pixel_metric", "reprojection"]
+__all__ = ["PoseRefinement", "reprojection"]
 
-# Depths at which the metric samples a view [median depths].
-NEAR_AND_FAR = (0.6, 1.6)
 # Threshold of the Huber loss on reprojection errors [px].
 OUTLIER = 2.0
-
-
-def pixel_jacobian(camera: PinholeCamera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jacobian of pixel positions with respect to a pose increment exp(xi) at xi = 0.
-
-    Args:
-        camera: Intrinsics.
-        points: Points (N, 3) in the camera frame, with z > 0.
-
-    Returns:
-        d pixel / d xi (N, 2, 6).
-    """
-    x, y, z = points.T
-    fx, fy, zero = camera.fx / z, camera.fy / z, np.zeros(len(points))
-    by_point = np.stack([fx, zero, -fx * x / z, zero, fy, -fy * y / z], axis=1).reshape(-1, 2, 3)
-    # exp(xi) p = p + rho + omega x p
-    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    return np.concatenate([by_point, by_point @ turned], axis=2)
-
-
-def pixel_metric(view: Keyframe) -> NDArray[np.float64]:
-    """Coordinates of a pose's tangent in which step lengths are in pixels.
-
-    With xi = W u, a step u moves the image by |u| px: the root mean square over a grid of pixels at two depths. This
-    decorrelates small rotations and translations, which move the image in similar ways, and cancels the scale of the
-    scene.
-
-    Args:
-        view: The keyframe.
-
-    Returns:
-        W (6, 6).
-    """
-    return _pixel_metric(view.camera, view.median_depth)
-
-
-@lru_cache(maxsize=64)
-def _pixel_metric(camera: PinholeCamera, median_depth: float) -> NDArray[np.float64]:
-    across, down = (np.arange(0.1, 1.0, 0.2) * side for side in (camera.width, camera.height))
-    grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-    p = np.concatenate([camera.unproject(grid, np.full(len(grid), d * median_depth)) for d in NEAR_AND_FAR])
-    J = pixel_jacobian(camera, p).reshape(-1, 6)
-    W = np.linalg.inv(np.linalg.cholesky(J.T @ J / len(p))).T
-    W.flags.writeable = False
-    return W
 
 
 def reprojection(view: Keyframe, W: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -117,7 +68,7 @@ class PoseRefinement:
         the tracked pose constrains the directions that the points leave undetermined. If the optimisation diverges, the
         view keeps its pose.
         """
-        W, before = pixel_metric(view), view.T_camera_world
+        W, before = pixel_metric(view.camera, view.median_depth), view.T_camera_world
         try:
             for _ in range(self.ITERATIONS):
                 gradient, H = reprojection(view, W)
@@ -152,7 +103,7 @@ class PoseRefinement:
             return
         before = view.T_camera_world
         beta1, beta2 = self.BETAS
-        W = pixel_metric(view)
+        W = pixel_metric(view.camera, view.median_depth)
         g = W.T @ gradient
         view.pose_steps += 1
         view.pose_m = beta1 * view.pose_m + (1 - beta1) * g

@@ -99,26 +99,26 @@ def rasterize(
         modp_ti.rasterize(**tensors, T_camera_world=torch.eye(4), camera=camera).image.mean().backward()
     """
     program()
-    if (sh is None) == (colour is None):
-        raise TypeError("rasterize takes either sh or colour")
-    tensors = {"position": position, "log_scale": log_scale, "quaternion": quaternion, "opacity_logit": opacity_logit}
-    if sh is not None:
-        tensors["sh"] = sh
-    if colour is not None:
-        tensors["colour"] = colour
-    _check(tensors, T_camera_world, background)
-    if colour is not None:
-        sh = ((colour - 0.5) / SH_C0)[:, None]
-    image, depth, opacity = _Rasterize.apply(
-        position, log_scale, quaternion, opacity_logit, sh, T_camera_world, camera, float(near)
-    )
+    geometry = {"position": position, "log_scale": log_scale, "quaternion": quaternion, "opacity_logit": opacity_logit}
+    _check(geometry, sh, colour, T_camera_world, background)
+    coefficients = sh if colour is None else ((colour - 0.5) / SH_C0)[:, None]
+    image, depth, opacity = _Rasterize.apply(*geometry.values(), coefficients, T_camera_world, camera, float(near))
     if background is not None:
         image = image + (1.0 - opacity)[..., None] * background
     return RasterizedView(image, depth, opacity)
 
 
-def _check(tensors: dict[str, Tensor], T_camera_world: Tensor, background: Tensor | None) -> None:
+def _check(
+    geometry: dict[str, Tensor],
+    sh: Tensor | None,
+    colour: Tensor | None,
+    T_camera_world: Tensor,
+    background: Tensor | None,
+) -> None:
     """Raise TypeError or ValueError for the first tensor that does not fit the others or the device."""
+    if (sh is None) == (colour is None):
+        raise TypeError("rasterize takes either sh or colour")
+    tensors = geometry | {name: tensor for name, tensor in (("sh", sh), ("colour", colour)) if tensor is not None}
     given = tensors | {"T_camera_world": T_camera_world}
     given |= {} if background is None else {"background": background}
     for name, tensor in given.items():

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.pixel_metric import pixel_metric
 from fields.geometry.se3 import inverse_se3, log_se3
 from fields.map.keyframes import Keyframe
 from fields.map.trajectory import Trajectory
-from pipelines.optimise.pose_refinement import pixel_metric
 from pipelines.render.renderer import Renderer
 from pipelines.settings import GateSettings
 
@@ -90,7 +90,7 @@ class FrameGate:
         if last is None or seen is None or self._accepted is None:
             self._accepted = self._seen
             return None
-        W = pixel_metric(last)
+        W = pixel_metric(last.camera, last.median_depth)
         motion = min(_motion(W, before, self.trajectory[before], frame) for before in (seen, self._accepted))
         limit = max(
             self.settings.jump * float(np.median(self._motions)) if len(self._motions) >= LEAST else np.inf,
@@ -106,11 +106,10 @@ class FrameGate:
 
     def state(self) -> dict[str, Any]:
         """Return the state as JSON-compatible values, for `restore`."""
-        before = [None if b is None else [b, self.trajectory[b].tolist()] for b in (self._seen, self._accepted)]
         return {
             "refused": dict(self.refused),
             "picture": self._picture,
-            "before": before,
+            "before": [self._seen, self._accepted],
             "motions": list(self._motions),
         }
 
@@ -122,7 +121,7 @@ class FrameGate:
         """
         self.refused |= {name: int(count) for name, count in state["refused"].items()}
         self._picture = int(state["picture"])
-        self._seen, self._accepted = (None if b is None else int(b[0]) for b in state["before"])
+        self._seen, self._accepted = (None if b is None else int(b) for b in state["before"])
         for index in (self._seen, self._accepted):
             if index is not None and index not in self.trajectory:
                 raise ValueError(f"frame {index} has no tracked pose")

@@ -2,68 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
+from fields.map.covisibility import SeenPoints, covisibility
 from fields.map.keyframes import Keyframe
 from fields.map.trajectory import Trajectory
 from pipelines.select.sharpness import sharpness
 from pipelines.settings import KeyframeSettings
 
 __all__ = ["KeyframeSelector", "SeenPoints", "covisibility"]
-
-
-@dataclass(frozen=True)
-class SeenPoints:
-    """The part of a view that covisibility depends on.
-
-    Attributes:
-        camera: Camera of the view.
-        T_camera_world: Pose (4, 4).
-        xyz: Tracked points (N, 3) in the world frame.
-    """
-
-    camera: PinholeCamera
-    T_camera_world: NDArray[np.float64]
-    xyz: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, view: TrackedFrame | Keyframe) -> SeenPoints:
-        """Take the camera, pose and points of a frame or keyframe."""
-        return cls(view.camera, view.T_camera_world, view.points.xyz)
-
-    @property
-    def farthest(self) -> float:
-        """Depth of the farthest tracked point [scene units]."""
-        return float((self.xyz @ self.T_camera_world[2, :3]).max() + self.T_camera_world[2, 3])
-
-    def count(self, xyz: NDArray[np.float64]) -> int:
-        """Count the world points (N, 3) that lie in the image and no deeper than `farthest`."""
-        p = xyz @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
-        p = p[(p[:, 2] > 0) & (p[:, 2] <= self.farthest)]
-        return int(np.count_nonzero(self.camera.contains(self.camera.project(p))))
-
-
-def covisibility(a: SeenPoints, b: SeenPoints) -> float:
-    """Overlap of two views in [0, 1] (Section 3.3.1).
-
-    The overlap is m / (m + only_a + only_b). m is the mean of the number of a's points that b sees and the number of
-    b's points that a sees; only_a and only_b count the points that the other view does not see.
-
-    Returns:
-        The overlap; 0.1 if either view has no points.
-    """
-    if len(a.xyz) == 0 or len(b.xyz) == 0:
-        return 0.1
-    a_in_b, b_in_a = b.count(a.xyz), a.count(b.xyz)
-    shared = 0.5 * (a_in_b + b_in_a)
-    only = (len(a.xyz) - a_in_b) + (len(b.xyz) - b_in_a)
-    return shared / max(shared + only, 1e-9)
 
 
 class KeyframeSelector:
@@ -99,7 +49,8 @@ class KeyframeSelector:
             previous, self.trajectory[previous], frame
         ) > self.settings.max_rotation and self._is_blurred(frame, last):
             return False
-        moved = np.linalg.norm(camera_centre(frame.T_camera_world) - camera_centre(last.T_camera_world))
+        centre, before = (inverse_se3(view.T_camera_world)[:3, 3] for view in (frame, last))
+        moved = np.linalg.norm(centre - before)
         if moved > self.settings.baseline * last.median_depth:
             return True
         return covisibility(SeenPoints.of(frame), SeenPoints.of(last)) < self.settings.covisibility
@@ -113,8 +64,3 @@ def rotation_per_frame(index: int, T_camera_world: NDArray[np.float64], frame: T
     R = frame.T_camera_world[:3, :3] @ T_camera_world[:3, :3].T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0)))
     return float(angle) / max(frame.index - index, 1)
-
-
-def camera_centre(T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera centre (3,) in the world frame."""
-    return inverse_se3(T_camera_world)[:3, 3]

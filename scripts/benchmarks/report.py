@@ -38,16 +38,18 @@ def _step(row: Mapping[str, Any], machine: Mapping[str, Figures]) -> list[str]:
     size, runs = Size(*row["size"]), row["threads"]
     first, last = next(iter(runs.values())), runs[max(runs, key=int)]
     visited, whole = first["pairs visited"], first["pairs of whole tiles"]
-    lines = [
-        "",
-        f"## {size}",
-        "",
+    about = (
         f"{visited / 1e6:.2f} million pixel-Gaussian pairs visited, {whole / 1e6:.2f} million over whole tiles; "
         f"{first['visible']:,.0f} Gaussians visible; peak memory of the process {last['peak_memory_mb']:.0f} MB. "
         "Cores at work in a step: "
         + ", ".join(f"{of['cores_had']:.2f} with {_threads(n)}" for n, of in runs.items())
-        + "; far fewer than threads where others use the machine.",
-    ]
+        + "; far fewer than threads where others use the machine."
+    )
+    lines = ["", f"## {size}", "", about]
+    return [*lines, *_compositing(runs, visited, whole), *_stages(runs), *_shares(runs, size, visited, machine)]
+
+
+def _compositing(runs: Mapping[str, Figures], visited: float, whole: float) -> list[str]:
     pairs: dict[str, Figures] = {}
     for n, of in runs.items():
         for name, stage, twin in (
@@ -64,8 +66,11 @@ def _step(row: Mapping[str, Any], machine: Mapping[str, Figures]) -> list[str]:
         "ns per pair of whole tiles": ("whole", ".2f"),
         "times faster than the plain twin": ("twin", ".1f"),
     }
-    lines += ["", markdown_table("compositing", columns, pairs)]
+    return ["", markdown_table("compositing", columns, pairs)]
 
+
+def _stages(runs: Mapping[str, Figures]) -> list[str]:
+    first, last = next(iter(runs.values())), runs[max(runs, key=int)]
     columns = {f"{_threads(n)} [ms]": (n, ".2f") for n in runs}
     if len(runs) > 1:
         columns["speed-up"] = ("speed-up", ".2f")
@@ -74,8 +79,10 @@ def _step(row: Mapping[str, Any], machine: Mapping[str, Figures]) -> list[str]:
         | {"speed-up": first[name] / last[name]}
         for name in (*STAGES, "step")
     }
-    lines += ["", markdown_table("stage", columns, stages)]
+    return ["", markdown_table("stage", columns, stages)]
 
+
+def _shares(runs: Mapping[str, Figures], size: Size, visited: float, machine: Mapping[str, Figures]) -> list[str]:
     shares: dict[str, Figures] = {}
     for n, of in runs.items():
         work = {
@@ -99,7 +106,7 @@ def _step(row: Mapping[str, Any], machine: Mapping[str, Figures]) -> list[str]:
         f"Operations counted: {FORWARD_FLOPS} a visited pair forward, {BACKWARD_FLOPS} backward, {LOSS_FLOPS} a pixel "
         f"and channel of the loss; bytes: {ADAM_BYTES} a Gaussian of Adam, more than 100 % where the caches hold them."
     )
-    return [*lines, "", markdown_table("share of the machine", columns, shares), "", about]
+    return ["", markdown_table("share of the machine", columns, shares), "", about]
 
 
 def _growth(growth: Mapping[str, Sequence[Figures]], frames: Sequence[Figures]) -> list[str]:

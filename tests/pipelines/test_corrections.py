@@ -56,22 +56,35 @@ def test_frames_go_with_the_named_ones_around_them() -> None:
 
 
 def test_a_correction_that_names_no_known_frame_moves_nothing() -> None:
-    motion = revise(KeyframeStore(), {}, correction([3], S))
-    after, around = motion.of(5, pose(5))
-    np.testing.assert_array_equal(after, pose(5))
-    np.testing.assert_array_equal(around, np.eye(4))
+    store = KeyframeStore()
+    store.append(frame(5))
+    around = revise(store, correction([3], S))
+    np.testing.assert_array_equal(store.trajectory[5], frame(5).T_camera_world)
+    np.testing.assert_array_equal(around[5], np.eye(4))
+
+
+def test_a_held_out_frame_takes_its_corrected_pose_but_moves_nothing() -> None:
+    store = KeyframeStore()
+    store.append(frame(0))
+    store.trajectory.add(frame(1, held_out=True))
+    store.append(frame(2))
+    moved = exp_se3([0.3, 0, 0, 0, 0, 0]) @ pose(1)
+    around = revise(store, PoseCorrection(np.array([1]), moved[None]))
+    np.testing.assert_array_equal(store.trajectory[1], moved)
+    for i in (0, 2):
+        np.testing.assert_array_equal(store.trajectory[i], frame(i).T_camera_world)
+        np.testing.assert_array_equal(around[i], np.eye(4))
 
 
 def test_keyframes_take_poses_points_and_scale_over() -> None:
     store = KeyframeStore()
     for i in range(5):
         store.append(frame(i))
-    tracked = {i: frame(i).T_camera_world for i in range(5)}
     depth = store.scene_depth
     # Frames 1 and 4 are not named, nor are the points of frame 3.
     named = correction([0, 2, 3], S)
     known = ~np.isin(named.ids, frame(3).points.ids)
-    revise(store, tracked, PoseCorrection(named.index, named.T_camera_world, named.ids[known], named.xyz[known]))
+    revise(store, PoseCorrection(named.index, named.T_camera_world, named.ids[known], named.xyz[known]))
     for i, view in enumerate(store):
         np.testing.assert_allclose(view.T_tracked, moved_pose(S, pose(i)), atol=1e-9)
         np.testing.assert_allclose(view.points.xyz, moved_points(S, frame(i).points.xyz), atol=1e-9)
@@ -83,7 +96,7 @@ def test_without_points_the_scale_stays() -> None:
     store = KeyframeStore()
     for i in range(3):
         store.append(frame(i))
-    revise(store, {i: frame(i).T_camera_world for i in range(3)}, correction([0, 1, 2], S, points=False))
+    revise(store, correction([0, 1, 2], S, points=False))
     for i, view in enumerate(store):
         assert scale_of(view.pending_motion) == pytest.approx(1.0)
         assert view.median_depth == pytest.approx(np.median(frame(i).points.depths(pose(i))))
@@ -94,7 +107,9 @@ def test_the_lag_is_the_shift_of_the_picture() -> None:
     view = store.append(frame(0))
     assert pending_motion_in_pixels(view) == 0.0
     # Sideways by a hundredth of the depth: the focal length is 60 pixels.
-    view.revise(exp_se3([0.01 * view.median_depth, 0, 0, 0, 0, 0]) @ view.T_tracked, np.eye(4))
+    before = view.T_tracked
+    store.trajectory.revise({0: exp_se3([0.01 * view.median_depth, 0, 0, 0, 0, 0]) @ before})
+    view.follow(before, np.eye(4))
     view.pending_motion = motion_around(pose(0), view.T_tracked)
     assert pending_motion_in_pixels(view) == pytest.approx(0.6, rel=1e-6)
     view.pending_motion = motion_around(pose(0), exp_se3([0, 0, 0, 0, np.pi, 0]) @ pose(0))

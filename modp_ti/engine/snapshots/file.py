@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
 
-__all__ = ["FILE", "VERSION", "read_arrays", "write_arrays"]
+__all__ = ["FILE", "OLDEST", "VERSION", "read_arrays", "write_arrays"]
 
 FILE = "snapshot.npz"
-# Version of the arrays and the JSON. Other versions are refused, as they hold the state of different code.
-VERSION = 2
+# Version of the arrays and the JSON. Versions before `OLDEST` and newer ones are refused, as they hold the state of
+# different code; `Snapshot.read` converts those in between.
+VERSION = 3
+OLDEST = 2
 ABOUT = "about"
 KINDS = "biuf"
 
@@ -57,7 +59,7 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
     except (zipfile.BadZipFile, ValueError, KeyError, TypeError, NotImplementedError, RuntimeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a snapshot, or a damaged one ({reason}); start the run from its scene") from None
-    if version != VERSION:
+    if version not in range(OLDEST, VERSION + 1):
         raise InputError(
             f"{path}: a snapshot of version {version}, but this program reads version {VERSION}; resume with the "
             "program that wrote it, or start the run from its scene"

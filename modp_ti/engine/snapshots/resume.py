@@ -101,7 +101,7 @@ def replay(
                 yield event
 
     with snapshot.fitting():
-        mapper.restore(snapshot.map, snapshot.frames(), frames(), position.finished)
+        mapper.restore(snapshot.map, snapshot.frames(mapper.pipeline.trajectory), frames(), position.finished)
         mapper.pipeline.stopwatch.seconds |= snapshot.numbers["watch"]
     if digest.value != position.digest:
         raise _changed(snapshot, "images, poses or points have changed")

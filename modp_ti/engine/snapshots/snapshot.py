@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from fields.map.trajectory import Trajectory
 from modp_ti.engine.snapshots.file import read_arrays, write_arrays
+from modp_ti.engine.snapshots.old_versions import convert_version_2
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
@@ -106,8 +108,10 @@ class Snapshot:
         """Read a snapshot. Raises InputError with one line if the file cannot be used."""
         arrays, about = read_arrays(path)
         try:
+            if about["version"] == 2:
+                convert_version_2(arrays, about["numbers"])
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (IndexError, KeyError, TypeError, ValueError) as error:
             raise _unfit(path, error) from None
         return cls(path, settings, position, arrays, numbers)
 
@@ -119,8 +123,12 @@ class Snapshot:
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
             raise _unfit(self.path, error) from None
 
-    def frames(self) -> DeliveredFrames:
-        """Return the metadata of the frames. Raises KeyError if it is incomplete, ValueError if inconsistent."""
+    def frames(self, trajectory: Trajectory) -> DeliveredFrames:
+        """Return the metadata of the frames, for the map whose trajectory is given.
+
+        Raises:
+            KeyError, ValueError: If the metadata are incomplete or inconsistent.
+        """
         state = MapState(self.arrays, self.numbers["frames"])
         rows, points = state.group("frames"), state.group("points")
         frames = DeliveredFrames(
@@ -132,12 +140,12 @@ class Snapshot:
                 for fx, fy, cx, cy, width, height in rows["camera"].tolist()
             ],
             held_out=rows["held_out"].tolist(),
-            T_tracked=list(rows["T_tracked"]),
+            trajectory=trajectory,
             corrections=dict(state.numbers["corrections"]),
         )
         frames.points.restore(points, frames.held_out)
-        if {len(part) for part in (frames.name, frames.timestamp, frames.camera, frames.T_tracked)} != {len(frames)}:
-            raise ValueError("the frames' names, times, cameras and poses differ in number")
+        if {len(part) for part in (frames.name, frames.timestamp, frames.camera)} != {len(frames)}:
+            raise ValueError("the frames' names, times and cameras differ in number")
         return frames
 
     def online(self) -> MapVersion | None:
@@ -176,7 +184,6 @@ def frames_state(frames: DeliveredFrames) -> MapState:
         "timestamp": np.array(frames.timestamp, dtype=np.float64),
         "camera": np.array(cameras, dtype=np.float64).reshape(-1, 6),
         "held_out": np.array(frames.held_out, dtype=bool),
-        "T_tracked": np.array(frames.T_tracked, dtype=np.float64).reshape(-1, 4, 4),
     }
     numbers = {"name": frames.name, "corrections": frames.corrections}
     return MapState.of({"frames": rows, "points": frames.points.state()}, numbers)

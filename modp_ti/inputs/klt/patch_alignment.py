@@ -18,6 +18,8 @@ __all__ = ["align_landmarks", "reference_views"]
 TILE = 40  # side [px] of a patch with its search area
 WINDOW = 13  # side [px] of the compared window
 COLUMNS = 16
+# Offsets (TILE, TILE, 2) [px] of the patch's pixels from its centre.
+GRID = np.stack(np.meshgrid(*[np.arange(TILE) - (TILE - 1) / 2] * 2), axis=-1)
 # Smallest correlation of matching patches.
 ALIKE = 0.75
 # Largest change of scale, and of viewing direction [degrees], between a patch and the current view.
@@ -93,31 +95,9 @@ def align_landmarks(
     warp = np.where(usable[:, None, None], warp, np.eye(2))
     guess = np.where(usable[:, None], guess, 0.0)
 
-    offset = np.arange(TILE) - (TILE - 1) / 2
-    grid = np.stack(np.meshgrid(offset, offset), axis=-1)  # (TILE, TILE, 2)
-    unwarped = grid.reshape(-1, 2) @ np.linalg.inv(warp).transpose(0, 2, 1)  # (N, TILE * TILE, 2)
-    there = pixel[:, None, None] + unwarped.reshape(count, TILE, TILE, 2)
-    here = guess[:, None, None] + grid
-    reference = np.zeros((count, TILE, TILE), np.float32)
-    for k in np.unique(keyframe[usable]):
-        mine = np.flatnonzero(usable & (keyframe == k))
-        reference[mine] = _sampled(landmarks.keyframes[k].grey, there[mine])
-    current = _sampled(grey, here)
-
-    centre = np.array([((n % COLUMNS) + 0.5, (n // COLUMNS) + 0.5) for n in range(count)]) * TILE - 0.5
-    start = centre.astype(np.float32)[:, None]
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        _mosaic(reference),
-        _mosaic(current),
-        start,
-        start.copy(),
-        winSize=(WINDOW, WINDOW),
-        maxLevel=1,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
-    )
-    shift = found[:, 0].astype(np.float64) - centre
-    room = (TILE - WINDOW) / 2 - 1
-    recognised = usable & (status[:, 0] > 0) & (np.abs(shift) <= room).all(axis=1)
+    reference = _warped_patches(landmarks, keyframe, pixel, warp, usable)
+    shift, aligned = _shifts(reference, _sampled(grey, guess[:, None, None] + GRID))
+    recognised = usable & aligned
     result = guess + np.where(recognised[:, None], shift, 0.0)
     half = WINDOW // 2
     near = np.stack(np.meshgrid(*[np.arange(-half, half + 1, dtype=np.float64)] * 2), axis=-1)
@@ -149,6 +129,44 @@ def _warps(
         world = np.einsum("nji,nj->ni", poses[:, :3, :3], point)
         moved.append(lens.pixels(world @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]))
     return np.stack([moved[1] - moved[0], moved[2] - moved[0]], axis=-1) / step
+
+
+def _warped_patches(
+    landmarks: LandmarkMap,
+    keyframe: NDArray[np.int64],
+    pixel: NDArray[np.float64],
+    warp: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Patches (N, TILE, TILE) of the keyframes as the current view would see them; zero where not `usable`."""
+    count = len(pixel)
+    unwarped = GRID.reshape(-1, 2) @ np.linalg.inv(warp).transpose(0, 2, 1)  # (N, TILE * TILE, 2)
+    there = pixel[:, None, None] + unwarped.reshape(count, TILE, TILE, 2)
+    patches = np.zeros((count, TILE, TILE), np.float32)
+    for k in np.unique(keyframe[usable]):
+        mine = np.flatnonzero(usable & (keyframe == k))
+        patches[mine] = _sampled(landmarks.keyframes[k].grey, there[mine])
+    return patches
+
+
+def _shifts(
+    reference: NDArray[np.float32], current: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Shifts (N, 2) [px] from each reference patch to its current one, and a mask (N,) of those that were found."""
+    centre = np.array([((n % COLUMNS) + 0.5, (n // COLUMNS) + 0.5) for n in range(len(reference))]) * TILE - 0.5
+    start = centre.astype(np.float32)[:, None]
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        _mosaic(reference),
+        _mosaic(current),
+        start,
+        start.copy(),
+        winSize=(WINDOW, WINDOW),
+        maxLevel=1,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
+    )
+    shift = found[:, 0].astype(np.float64) - centre
+    room = (TILE - WINDOW) / 2 - 1
+    return shift, (status[:, 0] > 0) & (np.abs(shift) <= room).all(axis=1)
 
 
 def _sampled(grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -71,20 +71,9 @@ def adjusted_bundle(
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-    model = pycolmap.Reconstruction()
+    model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
     model.add_camera_with_trivial_rig(camera)
-    config = pycolmap.BundleAdjustmentConfig()
-    tracks: dict[int, list[tuple[int, int]]] = {}
-    for k, T in poses.items():
-        mine = np.flatnonzero(view == k)
-        points = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels[mine]])
-        image = pycolmap.Image(name=str(k), camera_id=1, image_id=k + 1, points2D=points)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
-        config.add_image(k + 1)
-        if k not in free:
-            config.set_constant_rig_from_world_pose(k + 1)
-        for place, number in enumerate(point[mine].tolist()):
-            tracks.setdefault(number, []).append((k + 1, place))
+    tracks = _add_views(model, config, poses, view, point, pixels, free)
     names = {}
     for number, seen in tracks.items():
         if len(seen) == 1:
@@ -100,19 +89,53 @@ def adjusted_bundle(
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     if not summary.is_solution_usable():
         return None
-
-    found = {}
-    for k in free:
-        matrix = model.image(k + 1).cam_from_world().matrix()
-        if np.isfinite(matrix).all():
-            found[k] = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
     numbers = np.fromiter(names, np.int64, len(names))
     places = np.array([model.point3D(name).xyz for name in names.values()]).reshape(-1, 3)
     finite = np.isfinite(places).all(axis=1)
     # The declared type is the base class, which has no Ceres summary.
     solved = isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
     cost = summary.ceres_summary.final_cost / len(view) if solved else 0.0
-    return Bundle(found, numbers[finite], places[finite], model.camera(1), float(cost))
+    return Bundle(_adjusted_poses(model, free), numbers[finite], places[finite], model.camera(1), float(cost))
+
+
+def _add_views(
+    model: pycolmap.Reconstruction,
+    config: pycolmap.BundleAdjustmentConfig,
+    poses: Mapping[int, NDArray[np.float64]],
+    view: NDArray[np.int64],
+    point: NDArray[np.int64],
+    pixels: NDArray[np.float64],
+    free: Collection[int],
+) -> dict[int, list[tuple[int, int]]]:
+    """Add the views with their observations. View k becomes image k + 1.
+
+    Returns:
+        (image, place of the observation in it) for every point.
+    """
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    tracks: dict[int, list[tuple[int, int]]] = {}
+    for k, T in poses.items():
+        mine = np.flatnonzero(view == k)
+        points = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels[mine]])
+        image = pycolmap.Image(name=str(k), camera_id=1, image_id=k + 1, points2D=points)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
+        config.add_image(k + 1)
+        if k not in free:
+            config.set_constant_rig_from_world_pose(k + 1)
+        for place, number in enumerate(point[mine].tolist()):
+            tracks.setdefault(number, []).append((k + 1, place))
+    return tracks
+
+
+def _adjusted_poses(model: pycolmap.Reconstruction, free: Collection[int]) -> dict[int, NDArray[np.float64]]:
+    """T_camera_world (4, 4) of the free views, without those that are not finite."""
+    found = {}
+    for k in free:
+        matrix = model.image(k + 1).cam_from_world().matrix()
+        if np.isfinite(matrix).all():
+            found[k] = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
+    return found
 
 
 def _options(steps: int, loss_width: float, refined: Collection[Refinable]) -> pycolmap.BundleAdjustmentOptions:

@@ -37,11 +37,7 @@ def feature_tracks(
     # Matches between two held-out views must not create tracks.
     matches = [each for each in matches if not (aside[each[0]] and aside[each[1]])]
     offset = np.concatenate([[0], np.cumsum([len(each) for each in pixels])]).astype(np.int64)
-    place = np.arange(offset[-1])
-    for i, each in enumerate(pixels):
-        if len(each):
-            _, first, same = np.unique(each, axis=0, return_index=True, return_inverse=True)
-            place[offset[i] : offset[i + 1]] = offset[i] + first[same.reshape(-1)]
+    place = _first_at_position(pixels, offset)
 
     joined = [place[found.pairs + offset[[a, b]]] for a, b, found in matches]
     if not joined:
@@ -53,8 +49,40 @@ def feature_tracks(
     frame = np.searchsorted(offset, nodes, side="right") - 1
     links = np.searchsorted(nodes, np.concatenate(joined)[clearest])
 
-    alone = aside[frame].tolist()  # nodes of held-out views, which must not join other tracks
-    parent = list(range(len(nodes)))
+    roots = _roots(frame, links, aside[frame])
+    kept = np.bincount(roots[~aside[frame]], minlength=len(nodes))[roots] >= 2
+    _, track = np.unique(roots[kept], return_inverse=True)
+    return frame[kept], nodes[kept] - offset[frame[kept]], track.reshape(-1)
+
+
+def _first_at_position(pixels: Sequence[NDArray[np.float64]], offset: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each feature of all views, the first feature of its view at the same position.
+
+    Args:
+        pixels: (N, 2) features of each view.
+        offset: Number of the first feature of each view, and of all features at the end.
+    """
+    place = np.arange(offset[-1])
+    for i, each in enumerate(pixels):
+        if len(each):
+            _, first, same = np.unique(each, axis=0, return_index=True, return_inverse=True)
+            place[offset[i] : offset[i + 1]] = offset[i] + first[same.reshape(-1)]
+    return place
+
+
+def _roots(frame: NDArray[np.int64], links: NDArray[np.int64], held_out: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Join nodes by their links in order (union-find), except where a track would get two nodes of one view.
+
+    Args:
+        frame: (N,) view of each node.
+        links: (M, 2) pairs of nodes.
+        held_out: (N,) nodes of held-out views. Each may be added to one track but joins no two tracks.
+
+    Returns:
+        The root node (N,) of each node's track.
+    """
+    alone = held_out.tolist()
+    parent = list(range(len(frame)))
     views = [1 << int(i) for i in frame]  # bit i: the track has a feature in view i
 
     def root(node: int) -> int:
@@ -74,8 +102,4 @@ def feature_tracks(
         if first != second and not views[first] & views[second]:
             parent[second] = first
             views[first] |= views[second]
-
-    roots = np.array([root(node) for node in range(len(nodes))], dtype=np.int64)
-    kept = np.bincount(roots[~aside[frame]], minlength=len(nodes))[roots] >= 2
-    _, track = np.unique(roots[kept], return_inverse=True)
-    return frame[kept], nodes[kept] - offset[frame[kept]], track.reshape(-1)
+    return np.array([root(node) for node in range(len(frame))], dtype=np.int64)

@@ -1,12 +1,7 @@
 """Compositing on a GPU: one block per tile, one thread per pixel, with the tile's Gaussians in shared memory.
 
 The formulas are those of `pipelines/render/cpu/compositing.py`, but each pixel stops by itself once it is opaque. The
-backward pass also goes front to back. It sums without atomics, in three phases for every 16 Gaussians:
-    A  one thread per pixel writes the weight and d loss / d power of each Gaussian to shared memory,
-    B  one thread per (Gaussian, column of pixels) computes ten sums over the rows that the ellipse reaches,
-    C  one thread per (Gaussian, sum) adds the columns.
-This takes about eight accesses to shared memory per pixel and Gaussian, compared with some fifty shuffles for a
-reduction over the warps, and the order of the sums is fixed.
+backward pass also goes front to back, in the phases of `compositing_gradient.py`.
 """
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
@@ -21,22 +16,26 @@ from fields.buffers.view import ViewField
 from fields.runtime.compiled_kernel import CompiledKernel
 from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
 from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.gpu.compositing_gradient import (
+    COLUMNS,
+    PLANE,
+    ROW_BITS,
+    STEP,
+    SUMS,
+    WIDTH,
+    add_columns,
+    clear_pairs,
+    column_sums,
+    unclamped_alpha,
+    write_weights,
+)
 from pipelines.render.gpu.reductions import THREADS, max_over_block
 
 __all__ = ["DeviceCompositing"]
 
-# Number of Gaussians in shared memory at a time, in the forward and in the backward pass.
+# Number of Gaussians in shared memory at a time in the forward pass; the backward pass has `STEP`.
 BATCH = TILE_PIXELS
-STEP = 16
-# Values of a Gaussian in shared memory: mean (2), conic (3), opacity, colour (3), depth.
-WIDTH = 10
 TILE_BITS = TILE_PIXELS.bit_length() - 1
-ROW_BITS = TILE_WIDTH.bit_length() - 1
-# Strides in shared memory between the pixels of two Gaussians, and between the columns of two sums. They are padded so
-# that the two Gaussians, or the 32 sums, of the threads of a warp use different banks.
-PLANE = TILE_PIXELS + TILE_WIDTH
-COLUMNS = TILE_WIDTH + 1
-SUMS = 10
 
 assert THREADS == TILE_PIXELS == BATCH
 
@@ -93,6 +92,18 @@ class DeviceCompositing:
         store[place + 8] = colour[2]
         store[place + 9] = self.projected.depth[s]
 
+    @ti.func
+    def _write_pixel(self, x, y, red, green, blue, z, T):
+        """Write the image of a pixel over the background, with its transmittance T."""
+        plane = ti.static(self.images.plane)
+        target = (y + PAD) * self.images.stride + x + PAD
+        background = self.images.background[None]
+        self.images.colour[target] = red + T * background[0]
+        self.images.colour[target + plane] = green + T * background[1]
+        self.images.colour[target + 2 * plane] = blue + T * background[2]
+        self.images.depth[target] = z
+        self.images.opacity[target] = 1.0 - T
+
     @ti.kernel
     def _forward(self, width: ti.i32, height: ti.i32, slot: INDICES, rows: INDICES):
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -129,9 +140,7 @@ class DeviceCompositing:
                 for j in range(ti.select(inside, ti.min(BATCH, count - start), 0)):
                     at = j * WIDTH
                     if T > OPAQUE and row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
-                        dx, dy = px - splats[at], py - splats[at + 1]
-                        power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
-                        alpha = ti.min(splats[at + 5] * ti.exp(power), ALPHA_MAX)
+                        alpha = ti.min(unclamped_alpha(splats, at, px, py), ALPHA_MAX)
                         if alpha >= ALPHA_MIN:
                             weight = alpha * T
                             red += weight * splats[at + 6]
@@ -154,14 +163,7 @@ class DeviceCompositing:
             if thread == 0:
                 self.pairs.reached[tile] = spans[0]
             if inside:
-                plane = ti.static(self.images.plane)
-                target = (y + PAD) * self.images.stride + x + PAD
-                background = self.images.background[None]
-                self.images.colour[target] = red + T * background[0]
-                self.images.colour[target + plane] = green + T * background[1]
-                self.images.colour[target + 2 * plane] = blue + T * background[2]
-                self.images.depth[target] = z
-                self.images.opacity[target] = 1.0 - T
+                self._write_pixel(x, y, red, green, blue, z, T)
 
     @ti.kernel
     def _backward(
@@ -194,38 +196,25 @@ class DeviceCompositing:
             self._backward_pixel(i, width, height, slot, rows, origin, gradient, True)
 
     @ti.func
-    def _column_sums(
-        self,
-        g,
-        column,
-        rows,
-        dx,
-        dy,
-        weights: ti.template(),
-        power_grads: ti.template(),
-        image_grad: ti.template(),
-        with_depth: ti.template(),
-    ):
-        """Gradients of the step's g-th Gaussian over its rows of one column; (dx, dy) leads from its mean to row 0."""
-        s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
-        s, s_y, s_yy = 0.0, 0.0, 0.0
-        for r in range(rows & 0xFFFF, rows >> 16):
-            at = ((r << ROW_BITS) & (TILE_PIXELS - 1)) | column
-            weight = weights[g * PLANE + at]
-            power_grad = power_grads[g * PLANE + at]
-            s_red += weight * image_grad[at]
-            s_green += weight * image_grad[TILE_PIXELS + at]
-            s_blue += weight * image_grad[2 * TILE_PIXELS + at]
-            if ti.static(with_depth):
-                s_z += weight * image_grad[3 * TILE_PIXELS + at]
-            down = dy + ti.cast(r, ti.f32)
-            u = power_grad * down
-            s += power_grad
-            s_y += u
-            s_yy += u * down
-        return ti.Vector([s_red, s_green, s_blue, s_z, s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy])
+    def _image_gradient(self, x, y, with_depth: ti.template()):
+        """Gradients of a pixel's red, green, blue and depth, and the contribution of all its Gaussians to the loss."""
+        plane = ti.static(self.images.plane)
+        source = (y + PAD) * self.images.stride + x + PAD
+        red_grad = self.images.colour_grad[source]
+        green_grad = self.images.colour_grad[source + plane]
+        blue_grad = self.images.colour_grad[source + 2 * plane]
+        z_grad = 0.0
+        behind = (
+            red_grad * self.images.colour[source]
+            + green_grad * self.images.colour[source + plane]
+            + blue_grad * self.images.colour[source + 2 * plane]
+            - self.images.opacity_grad[source] * (1.0 - self.images.opacity[source])
+        )
+        if ti.static(with_depth):
+            z_grad = self.images.depth_grad[source]
+            behind += z_grad * self.images.depth[source]
+        return red_grad, green_grad, blue_grad, z_grad, behind
 
-    # Longer than other functions: its three phases share six arrays of the block and the pixel's registers.
     @ti.func
     def _backward_pixel(
         self,
@@ -249,37 +238,18 @@ class DeviceCompositing:
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
         # Shifts and masks, so that LLVM sees that no index overflows.
         tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
-        row, column = thread >> ROW_BITS, thread & (TILE_WIDTH - 1)
-        left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
-        x, y = left + column, top + row
-        inside = (x < width) & (y < height)
+        column, top = thread & (TILE_WIDTH - 1), tile // tiles_x * TILE_HEIGHT
+        x, y = tile % tiles_x * TILE_WIDTH + column, top + (thread >> ROW_BITS)
         px, py = ti.cast(x, ti.f32) + 0.5, ti.cast(y, ti.f32) + 0.5
-        plane = ti.static(self.images.plane)
-        red_grad, green_grad, blue_grad, z_grad, behind = 0.0, 0.0, 0.0, 0.0, 0.0
         # Pixels outside the image are opaque from the start.
-        T = 0.0
-        if inside:
-            source = (y + PAD) * self.images.stride + x + PAD
+        T, behind, grads = 0.0, 0.0, ti.Vector.zero(ti.f32, 4)
+        if x < width and y < height:
             T = 1.0
-            red_grad = self.images.colour_grad[source]
-            green_grad = self.images.colour_grad[source + plane]
-            blue_grad = self.images.colour_grad[source + 2 * plane]
-            behind = (
-                red_grad * self.images.colour[source]
-                + green_grad * self.images.colour[source + plane]
-                + blue_grad * self.images.colour[source + 2 * plane]
-                - self.images.opacity_grad[source] * (1.0 - self.images.opacity[source])
-            )
-            if ti.static(with_depth):
-                z_grad = self.images.depth_grad[source]
-                behind += z_grad * self.images.depth[source]
+            grads[0], grads[1], grads[2], grads[3], behind = self._image_gradient(x, y, with_depth)
         # Threads of the block may still use shared memory for the previous tile.
         ti.simt.block.sync()
-        image_grad[thread] = red_grad
-        image_grad[TILE_PIXELS + thread] = green_grad
-        image_grad[2 * TILE_PIXELS + thread] = blue_grad
-        if ti.static(with_depth):
-            image_grad[3 * TILE_PIXELS + thread] = z_grad
+        for c in ti.static(range(3 + with_depth)):
+            image_grad[c * TILE_PIXELS + thread] = grads[c]
 
         first, count, reached = self.pairs.first[tile], self.pairs.tile_count[tile], self.pairs.reached[tile]
         for step in range((reached + STEP - 1) // STEP):
@@ -291,53 +261,21 @@ class DeviceCompositing:
                 spans[thread] = rows[k]
                 origins[thread] = ti.cast(origin[k], ti.i32)
             ti.simt.block.sync()
-
-            for j in range(here):
-                at = j * WIDTH
-                if row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
-                    weight, power_grad = 0.0, 0.0
-                    dx, dy = px - splats[at], py - splats[at + 1]
-                    power = (splats[at + 2] * dx + splats[at + 3] * dy) * dx + splats[at + 4] * dy * dy
-                    unclamped = splats[at + 5] * ti.exp(power)
-                    alpha = ti.min(unclamped, ALPHA_MAX)
-                    if alpha >= ALPHA_MIN and T > OPAQUE:
-                        weight = alpha * T
-                        shade = splats[at + 6] * red_grad + splats[at + 7] * green_grad + splats[at + 8] * blue_grad
-                        if ti.static(with_depth):
-                            shade += splats[at + 9] * z_grad
-                        contribution = weight * shade
-                        behind -= contribution
-                        T -= weight
-                        # d loss / d power = alpha * d loss / d alpha, and 0 where alpha is clamped.
-                        if unclamped <= ALPHA_MAX:
-                            power_grad = contribution - behind * alpha / (1.0 - alpha)
-                    weights[j * PLANE + thread] = weight
-                    power_grads[j * PLANE + thread] = power_grad
+            write_weights(here, thread, px, py, grads, T, behind, splats, spans, weights, power_grads, with_depth)
             ti.simt.block.sync()
-
             # Phase B: this thread's Gaussian and column of pixels.
             g = thread >> ROW_BITS
             sums = ti.Vector.zero(ti.f32, SUMS)
             if g < here:
                 dx, dy = px - splats[g * WIDTH], ti.cast(top, ti.f32) + 0.5 - splats[g * WIDTH + 1]
-                sums = self._column_sums(g, column, spans[g], dx, dy, weights, power_grads, image_grad, with_depth)
+                sums = column_sums(g, column, spans[g], dx, dy, weights, power_grads, image_grad, with_depth)
             ti.simt.block.sync()
             for c in ti.static(range(SUMS)):
                 weights[(g * SUMS + c) * COLUMNS + column] = sums[c]
             ti.simt.block.sync()
-
-            # Phase C: this thread's Gaussian and sum.
-            if thread < here * SUMS:
-                total = 0.0
-                for q in range(TILE_WIDTH):
-                    total += weights[thread * COLUMNS + q]
-                gradient[origins[thread // SUMS] * SUMS + thread % SUMS] = total
+            add_columns(thread, here, weights, origins, gradient)
             ti.simt.block.sync()
-        for k in range((count - reached) * SUMS // TILE_PIXELS + 1):
-            entry = k * TILE_PIXELS + thread
-            if entry < (count - reached) * SUMS:
-                place = ti.cast(origin[first + reached + entry // SUMS], ti.i32)
-                gradient[place * SUMS + entry % SUMS] = 0.0
+        clear_pairs(thread, first + reached, count - reached, origin, gradient)
 
     @ti.kernel
     def _gather(self, room: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):

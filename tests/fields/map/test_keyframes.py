@@ -107,8 +107,10 @@ def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
     refinement, points = keyframe.correction, keyframe.points
     seen = points.xyz @ keyframe.T_camera_world[:3, :3].T + keyframe.T_camera_world[:3, 3]
     T = exp_se3([-0.5, 0.3, 2, -0.4, 0.1, 0])
-    S = motion_around(keyframe.T_tracked, T, 1.5)
-    keyframe.revise(T, S)
+    before = keyframe.T_tracked
+    S = motion_around(before, T, 1.5)
+    store.trajectory.revise({0: T})
+    keyframe.follow(before, S)
     store.take_in_depths()
     np.testing.assert_array_equal(keyframe.T_tracked, T)
     refinement[:3, 3] *= 1.5

@@ -52,12 +52,12 @@ def mapped(items: list[TrackedFrame | PoseCorrection]) -> tuple[float, float, bo
     """Held-out PSNR of the finished map; that at the corrected poses before Gaussians followed; whether they did."""
     initialise("cpu")
     mapper = OnlineMapper(SETTINGS, *SIZE, seed=0)
-    frames, delivered, before, moved = [], DeliveredFrames(), 0.0, False
+    frames, delivered, before, moved = [], DeliveredFrames(trajectory=mapper.trajectory), 0.0, False
     for item in items:
         if isinstance(item, PoseCorrection):
             before = held_out_psnr(mapper, frames, list(item.T_camera_world))
             report = mapper.correct(item)
-            delivered.correct(item, report.motion, report.moved)
+            delivered.correct(item, report.around, report.moved)
             moved = report.moved
             continue
         frames.append(item)

@@ -5,14 +5,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
-from pipelines.select.keyframes import KeyframeSelector, SeenPoints, covisibility
+from pipelines.select.keyframes import KeyframeSelector
 from pipelines.settings import KeyframeSettings
 
 CAMERA = PinholeCamera(10.0, 10.0, 10.0, 10.0, 20, 20)  # sees |x| < z and |y| < z
@@ -39,7 +38,8 @@ def frame(index: int, x: float = 0.0, yaw: float = 0.0, points: int = 30) -> Tra
 
 def decisions(frames: list[TrackedFrame], **settings: Any) -> list[bool]:
     """What becomes of every frame of a stream."""
-    trajectory, store = Trajectory(), KeyframeStore()
+    trajectory = Trajectory()
+    store = KeyframeStore(trajectory=trajectory)
     selector = KeyframeSelector(KeyframeSettings(**settings), trajectory)
     result = []
     for f in frames:
@@ -48,29 +48,6 @@ def decisions(frames: list[TrackedFrame], **settings: Any) -> list[bool]:
         if result[-1]:
             store.append(f)
     return result
-
-
-def view(xyz: list[list[float]], x: float = 0.0) -> SeenPoints:
-    return SeenPoints(CAMERA, pose(x), np.array(xyz, dtype=np.float64).reshape(-1, 3))
-
-
-def test_covisibility_is_the_shared_part() -> None:
-    # Both see the two in the middle; each has one that the other does not see.
-    a = view([[0, 0, 2], [0.5, 0, 2], [-1.9, 0, 2]])
-    b = view([[0, 0, 2], [0.5, 0, 2], [2.9, 0, 2]], x=1.0)
-    assert a.count(b.xyz) == b.count(a.xyz) == 2
-    assert covisibility(a, b) == pytest.approx(2 / (2 + 1 + 1))
-
-
-def test_points_beyond_the_farthest_are_not_seen() -> None:
-    a = view([[0, 0, 2]])
-    assert a.count(np.array([[0, 0, 2.0], [0, 0, 2.5], [0, 0, -1.0], [5, 0, 2]])) == 1
-
-
-def test_a_view_covers_itself_and_nothing_covers_no_points() -> None:
-    a = view([[0, 0, 2], [0.5, 0, 2]])
-    assert covisibility(a, a) == 1.0
-    assert covisibility(a, view([])) == 0.1
 
 
 def test_the_first_frame_with_points_is_a_keyframe() -> None:

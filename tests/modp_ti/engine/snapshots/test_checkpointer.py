@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fields.map.trajectory import Trajectory
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine.mapper import Mapper
@@ -65,7 +66,9 @@ def test_it_holds_what_the_run_has_kept(run: Run) -> None:
     assert run.checkpointer.keep() and run.checkpointer.written == 2  # nothing has happened since
     snapshot = Snapshot.read(run.checkpointer.path)
     assert snapshot.position.events == FRAMES
-    frames: DeliveredFrames = snapshot.frames()
+    trajectory = Trajectory()
+    trajectory.restore(snapshot.map.group("tracked"))
+    frames: DeliveredFrames = snapshot.frames(trajectory)
     of = run.mapper.frames
     assert (frames.index, frames.name, frames.timestamp) == (of.index, of.name, of.timestamp)
     assert (frames.camera, frames.held_out, frames.corrections) == (of.camera, of.held_out, of.corrections)
