@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -55,14 +55,14 @@ class FrameReader:
 
     def __init__(self, images: ImageSource, source: SourceSettings) -> None:
         self.images = images
-        self._source = source
+        self.source = source
         self._masks = None if source.masks is None else MaskFolder(source.masks)
         self._vignette = images.vignette
         if self._vignette is None and source.vignette is not None:
             self._vignette = read_vignette(source.vignette)
         self._of_camera: dict[Undistorter, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
 
-    def require_fitting(self, frames: Sequence[tuple[str, Undistorter]]) -> None:
+    def require_fitting(self, frames: Iterable[tuple[str, Undistorter]]) -> None:
         """Check that masks exist and match the images, and that the vignette has their aspect ratio.
 
         Only headers of the masks are read, so that a run with wrong masks fails at its start.
@@ -81,7 +81,7 @@ class FrameReader:
             if self._vignette is not None:
                 height, width = self._vignette.shape[:2]
                 if abs(width * raw.height / (height * raw.width) - 1.0) > ASPECT_TOLERANCE:
-                    what = self._source.vignette or f"the vignette of {self.images.path}"
+                    what = self.source.vignette or f"the vignette of {self.images.path}"
                     raise InputError(
                         f"{what} is {width}x{height}, the images are {raw.width}x{raw.height}: "
                         "the vignette must show the whole image (source.vignette)"
@@ -108,8 +108,8 @@ class FrameReader:
     def valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         """Return the valid pixels (H0, W0) of the stored image `raw`, or None if all are valid."""
         valid = _both(None if self._masks is None else self._masks.read(name), self.images.valid(name))
-        if self._source.mask_colour is not None:
-            valid = _both(valid, differs_from_colour(raw, self._source.mask_colour, self._source.mask_tolerance))
+        if self.source.mask_colour is not None:
+            valid = _both(valid, differs_from_colour(raw, self.source.mask_colour, self.source.mask_tolerance))
         return None if valid is None or valid.all() else valid
 
     def _light(

@@ -10,15 +10,15 @@ from threading import Event, Thread
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import is_held_out, points_inside, unmasked
+from modp_ti.inputs.replay import PosedImage, points_inside, tracked_frame
 from modp_ti.inputs.sources import FrameReader, Undistorter
 from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, SenderGoneError
-from modp_ti.inputs.tracker_server.history import Delivered, History
+from modp_ti.inputs.tracker_server.history import History
 from modp_ti.inputs.tracker_server.listening import Lobby, listen, open_to_others
 from modp_ti.inputs.tracker_server.messages import (
     Correction,
@@ -131,7 +131,8 @@ class TrackerServer(Tracker):
                 if event is not None:
                     raise event
             elif isinstance(event, TrackedFrame):
-                self._history.add(Delivered(event.name, event.timestamp, event.T_camera_world), event.points)
+                assert self._undistorter is not None, "HELLO came before"
+                self._history.add(PosedImage(event.name, self._undistorter, event.T_camera_world, event.points))
                 yield event
             else:
                 self._history.correct(event)
@@ -140,9 +141,9 @@ class TrackerServer(Tracker):
     def __iter__(self) -> Iterator[TrackedFrame]:
         """Iterate over the delivered frames with their corrected poses and points, then over frames that arrive."""
         for index, frame in enumerate(self._history.frames[:]):
-            assert self._spool is not None, "it holds the frames"
+            assert self._spool is not None and self._reader is not None, "HELLO came before"
             points = self._history.placed(self._spool.points(frame.name))
-            yield self._tracked(index, frame, points)
+            yield tracked_frame(self._reader, index, frame.with_points(points))
         for event in self.events():
             if isinstance(event, TrackedFrame):
                 yield event
@@ -158,22 +159,6 @@ class TrackerServer(Tracker):
         if self._progress is not None:
             self._progress(f"waiting for a tracker at {self.address}", done, 1)
             self._progress = self._progress if done == 0 else None
-
-    def _tracked(self, index: int, frame: Delivered, points: SparsePoints) -> TrackedFrame:
-        assert self._reader is not None and self._undistorter is not None, "HELLO came before"
-        picture = self._reader.read(frame.name, self._undistorter)
-        return TrackedFrame(
-            index=index,
-            timestamp=frame.timestamp,
-            name=frame.name,
-            image=picture.image,
-            camera=self._undistorter.camera,
-            T_camera_world=frame.T_camera_world,
-            points=unmasked(points, picture.mask),
-            mask=picture.mask,
-            vignette=picture.vignette,
-            held_out=is_held_out(index, self._source),
-        )
 
     # ---- the server's thread -----------------------------------------------------------------------------------
 
@@ -311,14 +296,14 @@ class TrackerServer(Tracker):
             self._put(self._revised(item) if isinstance(item, Correction) else self._arrived(item))
 
     def _arrived(self, frame: Frame) -> TrackedFrame:
-        assert self._spool is not None and self._undistorter is not None and frame.T_camera_world is not None
+        assert self._spool is not None and self._reader is not None and self._undistorter is not None
+        assert frame.T_camera_world is not None
         index = len(self._indices)
         self._indices[frame.number] = index
-        pixels = self._undistorter.points(frame.points.pixels)
-        pose = frame.T_camera_world
+        pixels, pose = self._undistorter.points(frame.points.pixels), frame.T_camera_world
         points = points_inside(frame.points.xyz, pixels, frame.points.ids, self._undistorter, pose)
         name = self._spool.name(frame.number)
-        tracked = self._tracked(index, Delivered(name, frame.timestamp, pose), points)
+        tracked = tracked_frame(self._reader, index, PosedImage(name, self._undistorter, pose, points))
         self._spool.keep_points(name, tracked.points)
         _ = tracked.pyramid  # computed and cached here, in this thread, to save the mapper time
         return tracked

@@ -15,7 +15,6 @@ from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.sources import ImageSource, open_source
-from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.trackers.aria_mps import (
     CameraMounts,
     DeviceTrajectory,
@@ -26,8 +25,8 @@ from modp_ti.inputs.trackers.aria_mps import (
     read_points,
 )
 from modp_ti.inputs.trackers.given_poses import (
-    checked_reader,
     missing_frames_note,
+    posed_images,
     selected_frames,
     solving,
     spread_points,
@@ -73,13 +72,8 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
         mounts, missing = _recorded_mount(images, calibration, tracker.camera)
     selected = selected_frames(images, source)
     rows = rows_at_frames(images, selected, file, device.times, tracker)
-    names = sorted(rows, key=images.position)
-    T_world_camera = np.stack(
-        [device.T_world_device[rows[name]] @ mounts.at(device.times[rows[name]]) for name in names]
-    )
-    undistorter = require_intrinsics(images).undistorter(source.scale)
-    reader = checked_reader(images, source, [(name, undistorter) for name in names], "source.intrinsics")
-    frames = [PosedImage(name, undistorter, T) for name, T in zip(names, inverse_poses(T_world_camera), strict=True)]
+    T_world_camera = np.stack([device.T_world_device[row] @ mounts.at(device.times[row]) for row in rows.values()])
+    reader, frames = posed_images(images, source, dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
     notes = [*missing_frames_note(selected, rows, file.name), *_notes(device, mounts, file), *missing]
 
     cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
@@ -90,12 +84,11 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
                 "tracked and triangulated instead"
             )
         frames = triangulated_frames(images, frames, solving(frames, source), progress)
-        return ReplayedTracker(reader, frames, source, notes)
+        return ReplayedTracker(reader, frames, notes)
     numbers, xyz, total = read_points(cloud, device.world, tracker.max_inv_dist_std, tracker.max_dist_std)
     notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
-    times = device.times[[rows[name] for name in names]]
-    frames, note = _with_points(folder, frames, times, numbers, xyz, tracker.max_points)
-    return ReplayedTracker(reader, frames, source, [*notes, *note])
+    frames, note = _with_points(folder, frames, device.times[list(rows.values())], numbers, xyz, tracker.max_points)
+    return ReplayedTracker(reader, frames, [*notes, *note])
 
 
 def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:

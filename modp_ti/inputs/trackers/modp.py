@@ -14,10 +14,9 @@ from modp_ti.config.tracker_settings import ModpSettings
 from modp_ti.files import LARGEST, open_file, read_json, readable
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import read_number_rows
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
+from modp_ti.inputs.replay import ReplayedTracker, checked_pose
 from modp_ti.inputs.sources import open_source
-from modp_ti.inputs.sources.protocol import require_intrinsics
-from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, matched_entries
+from modp_ti.inputs.trackers.given_poses import found_file, matched_entries, posed_images
 from modp_ti.inputs.trackers.point_cloud import projected_points
 
 __all__ = ["open_modp"]
@@ -57,8 +56,7 @@ def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
     stated = ((image, (number, T)) for number, (image, T) in enumerate(cameras))
     entries, notes = matched_entries(images, source, stated, file, file.name, "cameras")
     numbers = [number for number, _ in entries.values()]
-    undistorter = require_intrinsics(images).undistorter(source.scale)
-    reader = checked_reader(images, source, [(name, undistorter) for name in entries], "source.intrinsics")
+    reader, posed = posed_images(images, source, {name: T for name, (_, T) in entries.items()})
     xyz = [_read_cloud(clouds[number]) if number in clouds else np.zeros((0, 3)) for number in numbers]
     if not any(len(each) for each in xyz):
         raise InputError(f"{folder}: holds no point for any of the {len(entries)} frames")
@@ -66,15 +64,16 @@ def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
     _, ids = np.unique(np.concatenate(xyz), axis=0, return_inverse=True)
     ids = ids.reshape(-1).astype(np.int64)
     frames, first = [], 0
-    for (name, (_, T)), cloud in zip(entries.items(), xyz, strict=True):
+    for frame, cloud in zip(posed, xyz, strict=True):
         mine, rows = np.unique(ids[first : first + len(cloud)], return_index=True)
-        frames.append(PosedImage(name, undistorter, T, projected_points(cloud[rows], mine, undistorter, T)))
+        points = projected_points(cloud[rows], mine, frame.undistorter, frame.T_camera_world)
+        frames.append(frame.with_points(points))
         first += len(cloud)
 
     without = sum(number not in clouds for number in numbers)
     if without:
         notes.append(f"{without} frames have no file of points in {folder}: they bring none")
-    return ReplayedTracker(reader, frames, source, notes)
+    return ReplayedTracker(reader, frames, notes)
 
 
 def _cameras(file: Path) -> list[tuple[str, NDArray[np.float64]]]:

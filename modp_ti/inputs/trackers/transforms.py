@@ -58,7 +58,7 @@ def open_transforms(
         raw, distortion = _intrinsics({**data, **entry}, images, name, file)
         undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, source.scale))
         frames.append(PosedImage(name, undistorter, _pose(entry, file)))
-    reader = checked_reader(images, source, [(frame.name, frame.undistorter) for frame in frames], str(file))
+    reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(file))
 
     cloud = data.get("ply_file_path")
     if isinstance(cloud, str) and is_file(file.parent / cloud):
@@ -68,7 +68,7 @@ def open_transforms(
         if isinstance(cloud, str):
             notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
         frames = triangulated_frames(images, frames, solving(frames, source), progress)
-    return ReplayedTracker(reader, frames, source, notes)
+    return ReplayedTracker(reader, frames, notes)
 
 
 def _named(entries: list[Any], file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
