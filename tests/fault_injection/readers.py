@@ -99,7 +99,7 @@ def _aria(file: Path) -> None:
     from modp_ti.inputs.trackers import aria_mps
 
     if file.name == "closed_loop_trajectory.csv":
-        aria_mps.read_closed_loop(file)
+        aria_mps.read_device_trajectory(file, open_loop=False)
     elif file.suffix == ".jsonl":
         aria_mps.read_calibration(file, "camera-rgb")
     elif file.name == "semidense_points.csv.gz":
@@ -191,6 +191,7 @@ class _Wire(socket.socket):
 
 def _tracker_server(file: Path) -> None:
     """Run a whole conversation, up to what is passed to the mapper."""
+    from modp_ti.config.settings import SourceSettings
     from modp_ti.inputs.tracker_server import messages
     from modp_ti.inputs.tracker_server.connection import Connection, SenderGoneError
     from modp_ti.inputs.tracker_server.ordering import Ordering
@@ -207,7 +208,7 @@ def _tracker_server(file: Path) -> None:
             if kind is messages.Kind.HELLO:
                 hello = messages.parse_hello(payload)
                 hello.intrinsics.undistorter(1.0)
-                spool = Spool(hello)
+                spool = Spool(hello, SourceSettings())
             elif kind is messages.Kind.CORRECTION:
                 ordering.add_correction(messages.parse_correction(payload))
             else:

@@ -33,31 +33,18 @@ def adjust_bundle(
         The mean cost per observation [px^2 / 2]; infinite if there are too few observations.
     """
     views = sorted({*free, *held})
-    of, slot, ids = landmarks.observations(views)
+    of, ids, pixels = landmarks.observations(views)
     free_mask = np.zeros(len(landmarks.keyframes), dtype=bool)
     free_mask[list(free)] = True
     wanted = np.zeros(len(landmarks.known), dtype=bool)
     wanted[ids[free_mask[of]]] = True
     used = wanted[ids] & (np.bincount(ids, minlength=len(wanted))[ids] >= 2)
-    of, slot, ids = of[used], slot[used], ids[used]
+    of, ids, pixels = of[used], ids[used], pixels[used]
     if len(ids) < 12:
         return float("inf")
-
-    pixels = np.zeros((len(of), 2))
-    for k in views:
-        mine = of == k
-        pixels[mine] = landmarks.keyframes[k].pixels[slot[mine]]
     poses = {k: landmarks.keyframes[k].T_camera_world for k in views}
     bundle = adjusted_bundle(
-        landmarks.lens.camera,
-        poses,
-        of,
-        ids,
-        pixels,
-        landmarks.xyz,
-        set(free),
-        steps,
-        refined=refined,
+        landmarks.lens.camera, poses, of, ids, pixels, landmarks.xyz, set(free), steps, refined=refined
     )
     if bundle is None:
         return float("inf")

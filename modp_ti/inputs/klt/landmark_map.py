@@ -133,20 +133,22 @@ class LandmarkMap:
         for keyframe in self.keyframes:
             keyframe.rays = lens.rays(keyframe.pixels)
 
-    def observations(self, keyframes: Iterable[int]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def observations(
+        self, keyframes: Iterable[int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Observations of landmarks in these keyframes.
 
         Returns:
-            Keyframe, index within the keyframe, and landmark id of each observation, (M,) each.
+            Keyframe (M,), landmark id (M,) and pixel (M, 2) of each observation.
         """
-        nothing = np.zeros(0, dtype=np.int64)
-        of, place, ids = [nothing], [nothing], [nothing]
+        of, ids, pixels = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
         for k in keyframes:
-            slots = np.flatnonzero(self.known[self.keyframes[k].ids])
-            of.append(np.full(len(slots), k))
-            place.append(slots)
-            ids.append(self.keyframes[k].ids[slots])
-        return np.concatenate(of), np.concatenate(place), np.concatenate(ids)
+            keyframe = self.keyframes[k]
+            known = self.known[keyframe.ids]
+            ids.append(keyframe.ids[known])
+            pixels.append(keyframe.pixels[known])
+            of.append(np.full(len(ids[-1]), k))
+        return np.concatenate(of), np.concatenate(ids), np.concatenate(pixels)
 
     def triangulate(self, k: int) -> NDArray[np.int64]:
         """Triangulate features of keyframe k with their first observation. Returns the ids of the new landmarks."""

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
+from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.listed_images import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -35,12 +37,23 @@ class Spool(ImageSource):
 
     Args:
         hello: The HELLO message, with camera and image encoding.
+        source: Settings of the images.
+
+    Attributes:
+        hello: As the argument.
+        undistorter: Undistorter of the images.
+        reader: Reads and undistorts the images.
+
+    Raises:
+        InputError: If the settings do not fit the camera.
     """
 
-    def __init__(self, hello: Hello) -> None:
+    def __init__(self, hello: Hello, source: SourceSettings) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-server-")
         super().__init__(Path(self._folder.name))
-        self.intrinsics = hello.intrinsics
+        self.hello = hello
+        self.undistorter = hello.intrinsics.undistorter(source.scale)
+        self.reader = FrameReader(self, source)
         self._encoding = hello.encoding
         self._last: tuple[str, NDArray[np.uint8]] | None = None
 
@@ -71,8 +84,7 @@ class Spool(ImageSource):
 
     def _require_image(self, frame: Frame) -> None:
         """Check encoding and size from the image's header, so that no image of another size is ever decoded."""
-        assert self.intrinsics is not None
-        camera = self.intrinsics.camera
+        camera = self.hello.intrinsics.camera
         what = f"FRAME {frame.number}"
         if self._encoding.channels is not None:
             wanted = camera.width * camera.height * self._encoding.channels
@@ -98,8 +110,7 @@ class Spool(ImageSource):
         return self._names[start:stop:step]
 
     def size(self, name: str) -> tuple[int, int]:
-        assert self.intrinsics is not None
-        return self.intrinsics.camera.width, self.intrinsics.camera.height
+        return self.hello.intrinsics.camera.width, self.hello.intrinsics.camera.height
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Read an image (H, W, 3); see `ImageSource`. Raises InputError if it does not decode."""

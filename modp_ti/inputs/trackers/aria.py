@@ -19,15 +19,12 @@ from modp_ti.inputs.trackers.aria_mps import (
     CameraMounts,
     DeviceTrajectory,
     read_calibration,
-    read_closed_loop,
+    read_device_trajectory,
     read_observations,
-    read_open_loop,
     read_points,
 )
 from modp_ti.inputs.trackers.given_poses import (
-    missing_frames_note,
     posed_images,
-    selected_frames,
     solving,
     spread_points,
 )
@@ -63,18 +60,17 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
     """
     place = source.require_path()
     folder, file = _trajectory_file(tracker.path, place)
-    device = read_open_loop(file) if file.name == OPEN_LOOP else read_closed_loop(file)
+    device = read_device_trajectory(file, open_loop=file.name == OPEN_LOOP)
     calibration = folder / CALIBRATION
     mounts = read_calibration(calibration, tracker.camera) if calibration.is_file() else None
     images = open_source(source)
     missing = []
     if mounts is None:
         mounts, missing = _recorded_mount(images, calibration, tracker.camera)
-    selected = selected_frames(images, source)
-    rows = rows_at_frames(images, selected, file, device.times, tracker)
+    rows, notes = rows_at_frames(images, source, file, device.times, tracker)
     T_world_camera = np.stack([device.T_world_device[row] @ mounts.at(device.times[row]) for row in rows.values()])
     reader, frames = posed_images(images, source, dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
-    notes = [*missing_frames_note(selected, rows, file.name), *_notes(device, mounts, file), *missing]
+    notes += [*_notes(device, mounts, file), *missing]
 
     cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     if file.name == OPEN_LOOP or cloud is None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import GivenPosesSettings
+from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
 from modp_ti.inputs.protocol import Progress
@@ -29,6 +30,7 @@ __all__ = [
     "matched_entries",
     "missing_frames_note",
     "posed_images",
+    "read_entries",
     "replay_poses",
     "selected_frames",
     "solving",
@@ -41,6 +43,34 @@ T = TypeVar("T")
 def selected_frames(images: ImageSource, source: SourceSettings) -> Sequence[str]:
     """Return the images selected by source.start/stop/step, in order."""
     return images.selected(source.start, source.stop, source.step)
+
+
+def read_entries(
+    file: Path, key: str, image: str, what: str
+) -> tuple[dict[str, Any], list[tuple[str, dict[str, Any]]]]:
+    """Read a JSON file whose list under `key` has an entry for each image.
+
+    Args:
+        file: The file.
+        key: Key of the list, in the plural.
+        image: Key of an entry that names its image.
+        what: Description of the file, for error messages.
+
+    Returns:
+        The content of the file, and the image name and content of each entry.
+
+    Raises:
+        InputError: If the file is not JSON, or lacks the list or an image name.
+    """
+    data = read_json(file, "tracker.path")
+    entries = data.get(key) if isinstance(data, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{file}: holds no list of `{key}`; it is not {what}")
+    names = [entry.get(image) if isinstance(entry, dict) else None for entry in entries]
+    for number, name in enumerate(names):
+        if not isinstance(name, str):
+            raise InputError(f"{file}: {key[:-1]} {number} has no `{image}`")
+    return data, list(zip(names, entries, strict=True))
 
 
 def matched_entries(

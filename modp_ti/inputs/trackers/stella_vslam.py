@@ -14,7 +14,7 @@ from modp_ti.config.tracker_settings import StellaVslamSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, points_inside
 from modp_ti.inputs.sources import ImageSource, Intrinsics, open_source
-from modp_ti.inputs.trackers.given_poses import found_file, missing_frames_note, posed_images, selected_frames
+from modp_ti.inputs.trackers.given_poses import found_file, posed_images
 from modp_ti.inputs.trackers.point_cloud import visible_points
 from modp_ti.inputs.trackers.stella_map import StellaKeyframe, StellaMap, read_stella_map
 from modp_ti.inputs.trackers.trajectory import TimedPoses, read_trajectory_file, rows_at_frames
@@ -45,14 +45,13 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
     world = read_stella_map(file)
     beside = file.with_name(TRAJECTORY)
     images = open_source(source)
-    selected = selected_frames(images, source)
     keyframe_times = np.array([keyframe.time for keyframe in world.keyframes])
     keyframes_alone = not beside.is_file()
     if keyframes_alone:
         trajectory = TimedPoses(file, keyframe_times, np.stack([each.T_camera_world for each in world.keyframes]))
     else:
         trajectory = read_trajectory_file(beside)
-    rows = rows_at_frames(images, selected, trajectory.path, trajectory.times, tracker)
+    rows, notes = rows_at_frames(images, source, trajectory.path, trajectory.times, tracker)
 
     poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
     reader, posed = posed_images(images, source, poses, *_intrinsics(images, world, source))
@@ -71,7 +70,6 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
             between += 1
         frames.append(frame.with_points(points))
 
-    notes = missing_frames_note(selected, rows, trajectory.path.name)
     if keyframes_alone:
         notes.append(f"{beside} is missing: it would have brought the poses of the frames between the keyframes")
     if between:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TimedPosesSettings
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.files.trajectory import read_tum_rows, tum_poses
 from modp_ti.inputs.sources import ImageSource
 from modp_ti.inputs.sources.association import associate
+from modp_ti.inputs.trackers.given_poses import missing_frames_note, selected_frames
 
 __all__ = ["TimedPoses", "read_trajectory_file", "require_rising", "rows_at_frames"]
 
@@ -37,9 +39,6 @@ class TimedPoses:
     times: NDArray[np.float64]
     T_camera_world: NDArray[np.float64]
     left_out: int = 0
-
-    def __len__(self) -> int:
-        return len(self.times)
 
 
 def read_trajectory_file(path: Path) -> TimedPoses:
@@ -92,26 +91,27 @@ def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> N
 
 
 def rows_at_frames(
-    images: ImageSource, names: Sequence[str], path: Path, times: NDArray[np.float64], tracker: TimedPosesSettings
-) -> dict[str, int]:
-    """Associate images with poses by time.
+    images: ImageSource, source: SourceSettings, path: Path, times: NDArray[np.float64], tracker: TimedPosesSettings
+) -> tuple[dict[str, int], list[str]]:
+    """Associate the selected images with poses by time.
 
     An image and a pose may differ by at most `tracker.max_difference`. Each is used once; the pairs nearest in time are
     matched first.
 
     Args:
         images: The image source.
-        names: Names of the images.
-        path: Origin of the poses, for error messages.
+        source: Settings of the images.
+        path: Origin of the poses, for messages.
         times: Times (N,) of the poses [s], before `tracker.time_offset` is added.
         tracker: Settings of the tracker.
 
     Returns:
-        The row of the pose of each matched image, by name.
+        The row of the pose of each matched image, by name in the source's order, and remarks for the user.
 
     Raises:
         InputError: If no image has a pose.
     """
+    names = selected_frames(images, source)
     of_frames = np.array([images.timestamp(name) for name in names])
     shifted = times + tracker.time_offset
     pairs = associate(of_frames, shifted, tracker.max_difference)
@@ -121,4 +121,5 @@ def rows_at_frames(
             f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the frames from {of_frames.min():.6f} to "
             f"{of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
         )
-    return {names[int(frame)]: int(pose) for frame, pose in pairs}
+    rows = {names[int(frame)]: int(pose) for frame, pose in pairs}
+    return rows, missing_frames_note(names, rows, path.name)
