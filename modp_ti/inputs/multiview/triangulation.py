@@ -123,7 +123,13 @@ def _seen(
 ) -> Observations:
     """Observations of the frames, from tracked corners or matched features."""
     if follows:
-        return _followed(images, frames, solves, band, progress)
+        found = follow_features(images, frames, solves, progress, band)
+        rays = np.zeros((len(found.frame), 2))
+        for i, frame in enumerate(frames):
+            mine = found.frame == i
+            rays[mine] = frame.undistorter.rays(found.pixels[mine])
+        focal = np.array([frame.undistorter.raw.focal for frame in frames])
+        return Observations(found.frame, found.track, rays, found.pixel / focal[found.frame])
     most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
     poses = np.stack([frame.T_camera_world for frame in frames])
     return _matched(images, frames, poses, np.arange(len(frames)), solves, most, NEIGHBOURS, band, progress)
@@ -154,23 +160,6 @@ def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArra
     return (float(np.median(errors)) if len(errors) else float("nan")), len(xyz)
 
 
-def _followed(
-    images: ImageSource,
-    frames: Sequence[PosedImage],
-    solves: NDArray[np.bool_],
-    band: float,
-    progress: Progress | None,
-) -> Observations:
-    """Observations of corners tracked along the frames."""
-    found = follow_features(images, frames, solves, progress, band)
-    rays = np.zeros((len(found.frame), 2))
-    for i, frame in enumerate(frames):
-        mine = found.frame == i
-        rays[mine] = _ideal(frame, found.pixels[mine])
-    focal = np.array([frame.undistorter.raw.focal for frame in frames])
-    return Observations(found.frame, found.track, rays, found.pixel / focal[found.frame])
-
-
 def _matched(
     images: ImageSource,
     frames: Sequence[PosedImage],
@@ -188,7 +177,7 @@ def _matched(
     for done, i in enumerate(views.tolist()):
         found = detect_features(images.read(frames[i].name), most)
         features.append(found)
-        rays.append(_ideal(frames[i], found.pixels))
+        rays.append(frames[i].undistorter.rays(found.pixels))
         if progress is not None:
             progress("finding features", done + 1, len(views))
 
@@ -210,12 +199,6 @@ def _matched(
     return Observations(views[view], track, seen_rays, sigma[view])
 
 
-def _ideal(frame: PosedImage, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normalised coordinates (N, 2) of pixels of the stored image."""
-    camera = frame.undistorter.camera
-    return (frame.undistorter.points(pixels) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-
-
 def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
     """Choose pairs of views that may see the same points.
 
@@ -233,9 +216,7 @@ def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS)
     pairs = {(a, a + gap) for gap in GAPS for a in range(count - gap) if alike[a, a + gap]}
     for a in range(count):
         distance = np.linalg.norm(centres - centres[a], axis=1)
-        distance[~alike[a]] = np.inf
-        distance[a] = np.inf
-        others = [int(b) for b in np.argsort(distance, kind="stable") if np.isfinite(distance[b])]
+        others = [int(b) for b in np.argsort(distance, kind="stable") if alike[a, b] and np.isfinite(distance[b])]
         fresh = [b for b in others if (min(a, b), max(a, b)) not in pairs and abs(a - b) > max(GAPS)]
         pairs.update((min(a, b), max(a, b)) for b in fresh[:neighbours])
     return sorted(pairs)

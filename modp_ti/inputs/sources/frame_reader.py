@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.masks import MaskFolder, differs_from_colour
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.sources.undistortion import Undistorter
+from modp_ti.inputs.sources.undistortion import Undistorter, both_valid
 from modp_ti.inputs.sources.vignette import LEAST_LIGHT, read_vignette
 
 if TYPE_CHECKING:
@@ -103,13 +103,13 @@ class FrameReader:
         if self._vignette is None:
             return Picture(image, mask, None)
         vignette, lit = self._light(undistorter, self._vignette)
-        return Picture(image, _both(mask, lit), vignette)
+        return Picture(image, both_valid(mask, lit), vignette)
 
     def valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         """Return the valid pixels (H0, W0) of the stored image `raw`, or None if all are valid."""
-        valid = _both(None if self._masks is None else self._masks.read(name), self.images.valid(name))
+        valid = both_valid(None if self._masks is None else self._masks.read(name), self.images.valid(name))
         if self.source.mask_colour is not None:
-            valid = _both(valid, differs_from_colour(raw, self.source.mask_colour, self.source.mask_tolerance))
+            valid = both_valid(valid, differs_from_colour(raw, self.source.mask_colour, self.source.mask_tolerance))
         return None if valid is None or valid.all() else valid
 
     def _light(
@@ -123,9 +123,3 @@ class FrameReader:
             vignette.flags.writeable = False
             self._of_camera[undistorter] = vignette, lit
         return self._of_camera[undistorter]
-
-
-def _both(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-    if a is None or b is None:
-        return b if a is None else a
-    return a & b

@@ -126,13 +126,13 @@ class TrackerServer(Tracker):
                 self._ended = True
                 if event is not None:
                     raise event
-            elif isinstance(event, TrackedFrame):
+                return
+            if isinstance(event, TrackedFrame):
                 undistorter = self._received.undistorter
                 self._history.add(PosedImage(event.name, undistorter, event.T_camera_world, event.points))
-                yield event
             else:
                 self._history.correct(event)
-                yield event
+            yield event
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         """Iterate over the delivered frames with their corrected poses and points, then over frames that arrive."""

@@ -14,7 +14,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
-from modp_ti.inputs.sources import ImageSource, open_source
+from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.trackers.aria_mps import (
     CameraMounts,
     DeviceTrajectory,
@@ -66,7 +66,11 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
     images = open_source(source)
     missing = []
     if mounts is None:
-        mounts, missing = _recorded_mount(images, calibration, tracker.camera)
+        lost = f"{calibration} is missing: it would have brought where the camera {tracker.camera} sits on the device"
+        if images.T_device_camera is None:
+            raise InputError(f"{lost} (T_device_camera), without which device poses are no camera poses")
+        mounts = CameraMounts(images.path, np.zeros(1), images.T_device_camera[None])
+        missing.append(f"{lost} (T_device_camera) over time; the recording's own is taken")
     rows, notes = rows_at_frames(images, source, file, device.times, tracker)
     T_world_camera = np.stack([device.T_world_device[row] @ mounts.at(device.times[row]) for row in rows.values()])
     reader, frames = posed_images(images, source, dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
@@ -84,7 +88,7 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
     numbers, xyz, total = read_points(cloud, device.world, tracker.max_inv_dist_std, tracker.max_dist_std)
     notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
     frames, note = _with_points(folder, frames, device.times[list(rows.values())], numbers, xyz, tracker.max_points)
-    return ReplayedTracker(reader, frames, [*notes, *note])
+    return ReplayedTracker(reader, frames, [*notes, note])
 
 
 def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
@@ -106,15 +110,6 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
         f"{roots[0]}: holds neither {CLOSED_LOOP} nor {OPEN_LOOP}, which would have brought the poses: set "
         "tracker.path to MPS's folder"
     )
-
-
-def _recorded_mount(images: ImageSource, file: Path, label: str) -> tuple[CameraMounts, list[str]]:
-    """Return the camera mount stored in a VRS recording, for use without the online calibration, and a remark."""
-    mount = images.T_device_camera
-    lost = f"{file} is missing: it would have brought where the camera {label} sits on the device (T_device_camera)"
-    if mount is None:
-        raise InputError(f"{lost}, without which device poses are no camera poses")
-    return CameraMounts(images.path, np.zeros(1), mount[None]), [f"{lost} over time; the recording's own is taken"]
 
 
 def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[str]:
@@ -141,8 +136,8 @@ def _with_points(
     numbers: NDArray[np.int64],
     xyz: NDArray[np.float64],
     limit: int,
-) -> tuple[list[PosedImage], list[str]]:
-    """Return the frames, taken at device times (F,), with the points that they observe, and remarks for the user."""
+) -> tuple[list[PosedImage], str]:
+    """Return the frames, taken at device times (F,), with the points that they observe, and a remark for the user."""
     file = next((folder / name for name in OBSERVATIONS if (folder / name).is_file()), None)
     if file is None:
         seen = [np.arange(len(xyz))] * len(frames)
@@ -157,11 +152,12 @@ def _with_points(
             a, b = np.searchsorted(instants, (time - SEEN_WITHIN, time + SEEN_WITHIN))
             seen.append(np.unique(np.concatenate([np.zeros(0, np.int64), *groups[a:b]])))
         note = f"points seen within {SEEN_WITHIN} s by the tracking cameras, at the pixels that they project to"
-    result = []
-    for frame, mine in zip(frames, seen, strict=True):
-        result.append(frame.with_points(spread_points(xyz[mine], numbers[mine], frame, limit)))
+    result = [
+        frame.with_points(spread_points(xyz[mine], numbers[mine], frame, limit))
+        for frame, mine in zip(frames, seen, strict=True)
+    ]
     if not any(len(frame.points) for frame in result):
         raise InputError(
             f"{folder}: none of the {len(xyz)} points projects into any frame: is source.intrinsics right?"
         )
-    return result, [note]
+    return result, note
