@@ -117,7 +117,7 @@ def _stella(file: Path) -> None:
 def _image(file: Path) -> None:
     from modp_ti.inputs.sources.image_header import focal_length_35mm
     from modp_ti.inputs.sources.listed_images import ListedImages
-    from modp_ti.inputs.sources.vignette import read_vignette
+    from modp_ti.inputs.sources.masks import read_vignette
 
     images = ListedImages(file.parent, [file.name], [0.0])
     focal_length_35mm(file)
@@ -275,7 +275,7 @@ def import_readers() -> None:
             "inputs.sources.exif",
             "inputs.sources.tum_rgbd",
             "inputs.sources.video_decoder",
-            "inputs.sources.vignette",
+            "inputs.sources.masks",
         ),
         *(f"inputs.trackers.{kind}" for kind in kinds),
         "inputs.tracker_server",

@@ -7,15 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
 from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.relocalisation import describe
 from modp_ti.inputs.klt.two_view import TwoViews, two_views
-from modp_ti.inputs.multiview.camera_pose import pose_from_points
 from modp_ti.inputs.multiview.features import match_anywhere
-from modp_ti.inputs.multiview.reprojection import ray_errors
+from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
 
 __all__ = ["Initialisation"]
 
@@ -141,12 +139,12 @@ class Initialisation:
             landmarks.add_keyframe(keyframe)
         every = range(len(poses))
         for _ in range(2):
-            if not np.isfinite(adjust_bundle(landmarks, every, steps=30)):
+            if not np.isfinite(landmarks.adjust(every, steps=30)):
                 return None, np.inf
             landmarks.discard_outliers(every)
             for k in every:
                 landmarks.triangulate(k)
-        cost = adjust_bundle(landmarks, every, steps=15)
+        cost = landmarks.adjust(every, steps=15)
         landmarks.discard_outliers(every)
         if not self._holds(landmarks, len(share)):
             return None, np.inf

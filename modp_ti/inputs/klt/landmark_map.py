@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
@@ -127,12 +128,6 @@ class LandmarkMap:
         late = self.last[ids] <= k
         self.last[ids[late]], self.last_pixel[ids[late]] = k, pixels[late]
 
-    def use_lens(self, lens: Lens) -> None:
-        """Replace the camera and recompute the rays of all observations."""
-        self.lens = lens
-        for keyframe in self.keyframes:
-            keyframe.rays = lens.rays(keyframe.pixels)
-
     def observations(
         self, keyframes: Iterable[int]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
@@ -194,6 +189,41 @@ class LandmarkMap:
         for k, keyframe in enumerate(self.keyframes):
             slots = np.flatnonzero(lost[keyframe.ids])
             self.note_observations(k, keyframe.ids[slots], keyframe.pixels[slots])
+
+    def adjust(
+        self, free: Sequence[int], held: Sequence[int] = (), steps: int = 10, refined: Collection[Refinable] = ()
+    ) -> float:
+        """Minimise the robust reprojection error over keyframes and the landmarks that they see, in place.
+
+        Args:
+            free: Keyframes whose poses are optimised.
+            held: Keyframes that take part with fixed poses. Without any, the first two of `free` fix the gauge.
+            steps: Levenberg-Marquardt steps at most.
+            refined: Parts of the camera that are optimised too.
+
+        Returns:
+            The mean cost per observation [px^2 / 2]; infinite if there are too few observations.
+        """
+        views = sorted({*free, *held})
+        of, ids, pixels = self.observations(views)
+        wanted = np.zeros(len(self.known), dtype=bool)
+        wanted[ids[np.isin(of, free)]] = True
+        used = wanted[ids] & (np.bincount(ids, minlength=len(wanted))[ids] >= 2)
+        of, ids, pixels = of[used], ids[used], pixels[used]
+        if len(ids) < 12:
+            return float("inf")
+        poses = {k: self.keyframes[k].T_camera_world for k in views}
+        bundle = adjusted_bundle(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
+        if bundle is None:
+            return float("inf")
+        for k, T in bundle.poses.items():
+            self.keyframes[k].T_camera_world[:3] = T[:3]
+        self.xyz[bundle.points] = bundle.xyz
+        if refined:
+            self.lens = Lens(bundle.camera)
+            for keyframe in self.keyframes:
+                keyframe.rays = self.lens.rays(keyframe.pixels)
+        return bundle.cost
 
 
 def triangulated(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.masks import read_vignette
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.sources.vignette import read_vignette
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import VrsSettings

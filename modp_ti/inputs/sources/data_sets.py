@@ -12,7 +12,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_folder import ImageFolder, natural_key
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.listed_images import ListedImages
-from modp_ti.inputs.sources.vignette import read_vignette
+from modp_ti.inputs.sources.masks import read_vignette
 
 __all__ = [
     "RELEASE_IMAGES",

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.masks import MaskFolder, differs_from_colour
+from modp_ti.inputs.sources.masks import LEAST_LIGHT, MaskFolder, differs_from_colour, read_vignette
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import Undistorter, both_valid
-from modp_ti.inputs.sources.vignette import LEAST_LIGHT, read_vignette
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings

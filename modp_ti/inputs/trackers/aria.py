@@ -69,12 +69,12 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
         lost = f"{calibration} is missing: it would have brought where the camera {tracker.camera} sits on the device"
         if images.T_device_camera is None:
             raise InputError(f"{lost} (T_device_camera), without which device poses are no camera poses")
-        mounts = CameraMounts(images.path, np.zeros(1), images.T_device_camera[None])
+        mounts = CameraMounts(np.zeros(1), images.T_device_camera[None])
         missing.append(f"{lost} (T_device_camera) over time; the recording's own is taken")
     rows, notes = rows_at_frames(images, source, file, device.times, tracker)
     T_world_camera = np.stack([device.T_world_device[row] @ mounts.at(device.times[row]) for row in rows.values()])
     reader, frames = posed_images(images, source, dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
-    notes += [*_notes(device, mounts, file), *missing]
+    notes += [*_notes(device, None if missing else mounts, file), *missing]
 
     cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     if file.name == OPEN_LOOP or cloud is None:
@@ -112,7 +112,7 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
     )
 
 
-def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[str]:
+def _notes(device: DeviceTrajectory, mounts: CameraMounts | None, file: Path) -> list[str]:
     notes = []
     if file.name == OPEN_LOOP:
         notes.append(
@@ -121,11 +121,12 @@ def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[s
         )
     if device.left_out:
         notes.append(f"{device.left_out} poses of {file.name} are of another world than most (its graph): left out")
-    gap = max(device.times[0] - mounts.times[-1], mounts.times[0] - device.times[-1])
-    if mounts.path.name == CALIBRATION and gap > 0:
-        notes.append(
-            f"{mounts.path.name} is of another time than {file.name} ({gap:.1f} s apart): is it of one recording?"
-        )
+    if mounts is not None:
+        gap = max(device.times[0] - mounts.times[-1], mounts.times[0] - device.times[-1])
+        if gap > 0:
+            notes.append(
+                f"{CALIBRATION} is of another time than {file.name} ({gap:.1f} s apart): is it of one recording?"
+            )
     return notes
 
 

@@ -36,14 +36,12 @@ class DeviceTrajectory:
     """Device poses over time.
 
     Attributes:
-        path: The file.
         times: Times (N,) on the device clock [s], strictly increasing.
         T_world_device: Poses (N, 4, 4), device to world.
         world: Name of the world frame (`graph_uid` or `session_uid`).
         left_out: Number of poses that belong to other worlds and were dropped.
     """
 
-    path: Path
     times: NDArray[np.float64]
     T_world_device: NDArray[np.float64]
     world: str
@@ -55,12 +53,10 @@ class CameraMounts:
     """Pose of a camera on the device, estimated over time.
 
     Attributes:
-        path: The file.
         times: Times (N,) [s].
         T_device_camera: Poses (N, 4, 4), camera to device.
     """
 
-    path: Path
     times: NDArray[np.float64]
     T_device_camera: NDArray[np.float64]
 
@@ -95,7 +91,7 @@ def read_device_trajectory(path: Path, open_loop: bool) -> DeviceTrajectory:
     table = table[rows]
     times = table["tracking_timestamp_us"] * MICROSECONDS
     poses = _poses(NumberRows(path, np.stack([times, *(table[name] for name in names)], axis=1), rows + 2))
-    return DeviceTrajectory(path, times, poses, str(main), int(count.sum() - count.max()))
+    return DeviceTrajectory(times, poses, str(main), int(count.sum() - count.max()))
 
 
 def read_calibration(path: Path, label: str) -> CameraMounts:
@@ -105,7 +101,7 @@ def read_calibration(path: Path, label: str) -> CameraMounts:
     if len(table) == 0:
         raise InputError(f"{path}: holds no calibration")
     rows = NumberRows(path, table[:, 1:], table[:, 0].astype(np.int64))
-    return CameraMounts(path, rows.values[:, 0], _poses(rows))
+    return CameraMounts(rows.values[:, 0], _poses(rows))
 
 
 def _poses(rows: NumberRows) -> NDArray[np.float64]:
