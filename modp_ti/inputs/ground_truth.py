@@ -42,9 +42,8 @@ def true_poses(truth: TimedPoses, timestamps: Sequence[float]) -> tuple[list[NDA
         frames have one. And a note for the user if frames have none.
     """
     pairs = associate(timestamps, truth.times, MAX_DIFFERENCE)
-    if len(pairs) == len(timestamps):
-        note = None
-    else:
+    note = None
+    if len(pairs) < len(timestamps):
         note = (
             f"{len(timestamps) - len(pairs)} of {len(timestamps)} frames have no pose in {truth.path} within "
             f"{MAX_DIFFERENCE:g} s: not in the trajectory errors"

@@ -100,17 +100,8 @@ class LandmarkMap:
         self._count += count
         if self._count > len(self.known):
             extra = max(self._count, 2 * len(self.known), 1024) - len(self.known)
-            for name, value in (
-                ("xyz", 0.0),
-                ("known", False),
-                ("first", -1),
-                ("first_pixel", 0.0),
-                ("last", -1),
-                ("last_pixel", 0.0),
-                ("looked", 0),
-                ("found", 0),
-            ):
-                array = getattr(self, name)
+            for name in ("xyz", "known", "first", "first_pixel", "last", "last_pixel", "looked", "found"):
+                array, value = getattr(self, name), -1 if name in ("first", "last") else 0
                 setattr(self, name, np.concatenate([array, np.full((extra, *array.shape[1:]), value, array.dtype)]))
         return ids
 

@@ -69,11 +69,6 @@ class _Picture:
         pixels = self.frame.undistorter.distortion.distort(rays) * (raw.fx, raw.fy) + (raw.cx, raw.cy)
         return (pixels / self._to_stored - 0.5).astype(np.float32)
 
-    @property
-    def focal(self) -> float:
-        """Focal length in pixels of the resized image."""
-        return self.frame.undistorter.raw.focal / self.pixel
-
 
 def follow_features(
     images: ImageSource,
@@ -208,4 +203,4 @@ def _near_line(
     length = np.linalg.norm(lines[:, :2], axis=1)
     off = np.abs((lines * np.c_[rays_other, np.ones(len(rays_other))]).sum(axis=1))
     # Without camera motion there is no epipolar line: both sides are about 0, and the correspondence is accepted.
-    return off * other.focal <= band * np.maximum(length, 1e-12)
+    return off * (other.frame.undistorter.raw.focal / other.pixel) <= band * np.maximum(length, 1e-12)

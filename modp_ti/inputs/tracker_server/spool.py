@@ -142,10 +142,8 @@ class Spool(ImageSource):
         image = decoded_as(data, cv2.IMREAD_UNCHANGED if png else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None or image.dtype != np.uint8:
             raise InputError(f"{name}: its {self._encoding.name} image is damaged or not of 8 bits a channel")
-        if image.ndim == 2:
-            conversion = cv2.COLOR_GRAY2RGB
-        else:
-            conversion = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
+        channels = image.shape[2] if image.ndim == 3 else 1
+        conversion = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}[channels]
         return np.asarray(cv2.cvtColor(image, conversion), dtype=np.uint8)
 
     def keep_points(self, name: str, points: SparsePoints) -> None:
