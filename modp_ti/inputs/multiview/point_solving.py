@@ -48,7 +48,7 @@ def solve_points(
         Positions (P, 3), and the observations that agree with them, whose points index the rows of the positions.
     """
     used = seen.where(solves[seen.frame])
-    used = used.where(np.isfinite(used.rays).all(axis=1))
+    used = used.where(np.isfinite(used.rays[:, 0]) & np.isfinite(used.rays[:, 1]))
     count = int(seen.point.max()) + 1 if len(seen) else 0
     xyz = np.zeros((count, 3))
     for _ in range(ROUNDS):

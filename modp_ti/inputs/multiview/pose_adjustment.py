@@ -141,7 +141,7 @@ def _resected(
     T: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], width: float
 ) -> NDArray[np.float64]:
     """Refine a pose (4, 4) by the points that it observes. Returns `T` if this increases the median error."""
-    seen = seen.where(np.isfinite(seen.rays).all(axis=1))
+    seen = seen.where(np.isfinite(seen.rays[:, 0]) & np.isfinite(seen.rays[:, 1]))
     if len(seen) < FEWEST:
         return T
     sigma = float(np.median(seen.sigma))

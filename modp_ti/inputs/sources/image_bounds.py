@@ -98,8 +98,9 @@ def _jpeg(data: bytes) -> Claim:
 def _bmp(data: bytes) -> Claim:
     image = BmpImagePlugin.BmpImageFile(bounded(io.BytesIO(data)))
     tile, (width, height) = image.tile[0], image.size
-    raw = tile.codec_name == "raw" and isinstance(tile.args, tuple)
-    return width, height, (height - 1) * int(tile.args[1]) if raw else 0  # the last row may lack its padding
+    if tile.codec_name != "raw" or not isinstance(tile.args, tuple):
+        return width, height, 0
+    return width, height, (height - 1) * int(tile.args[1])  # the last row may lack its padding
 
 
 def _pnm(data: bytes) -> Claim:

@@ -66,11 +66,10 @@ def read_entries(
     entries = data.get(key) if isinstance(data, dict) else None
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{file}: holds no list of `{key}`; it is not {what}")
-    names = [entry.get(image) if isinstance(entry, dict) else None for entry in entries]
-    for number, name in enumerate(names):
-        if not isinstance(name, str):
+    for number, entry in enumerate(entries):
+        if not isinstance(entry, dict) or not isinstance(entry.get(image), str):
             raise InputError(f"{file}: {key[:-1]} {number} has no `{image}`")
-    return data, list(zip(names, entries, strict=True))
+    return data, [(entry[image], entry) for entry in entries]
 
 
 def matched_entries(
