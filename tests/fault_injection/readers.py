@@ -261,7 +261,7 @@ READERS: dict[str, Reader] = {
 
 def import_readers() -> None:
     """Import every module that the readers use, once for all forked processes."""
-    kinds = ("aria", "colmap", "modp", "replica", "stella_vslam", "transforms", "tum")
+    kinds = ("aria", "colmap", "data_sets", "modp", "stella_vslam", "transforms", "tum")
     for name in (
         *(
             "config.scene_file",
@@ -272,7 +272,7 @@ def import_readers() -> None:
         ),
         *(
             "outputs.playback.finished_run",
-            "inputs.sources.exif",
+            "inputs.sources.image_header",
             "inputs.sources.tum_rgbd",
             "inputs.sources.video_decoder",
             "inputs.sources.masks",

@@ -100,11 +100,6 @@ class VideoFile(ImageSource):
         self._front.close()
         self._front = self._decoder(missing)
 
-    def size(self, name: str) -> tuple[int, int]:
-        """Return the size (width, height) of the frames."""
-        assert name in self._position, name
-        return self._size
-
     def read(self, name: str) -> NDArray[np.uint8]:
         """Decode a frame (H, W, 3) uint8 RGB.
 

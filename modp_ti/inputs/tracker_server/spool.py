@@ -52,6 +52,8 @@ class Spool(ImageSource):
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-server-")
         super().__init__(Path(self._folder.name))
         self.hello = hello
+        self.intrinsics = hello.intrinsics
+        self._size = (hello.intrinsics.camera.width, hello.intrinsics.camera.height)
         self.undistorter = hello.intrinsics.undistorter(source.scale)
         self.reader = FrameReader(self, source)
         self._encoding = hello.encoding
@@ -84,10 +86,10 @@ class Spool(ImageSource):
 
     def _require_image(self, frame: Frame) -> None:
         """Check encoding and size from the image's header, so that no image of another size is ever decoded."""
-        camera = self.hello.intrinsics.camera
+        width, height = self.frame_size
         what = f"FRAME {frame.number}"
         if self._encoding.channels is not None:
-            wanted = camera.width * camera.height * self._encoding.channels
+            wanted = width * height * self._encoding.channels
             if len(frame.image) != wanted:
                 raise UnfitError(f"{what}: its image has {len(frame.image)} bytes, HELLO says {wanted}", frame.number)
             return
@@ -97,9 +99,9 @@ class Spool(ImageSource):
             raise UnfitError(f"{what}: its image is no {self._encoding.name}", frame.number)
         if not header.complete:
             raise UnfitError(f"{what}: its {self._encoding.name} image is cut off", frame.number)
-        if (header.width, header.height) != (camera.width, camera.height):
+        if (header.width, header.height) != (width, height):
             raise UnfitError(
-                f"{what}: its image is {header.width}x{header.height}, HELLO says {camera.width}x{camera.height}",
+                f"{what}: its image is {header.width}x{header.height}, HELLO says {width}x{height}",
                 frame.number,
             )
 
@@ -108,9 +110,6 @@ class Spool(ImageSource):
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
         return self._names[start:stop:step]
-
-    def size(self, name: str) -> tuple[int, int]:
-        return self.hello.intrinsics.camera.width, self.hello.intrinsics.camera.height
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Read an image (H, W, 3); see `ImageSource`. Raises InputError if it does not decode."""
@@ -130,7 +129,7 @@ class Spool(ImageSource):
         return self._last[1]
 
     def _decode(self, name: str) -> NDArray[np.uint8]:
-        width, height = self.size(name)
+        width, height = self.frame_size
         data = (self.path / name).read_bytes()
         if self._encoding.channels is not None:
             image = np.frombuffer(data, np.uint8).reshape(height, width, self._encoding.channels)
