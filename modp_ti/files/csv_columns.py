@@ -88,11 +88,11 @@ def _blocks(path: Path, file: Iterator[str], columns: Mapping[str, str]) -> Iter
         except (ValueError, OverflowError):
             number, name, value = _first_bad_value(rows, columns, places)
             raise InputError(f"{path}:{line + number}: {name} is {value!r:.40}, not a number") from None
-        for name in columns:
-            if table.dtype[name].kind == "f" and not (np.abs(table[name]) <= LARGEST).all():
-                number = int(np.flatnonzero(~(np.abs(table[name]) <= LARGEST))[0])
+        for name in (name for name in columns if table.dtype[name].kind == "f"):
+            bad = np.flatnonzero(~(np.abs(table[name]) <= LARGEST))
+            if len(bad):
                 raise InputError(
-                    f"{path}:{line + number}: {name} is NaN or infinite, or beyond {LARGEST:g}; take the line out"
+                    f"{path}:{line + bad[0]}: {name} is NaN or infinite, or beyond {LARGEST:g}; take the line out"
                 )
         yield line, table
         line += len(rows)

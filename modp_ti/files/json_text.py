@@ -36,7 +36,7 @@ def read_json(path: Path, setting: str) -> Any:
     return parse_json(text, str(path))
 
 
-def parse_json(text: str, name: str, line: int | None = None) -> Any:
+def parse_json(text: str, name: str, line: int = 1) -> Any:
     """Parse a JSON text.
 
     Numbers beyond the range of float64 become infinite, and `NaN` and `Infinity` are accepted. The caller must check
@@ -45,24 +45,23 @@ def parse_json(text: str, name: str, line: int | None = None) -> Any:
     Args:
         text: The JSON text.
         name: Name of the file, for the error message.
-        line: Line of the file at which the text starts, for the error message; None for the first.
+        line: Line of the file at which the text starts, for the error message.
 
     Raises:
         InputError: With the line, if the text is not valid JSON or is nested deeper than `MAX_DEPTH`.
     """
-    first = 1 if line is None else line
-    _require_shallow(text, name, first)
+    _require_shallow(text, name, line)
     try:
-        data = json.loads(text, parse_int=_whole_number)
+        data = json.loads(text, parse_int=lambda digits: (int if len(digits) <= DIGITS else float)(digits))
         if HALF_CHARACTER.search(text):
             json.dumps(data, ensure_ascii=False).encode()
         return data
     except json.JSONDecodeError as error:
-        raise _invalid(name, first + error.lineno - 1, error.msg) from None
+        raise _invalid(name, line + error.lineno - 1, error.msg) from None
     except UnicodeEncodeError:
-        raise _invalid(name, first, "it holds half a character (a surrogate)") from None
+        raise _invalid(name, line, "it holds half a character (a surrogate)") from None
     except (ValueError, RecursionError) as error:
-        raise _invalid(name, first, str(error)) from None
+        raise _invalid(name, line, str(error)) from None
 
 
 def _require_shallow(text: str, name: str, first: int) -> None:
@@ -79,7 +78,3 @@ def _require_shallow(text: str, name: str, first: int) -> None:
 
 def _invalid(name: str, line: int, reason: str) -> InputError:
     return InputError(f"{name}:{line}: not valid JSON: {reason}; the file is cut off or damaged")
-
-
-def _whole_number(digits: str) -> int | float:
-    return int(digits) if len(digits) <= DIGITS else float(digits)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.association import MAX_DIFFERENCE, associate
-from modp_ti.inputs.trackers.trajectory import TimedPoses, read_trajectory_file
+from modp_ti.inputs.trackers.trajectory import MAX_DIFFERENCE, TimedPoses, associate, read_trajectory_file
 
 __all__ = ["open_ground_truth", "true_poses"]
 
@@ -43,9 +42,8 @@ def true_poses(truth: TimedPoses, timestamps: Sequence[float]) -> tuple[list[NDA
         frames have one. And a note for the user if frames have none.
     """
     pairs = associate(timestamps, truth.times, MAX_DIFFERENCE)
-    if len(pairs) == len(timestamps):
-        note = None
-    else:
+    note = None
+    if len(pairs) < len(timestamps):
         note = (
             f"{len(timestamps) - len(pairs)} of {len(timestamps)} frames have no pose in {truth.path} within "
             f"{MAX_DIFFERENCE:g} s: not in the trajectory errors"

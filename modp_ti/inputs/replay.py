@@ -19,13 +19,12 @@ from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 __all__ = [
     "PosedImage",
     "ReplayedTracker",
+    "Unreadable",
     "checked_pose",
     "is_held_out",
     "points_inside",
-    "require_few",
-    "require_fitting_sizes",
-    "unmasked",
-    "unreadable_note",
+    "readable_sizes",
+    "tracked_frame",
 ]
 
 # Largest deviation of R^T R from the identity. Rounding in text files stays below it.
@@ -61,25 +60,17 @@ class ReplayedTracker(Tracker):
     Args:
         reader: Reads and undistorts the images.
         frames: The images with their poses and points.
-        source: Source settings; `holdout` is used.
         notes: Remarks for the user, followed by those of the image source.
     """
 
     reads_ahead: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        reader: FrameReader,
-        frames: Sequence[PosedImage],
-        source: SourceSettings,
-        notes: Iterable[str] = (),
-    ) -> None:
+    def __init__(self, reader: FrameReader, frames: Sequence[PosedImage], notes: Iterable[str] = ()) -> None:
         self.frames = tuple(frames)
         self._notes = [*notes, *reader.images.notes]
-        self._unreadable: dict[str, UnreadableImageError] = {}
+        self._unreadable = Unreadable()
         self._noted = False
         self._reader = reader
-        self._source = source
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -112,53 +103,80 @@ class ReplayedTracker(Tracker):
         index = -1
         for place, frame in enumerate(self.frames):
             try:
-                picture = self._reader.read(frame.name, frame.undistorter)
+                tracked = tracked_frame(self._reader, index + 1, frame, place)
             except UnreadableImageError as error:
-                self._unreadable[frame.name] = error
-                require_few(list(self._unreadable.values()), len(self.frames))
+                self._unreadable.add(frame.name, error, len(self.frames))
                 continue
             index += 1
-            yield TrackedFrame(
-                index=index,
-                timestamp=self._reader.images.timestamp(frame.name),
-                name=frame.name,
-                image=picture.image,
-                camera=frame.undistorter.camera,
-                T_camera_world=frame.T_camera_world,
-                points=unmasked(frame.points, picture.mask),
-                mask=picture.mask,
-                vignette=picture.vignette,
-                held_out=is_held_out(place, self._source),
-            )
+            yield tracked
         if self._unreadable and not self._noted:
             self._noted = True
-            self._notes.append(unreadable_note(list(self._unreadable.values()), len(self.frames)))
+            self._notes.append(self._unreadable.note(len(self.frames)))
 
 
-def require_few(unreadable: Sequence[UnreadableImageError], count: int) -> None:
-    """Raise the first error if more than a share `FEW` of `count` images are unreadable."""
-    if len(unreadable) > FEW * count:
-        raise unreadable[0]
+class Unreadable(dict[str, UnreadableImageError]):
+    """Damaged images that were skipped, by name, with the error of each."""
+
+    def add(self, name: str, error: UnreadableImageError, count: int) -> None:
+        """Add an image. Raises the first error if more than a share `FEW` of `count` images are unreadable."""
+        self[name] = error
+        if len(self) > FEW * count:
+            raise next(iter(self.values()))
+
+    def note(self, count: int) -> str:
+        """Return a remark on the images that were skipped, of `count` images."""
+        first = str(next(iter(self.values()))).partition(";")[0]
+        return f"{len(self)} of {count} images are damaged: left out (the first: {first})"
 
 
-def unreadable_note(unreadable: Sequence[UnreadableImageError], count: int) -> str:
-    """Return a remark on the images that were skipped."""
-    first = str(unreadable[0]).partition(";")[0]
-    return f"{len(unreadable)} of {count} images are damaged: left out (the first: {first})"
+def readable_sizes(images: ImageSource, names: Sequence[str]) -> Iterator[tuple[str, tuple[int, int]]]:
+    """Yield name and size (width, height) of each image, from its header. Damaged images are skipped.
+
+    Raises:
+        UnreadableImageError: If more than a share `FEW` of the images are unreadable.
+    """
+    unreadable = Unreadable()
+    for name in names:
+        try:
+            size = images.size(name)
+        except UnreadableImageError as error:
+            unreadable.add(name, error, len(names))
+        else:
+            yield name, size
 
 
-def unmasked(points: SparsePoints, mask: NDArray[np.bool_] | None) -> SparsePoints:
-    """Return the points whose pixels are valid.
+def tracked_frame(
+    reader: FrameReader, index: int, frame: PosedImage, place: int | None = None, raw: NDArray[np.uint8] | None = None
+) -> TrackedFrame:
+    """Decode a posed image to the frame that a tracker delivers. Points on masked pixels are dropped.
 
     Args:
-        points: Points; all pixels must lie inside the image.
-        mask: Validity (H, W) of the pixels, or None if all are valid.
+        reader: Reads and undistorts the image.
+        index: Index of the delivered frame.
+        frame: The image with its pose and points, whose pixels must lie inside the image.
+        place: Position that decides whether the frame is held out; `index` if None.
+        raw: The stored image (H0, W0, 3), if it is already decoded.
+
+    Raises:
+        InputError: If the image or its mask is unreadable.
     """
-    if mask is None:
-        return points
-    column, row = np.floor(points.pixels).astype(int).T
-    kept = mask[row, column]
-    return SparsePoints(points.xyz[kept], points.pixels[kept], points.ids[kept])
+    picture, points = reader.read(frame.name, frame.undistorter, raw), frame.points
+    if picture.mask is not None:
+        column, row = np.floor(points.pixels).astype(int).T
+        kept = picture.mask[row, column]
+        points = SparsePoints(points.xyz[kept], points.pixels[kept], points.ids[kept])
+    return TrackedFrame(
+        index=index,
+        timestamp=reader.images.timestamp(frame.name),
+        name=frame.name,
+        image=picture.image,
+        camera=frame.undistorter.camera,
+        T_camera_world=frame.T_camera_world,
+        points=points,
+        mask=picture.mask,
+        vignette=picture.vignette,
+        held_out=is_held_out(index if place is None else place, reader.source),
+    )
 
 
 def is_held_out(index: int, source: SourceSettings) -> bool:
@@ -198,47 +216,6 @@ def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
     pose[:3, :3] = u @ vt
     pose[:3, 3] = translation
     return pose
-
-
-def require_fitting_sizes(images: ImageSource, frames: Sequence[tuple[str, Undistorter]], intrinsics: str) -> None:
-    """Check that the size of each image matches its camera.
-
-    Only image headers are read, so that a run with wrong intrinsics fails at its start.
-
-    Args:
-        images: The image source.
-        frames: Name and undistorter of each image.
-        intrinsics: Origin of the cameras, for the error message.
-
-    Raises:
-        InputError: If an image differs from its camera in size.
-        UnreadableImageError: If more than a share `FEW` of the images are unreadable.
-    """
-    unreadable = []
-    for name, undistorter in frames:
-        raw = undistorter.raw
-        try:
-            width, height = images.size(name)
-        except UnreadableImageError as error:
-            unreadable.append(error)
-            require_few(unreadable, len(frames))
-            continue
-        if (width, height) == (raw.width, raw.height):
-            continue
-        advice = "give source.path the images that belong to these intrinsics"
-        ratio = width / raw.width
-        if (width, height) == (raw.height, raw.width):
-            advice = "the image lies on its side: turn the pixels (an EXIF orientation is not applied)"
-        elif abs(ratio * raw.height - height) <= 1.0:
-            advice = (
-                f"the image is the same view at {ratio:.4g} of the size: {advice}"
-                + (f" and set source.scale: {ratio:.4g}" if ratio < 1 else "")
-                + f", or multiply the intrinsics and the size in {intrinsics} by {ratio:.4g}"
-            )
-        raise InputError(
-            f"{images.path / name} is {width}x{height}, its camera in {intrinsics} is "
-            f"{raw.width}x{raw.height}; {advice}"
-        )
 
 
 def points_inside(

@@ -99,7 +99,7 @@ def _aria(file: Path) -> None:
     from modp_ti.inputs.trackers import aria_mps
 
     if file.name == "closed_loop_trajectory.csv":
-        aria_mps.read_closed_loop(file)
+        aria_mps.read_device_trajectory(file, open_loop=False)
     elif file.suffix == ".jsonl":
         aria_mps.read_calibration(file, "camera-rgb")
     elif file.name == "semidense_points.csv.gz":
@@ -117,7 +117,7 @@ def _stella(file: Path) -> None:
 def _image(file: Path) -> None:
     from modp_ti.inputs.sources.image_header import focal_length_35mm
     from modp_ti.inputs.sources.listed_images import ListedImages
-    from modp_ti.inputs.sources.vignette import read_vignette
+    from modp_ti.inputs.sources.masks import read_vignette
 
     images = ListedImages(file.parent, [file.name], [0.0])
     focal_length_35mm(file)
@@ -191,6 +191,7 @@ class _Wire(socket.socket):
 
 def _tracker_server(file: Path) -> None:
     """Run a whole conversation, up to what is passed to the mapper."""
+    from modp_ti.config.settings import SourceSettings
     from modp_ti.inputs.tracker_server import messages
     from modp_ti.inputs.tracker_server.connection import Connection, SenderGoneError
     from modp_ti.inputs.tracker_server.ordering import Ordering
@@ -207,7 +208,7 @@ def _tracker_server(file: Path) -> None:
             if kind is messages.Kind.HELLO:
                 hello = messages.parse_hello(payload)
                 hello.intrinsics.undistorter(1.0)
-                spool = Spool(hello)
+                spool = Spool(hello, SourceSettings())
             elif kind is messages.Kind.CORRECTION:
                 ordering.add_correction(messages.parse_correction(payload))
             else:
@@ -260,7 +261,7 @@ READERS: dict[str, Reader] = {
 
 def import_readers() -> None:
     """Import every module that the readers use, once for all forked processes."""
-    kinds = ("aria", "colmap", "modp", "replica", "stella_vslam", "transforms", "tum")
+    kinds = ("aria", "colmap", "data_sets", "modp", "stella_vslam", "transforms", "tum")
     for name in (
         *(
             "config.scene_file",
@@ -271,10 +272,10 @@ def import_readers() -> None:
         ),
         *(
             "outputs.playback.finished_run",
-            "inputs.sources.exif",
+            "inputs.sources.image_header",
             "inputs.sources.tum_rgbd",
             "inputs.sources.video_decoder",
-            "inputs.sources.vignette",
+            "inputs.sources.masks",
         ),
         *(f"inputs.trackers.{kind}" for kind in kinds),
         "inputs.tracker_server",

@@ -104,7 +104,8 @@ def epipolar_score(
     for pair in pairs:
         camera_a, camera_b = convention.camera(cameras[pair.a]), convention.camera(cameras[pair.b])
         T_a, T_b = convention.pose(poses[pair.a]), convention.pose(poses[pair.b])
-        x_a, x_b = _rays(camera_a, pair.pixels_a), _rays(camera_b, pair.pixels_b)
+        ones = np.ones(len(pair.pixels_a))
+        x_a, x_b = camera_a.unproject(pair.pixels_a, ones), camera_b.unproject(pair.pixels_b, ones)
         E = essential_matrix(T_a, T_b)
         if np.linalg.norm(E) == 0:
             continue  # pure rotation has no epipolar geometry
@@ -118,10 +119,6 @@ def epipolar_score(
     if len(fitting) == 0:
         return EpipolarScore(0.0, float("nan"), 0)
     return EpipolarScore(float(fitting.mean()), float(np.median(error)), len(fitting))
-
-
-def _rays(camera: PinholeCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    return camera.unproject(pixels, np.ones(len(pixels)))
 
 
 def _before_both(x_a: NDArray[np.float64], x_b: NDArray[np.float64], T_b_a: NDArray[np.float64]) -> NDArray[np.bool_]:

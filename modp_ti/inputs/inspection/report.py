@@ -61,7 +61,7 @@ def as_json(report: Report) -> dict[str, Any]:
     camera = frames[0].camera
     points = np.array([frame.points for frame in frames])
     steps = np.diff([frame.timestamp for frame in frames])
-    data |= {
+    return data | {
         "frames": len(frames),
         "held_out": sum(frame.held_out for frame in frames),
         "size": [camera.width, camera.height],
@@ -71,9 +71,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "masked": _number(np.mean([frame.masked for frame in frames])),
         "seconds": _number(frames[-1].timestamp - frames[0].timestamp),
         "seconds_between_frames": _number(np.median(steps)) if len(steps) else None,
-        "time_gaps": [frames[i].name for i in time_gaps(frames)],
-        "blurred": [frames[i].name for i in blurred(frames)],
-        "duplicates": [frames[i].name for i in duplicates(frames)],
+        **{check.__name__: [frames[i].name for i in check(frames)] for check in (time_gaps, blurred, duplicates)},
         "points": {"median": int(np.median(points)), "least": int(points.min()), "most": int(points.max())},
         "scale": {
             "depth": _number(report.scale.depth),
@@ -93,7 +91,6 @@ def as_json(report: Report) -> dict[str, Any]:
         "matched_features": report.geometry.epipolar[CONVENTIONS[0]].matches,
         "observations": report.geometry.points,
     }
-    return data
 
 
 def print_report(report: Report, console: Console) -> None:

@@ -83,7 +83,9 @@ def survey(frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[in
     result = Survey()
     errors: dict[Convention, list[NDArray[np.float32]]] = {c: [] for c in CONVENTIONS}
     features: dict[int, Features] = {}
-    anchors = None if total is None else set(np.linspace(0, max(total - 1 - GAPS[-1], 0), PLACES).astype(int).tolist())
+    anchors = range(0, PLACES * LIVE_SPACING, LIVE_SPACING)
+    if total is not None:
+        anchors = set(np.linspace(0, max(total - 1 - GAPS[-1], 0), PLACES).astype(int).tolist())
     before: NDArray[np.float32] | None = None
     for place, frame in enumerate(frames):
         rgb = np.ascontiguousarray(frame.rgba[..., :3])
@@ -93,7 +95,7 @@ def survey(frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[in
         for convention in CONVENTIONS:
             errors[convention].append(_reprojection_errors(frame, convention))
 
-        wanted = [a for a in range(max(place - GAPS[-1], 0), place + 1) if _is_anchor(a, anchors)]
+        wanted = [a for a in range(max(place - GAPS[-1], 0), place + 1) if a in anchors]
         if any(place - a in (0, *GAPS) for a in wanted):
             features[place] = detect_features(rgb)
         for a in wanted:
@@ -105,12 +107,6 @@ def survey(frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[in
         seen(place + 1)
     result.reprojection = {c: np.concatenate([np.zeros(0, np.float32), *each]) for c, each in errors.items()}
     return result
-
-
-def _is_anchor(place: int, anchors: set[int] | None) -> bool:
-    if anchors is None:
-        return place % LIVE_SPACING == 0 and place < PLACES * LIVE_SPACING
-    return place in anchors
 
 
 def _record(

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.tracking import FOCAL_FROM
@@ -65,14 +64,10 @@ def estimated_intrinsics(
     if tracking is None or len(tracking.map.keyframes) < FOCAL_FROM:
         return None, used
     tracking.refine_camera()
-    return _believable(tracking.map, width, height), used
-
-
-def _believable(landmarks: LandmarkMap, width: int, height: int) -> Intrinsics | None:
-    """The map's camera, scaled to the stored size; None if its values are implausible."""
-    focal, _, _, k = (float(value) for value in landmarks.lens.camera.params)
-    focal *= width / landmarks.lens.width
+    lens = tracking.map.lens
+    focal, _, _, k = (float(value) for value in lens.camera.params)
+    focal *= width / lens.width
     if not LEAST_FOCAL < focal / max(width, height) < LARGEST_FOCAL or not abs(k) < LARGEST_DISTORTION:
-        return None
+        return None, used
     distortion = Distortion(numerator=(k,)) if k else NO_DISTORTION
-    return Intrinsics(PinholeCamera(focal, focal, width / 2, height / 2, width, height), distortion)
+    return Intrinsics(PinholeCamera(focal, focal, width / 2, height / 2, width, height), distortion), used

@@ -7,15 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
 from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.relocalisation import describe
-from modp_ti.inputs.klt.two_view import two_views
-from modp_ti.inputs.multiview.camera_pose import pose_from_points
+from modp_ti.inputs.klt.two_view import TwoViews, two_views
 from modp_ti.inputs.multiview.features import match_anywhere
-from modp_ti.inputs.multiview.reprojection import ray_errors
+from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
 
 __all__ = ["Initialisation"]
 
@@ -90,7 +88,7 @@ class Initialisation:
             pair = two_views(lens, pixels_a, pixels_b, least, self._seed)
             if pair is None:
                 continue
-            landmarks, cost = self._mapped(lens, first, frame, share, pair.T_b_a, pair.xyz, pair.good)
+            landmarks, cost = self._mapped(lens, first, share, pair)
             if landmarks is not None and cost < best_cost:
                 best, best_cost = landmarks, cost
         return best
@@ -111,22 +109,16 @@ class Initialisation:
         return best
 
     def _mapped(
-        self,
-        lens: Lens,
-        first: int,
-        frame: Frame,
-        share: NDArray[np.int64],
-        T_b_a: NDArray[np.float64],
-        xyz: NDArray[np.float64],
-        good: NDArray[np.bool_],
+        self, lens: Lens, first: int, share: NDArray[np.int64], pair: TwoViews
     ) -> tuple[LandmarkMap | None, float]:
         """Build the map of a pair and of frames between, with its cost; None if it is inconsistent."""
         landmarks = LandmarkMap(lens)
         landmarks.new_ids(self._count)
-        scale = 1.0 / float(np.median(xyz[good, 2]))  # the median depth becomes 1
-        landmarks.xyz[share[good]] = scale * xyz[good]
-        landmarks.known[share[good]] = True
-        T_last = T_b_a.copy()
+        ids, xyz = share[pair.good], pair.xyz[pair.good]
+        scale = 1.0 / float(np.median(xyz[:, 2]))  # the median depth becomes 1
+        landmarks.xyz[ids] = scale * xyz
+        landmarks.known[ids] = True
+        T_last = pair.T_b_a.copy()
         T_last[:3, 3] *= scale
         last = len(self.frames) - 1
         middle = np.unique(np.linspace(first, last, BETWEEN + 2).round().astype(int)[1:-1])
@@ -140,20 +132,19 @@ class Initialisation:
             found = pose_from_points(landmarks.xyz[other.ids[known]], rays, 3.0 / lens.focal, self._seed)
             if found is not None and found[1].sum() >= max(FEWEST_SHARED // 2, 0.5 * known.sum()):
                 poses[int(i)] = found[0]
-        order = sorted(poses)
-        for i in order:
+        for i in sorted(poses):
             seen = self.frames[i]
             pixels = seen.pixels.copy()
             keyframe = Keyframe(seen.number, poses[i], seen.grey, seen.ids.copy(), pixels, lens.rays(pixels))
             landmarks.add_keyframe(keyframe)
-        every = range(len(order))
+        every = range(len(poses))
         for _ in range(2):
-            if not np.isfinite(adjust_bundle(landmarks, every, steps=30)):
+            if not np.isfinite(landmarks.adjust(every, steps=30)):
                 return None, np.inf
             landmarks.discard_outliers(every)
             for k in every:
                 landmarks.triangulate(k)
-        cost = adjust_bundle(landmarks, every, steps=15)
+        cost = landmarks.adjust(every, steps=15)
         landmarks.discard_outliers(every)
         if not self._holds(landmarks, len(share)):
             return None, np.inf
@@ -162,12 +153,11 @@ class Initialisation:
     @staticmethod
     def _holds(landmarks: LandmarkMap, shared: int) -> bool:
         """Whether the map keeps enough landmarks and has a median reprojection error below 1 px."""
-        _, _, ids = landmarks.observations([len(landmarks.keyframes) - 1])
+        _, ids, _ = landmarks.observations([len(landmarks.keyframes) - 1])
         if len(ids) < max(FEWEST_SHARED // 2, 0.5 * shared):
             return False
         errors = []
-        for k in range(len(landmarks.keyframes)):
-            keyframe = landmarks.keyframes[k]
+        for keyframe in landmarks.keyframes:
             known = landmarks.known[keyframe.ids]
             errors.append(ray_errors(keyframe.T_camera_world, landmarks.xyz[keyframe.ids[known]], keyframe.rays[known]))
         return bool(np.median(np.concatenate(errors)) * landmarks.lens.focal < 1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
@@ -99,17 +100,8 @@ class LandmarkMap:
         self._count += count
         if self._count > len(self.known):
             extra = max(self._count, 2 * len(self.known), 1024) - len(self.known)
-            for name, value in (
-                ("xyz", 0.0),
-                ("known", False),
-                ("first", -1),
-                ("first_pixel", 0.0),
-                ("last", -1),
-                ("last_pixel", 0.0),
-                ("looked", 0),
-                ("found", 0),
-            ):
-                array = getattr(self, name)
+            for name in ("xyz", "known", "first", "first_pixel", "last", "last_pixel", "looked", "found"):
+                array, value = getattr(self, name), -1 if name in ("first", "last") else 0
                 setattr(self, name, np.concatenate([array, np.full((extra, *array.shape[1:]), value, array.dtype)]))
         return ids
 
@@ -127,26 +119,22 @@ class LandmarkMap:
         late = self.last[ids] <= k
         self.last[ids[late]], self.last_pixel[ids[late]] = k, pixels[late]
 
-    def use_lens(self, lens: Lens) -> None:
-        """Replace the camera and recompute the rays of all observations."""
-        self.lens = lens
-        for keyframe in self.keyframes:
-            keyframe.rays = lens.rays(keyframe.pixels)
-
-    def observations(self, keyframes: Iterable[int]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def observations(
+        self, keyframes: Iterable[int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Observations of landmarks in these keyframes.
 
         Returns:
-            Keyframe, index within the keyframe, and landmark id of each observation, (M,) each.
+            Keyframe (M,), landmark id (M,) and pixel (M, 2) of each observation.
         """
-        nothing = np.zeros(0, dtype=np.int64)
-        of, place, ids = [nothing], [nothing], [nothing]
+        of, ids, pixels = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
         for k in keyframes:
-            slots = np.flatnonzero(self.known[self.keyframes[k].ids])
-            of.append(np.full(len(slots), k))
-            place.append(slots)
-            ids.append(self.keyframes[k].ids[slots])
-        return np.concatenate(of), np.concatenate(place), np.concatenate(ids)
+            keyframe = self.keyframes[k]
+            known = self.known[keyframe.ids]
+            ids.append(keyframe.ids[known])
+            pixels.append(keyframe.pixels[known])
+            of.append(np.full(len(ids[-1]), k))
+        return np.concatenate(of), np.concatenate(ids), np.concatenate(pixels)
 
     def triangulate(self, k: int) -> NDArray[np.int64]:
         """Triangulate features of keyframe k with their first observation. Returns the ids of the new landmarks."""
@@ -192,6 +180,41 @@ class LandmarkMap:
         for k, keyframe in enumerate(self.keyframes):
             slots = np.flatnonzero(lost[keyframe.ids])
             self.note_observations(k, keyframe.ids[slots], keyframe.pixels[slots])
+
+    def adjust(
+        self, free: Sequence[int], held: Sequence[int] = (), steps: int = 10, refined: Collection[Refinable] = ()
+    ) -> float:
+        """Minimise the robust reprojection error over keyframes and the landmarks that they see, in place.
+
+        Args:
+            free: Keyframes whose poses are optimised.
+            held: Keyframes that take part with fixed poses. Without any, the first two of `free` fix the gauge.
+            steps: Levenberg-Marquardt steps at most.
+            refined: Parts of the camera that are optimised too.
+
+        Returns:
+            The mean cost per observation [px^2 / 2]; infinite if there are too few observations.
+        """
+        views = sorted({*free, *held})
+        of, ids, pixels = self.observations(views)
+        wanted = np.zeros(len(self.known), dtype=bool)
+        wanted[ids[np.isin(of, free)]] = True
+        used = wanted[ids] & (np.bincount(ids, minlength=len(wanted))[ids] >= 2)
+        of, ids, pixels = of[used], ids[used], pixels[used]
+        if len(ids) < 12:
+            return float("inf")
+        poses = {k: self.keyframes[k].T_camera_world for k in views}
+        bundle = adjusted_bundle(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
+        if bundle is None:
+            return float("inf")
+        for k, T in bundle.poses.items():
+            self.keyframes[k].T_camera_world[:3] = T[:3]
+        self.xyz[bundle.points] = bundle.xyz
+        if refined:
+            self.lens = Lens(bundle.camera)
+            for keyframe in self.keyframes:
+                keyframe.rays = self.lens.rays(keyframe.pixels)
+        return bundle.cost
 
 
 def triangulated(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.optical_flow import BORDER
 from modp_ti.inputs.klt.patch_alignment import align_landmarks, reference_views
-from modp_ti.inputs.multiview.camera_pose import pose_from_points
-from modp_ti.inputs.multiview.reprojection import ray_errors, refine_pose
+from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 
 __all__ = ["FEWEST", "MAX_ERROR", "SIGMA", "localised", "realigned", "searched"]
 
@@ -19,27 +19,24 @@ FEWEST = 20  # fewest landmarks for a pose
 SEARCHED = 300  # landmarks of the map that are searched for in a keyframe, at most
 
 
-def localised(
-    landmarks: LandmarkMap, ids: NDArray[np.int64], pixels: NDArray[np.float64], T_guess: NDArray[np.float64], seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+def localised(landmarks: LandmarkMap, frame: Frame, T_guess: NDArray[np.float64], seed: int) -> LocalisedFrame | None:
     """Localise a frame by its features.
 
     Args:
         landmarks: The map.
-        ids: (N,) features of the frame.
-        pixels: (N, 2) their positions.
+        frame: The frame.
         T_guess: (4, 4) initial T_camera_world.
         seed: Seed of RANSAC, which runs if too few landmarks agree with the pose refined from `T_guess`.
 
     Returns:
-        T_camera_world (4, 4), and a mask (N,) of the features to keep: inlier landmarks and all features that are not
-        triangulated. None if too few landmarks agree.
+        The frame with its pose, with the inlier landmarks and all features that are not triangulated. None if too few
+        landmarks agree.
     """
-    known = np.flatnonzero(landmarks.known[ids])
+    known = np.flatnonzero(landmarks.known[frame.ids])
     if len(known) < FEWEST:
         return None
     focal = landmarks.lens.focal
-    xyz, rays = landmarks.xyz[ids[known]], landmarks.lens.rays(pixels[known])
+    xyz, rays = landmarks.xyz[frame.ids[known]], landmarks.lens.rays(frame.pixels[known])
     T = refine_pose(T_guess, xyz, rays, SIGMA / focal)
     good = ray_errors(T, xyz, rays) * focal < MAX_ERROR
     if good.sum() < 0.7 * len(known):
@@ -49,33 +46,21 @@ def localised(
             good = ray_errors(T, xyz, rays) * focal < MAX_ERROR
     if good.sum() < max(FEWEST, 0.3 * len(known)):
         return None
-    kept = np.ones(len(ids), dtype=bool)
+    kept = np.ones(len(frame.ids), dtype=bool)
     kept[known] = good
-    return T, kept
+    return LocalisedFrame(frame.number, frame.grey, frame.valid, frame.ids[kept], frame.pixels[kept], T_camera_world=T)
 
 
-def searched(
-    landmarks: LandmarkMap,
-    T: NDArray[np.float64],
-    grey: NDArray[np.uint8],
-    ids: NDArray[np.int64],
-    pixels: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Search an image for landmarks of the map that should be visible but are not tracked.
-
-    Args:
-        landmarks: The map.
-        T: (4, 4) T_camera_world of the image.
-        grey: (H, W) uint8.
-        ids: (N,) features that are already tracked.
-        pixels: (N, 2) their positions.
+def searched(landmarks: LandmarkMap, frame: LocalisedFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Search a frame for landmarks of the map that should be visible but are not tracked.
 
     Returns:
         Ids (M,) of the landmarks that were found, and their pixels (M, 2).
     """
-    height, width = grey.shape
+    T = frame.T_camera_world
+    height, width = frame.grey.shape
     candidate = landmarks.known.copy()
-    candidate[ids] = False
+    candidate[frame.ids] = False
     candidate &= (landmarks.looked < 4) | (landmarks.found > 0.25 * landmarks.looked)
     candidate = np.flatnonzero(candidate)
     at = landmarks.lens.pixels(landmarks.xyz[candidate] @ T[:3, :3].T + T[:3, 3])
@@ -88,36 +73,23 @@ def searched(
     candidate, at, keyframe, pixel = candidate[visible], at[visible], keyframe[visible], pixel[visible]
     chosen = _spread(at, SEARCHED, width, height, landmarks.found[candidate])
     candidate, at, keyframe, pixel = candidate[chosen], at[chosen], keyframe[chosen], pixel[chosen]
-    there, found = align_landmarks(landmarks, candidate, keyframe, pixel, grey, T, at)
+    there, found = align_landmarks(landmarks, candidate, keyframe, pixel, frame.grey, T, at)
     landmarks.looked[candidate] += 1
     landmarks.found[candidate[found]] += 1
     return candidate[found], there[found]
 
 
-def realigned(
-    landmarks: LandmarkMap,
-    T: NDArray[np.float64],
-    grey: NDArray[np.uint8],
-    ids: NDArray[np.int64],
-    pixels: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Remove the drift of tracked landmarks by aligning them with patches of earlier keyframes.
-
-    Args:
-        landmarks: The map.
-        T: (4, 4) T_camera_world of the image.
-        grey: (H, W) uint8.
-        ids: (N,) tracked features.
-        pixels: (N, 2) their positions.
+def realigned(landmarks: LandmarkMap, frame: LocalisedFrame) -> NDArray[np.float64]:
+    """Remove the drift of a frame's landmarks by aligning them with patches of earlier keyframes.
 
     Returns:
-        Corrected positions (N, 2). Features without a successful alignment keep theirs.
+        Corrected positions (N, 2) of its N features. Those without a successful alignment keep theirs.
     """
-    pixels = pixels.copy()
-    known = np.flatnonzero(landmarks.known[ids])
-    keyframe, pixel, visible = reference_views(landmarks, ids[known], T)
+    T, pixels = frame.T_camera_world, frame.pixels.copy()
+    known = np.flatnonzero(landmarks.known[frame.ids])
+    keyframe, pixel, visible = reference_views(landmarks, frame.ids[known], T)
     known, keyframe, pixel = known[visible], keyframe[visible], pixel[visible]
-    there, found = align_landmarks(landmarks, ids[known], keyframe, pixel, grey, T, pixels[known])
+    there, found = align_landmarks(landmarks, frame.ids[known], keyframe, pixel, frame.grey, T, pixels[known])
     near = found & (np.linalg.norm(there - pixels[known], axis=1) < MAX_ERROR)
     pixels[known[near]] = there[near]
     return pixels

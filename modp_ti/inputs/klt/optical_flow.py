@@ -46,14 +46,11 @@ def flow(
     options = {
         "winSize": WINDOW,
         "maxLevel": _levels(before),
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
     }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, start, there.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
-    )
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(
-        after, before, there, start.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
-    )
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, there.copy(), **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, start.copy(), **options)
     found = (found[:, 0] > 0) & (returned[:, 0] > 0) & np.isfinite(there).all(axis=(1, 2))
     found &= np.linalg.norm(back - start, axis=(1, 2)) < ROUND_TRIP
     result = there[:, 0].astype(np.float64) + 0.5

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.multiview.camera_pose import pose_from_points
 from modp_ti.inputs.multiview.features import Features, detect_features, essential_matrix, match_anywhere
+from modp_ti.inputs.multiview.reprojection import pose_from_points
 
 __all__ = ["alike_keyframes", "describe", "inherited", "place_by_features", "thumbnail"]
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised
-from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, localised, realigned, searched
@@ -103,17 +102,11 @@ class Tracking:
             frame: The frame.
             T_guess: (4, 4) initial T_camera_world.
         """
-        found = localised(self.map, frame.ids, frame.pixels, T_guess, self._seed)
-        if found is None:
-            return None
-        T, kept = found
-        return LocalisedFrame(
-            frame.number, frame.grey, frame.valid, frame.ids[kept], frame.pixels[kept], T_camera_world=T
-        )
+        return localised(self.map, frame, T_guess, self._seed)
 
     def search(self, frame: LocalisedFrame) -> None:
         """Add further landmarks of the map to the frame's features."""
-        frame.append(*searched(self.map, frame.T_camera_world, frame.grey, frame.ids, frame.pixels))
+        frame.append(*searched(self.map, frame))
 
     def view_of_keyframe(self, k: int) -> View:
         """The view of keyframe k."""
@@ -173,7 +166,7 @@ class Tracking:
 
     def _make_keyframe(self, frame: LocalisedFrame) -> View:
         """Make the last frame a keyframe: realign its landmarks, search for more, and adjust the map."""
-        frame.pixels = realigned(self.map, frame.T_camera_world, frame.grey, frame.ids, frame.pixels)
+        frame.pixels = realigned(self.map, frame)
         self.search(frame)
         return self._insert_keyframe(self.localised(frame, frame.T_camera_world) or frame)
 
@@ -207,7 +200,7 @@ class Tracking:
         held = self._companions(free)
         if not held:
             held, free = free[:2], free[2:]
-        adjust_bundle(self.map, free, held, steps=8)
+        self.map.adjust(free, held, steps=8)
         self.map.discard_outliers(free)
 
     def refine_camera(self) -> None:
@@ -216,13 +209,13 @@ class Tracking:
         every = range(count)
         refined: list[Refinable] = ["focal", "distortion"] if count >= DISTORTION_FROM else ["focal"]
         for _ in range(2):
-            adjust_bundle(self.map, every, steps=15, refined=refined)
+            self.map.adjust(every, steps=15, refined=refined)
             self.map.discard_outliers(every)
 
     def _companions(self, free: list[int]) -> list[int]:
         """Other keyframes that share the most landmarks with `free`, at most HELD of them."""
         seen = np.zeros(len(self.map.known), dtype=bool)
-        seen[self.map.observations(free)[2]] = True
+        seen[self.map.observations(free)[1]] = True
         others = [k for k in range(len(self.map.keyframes)) if k not in set(free)]
         shared = {k: int(seen[self.map.keyframes[k].ids].sum()) for k in others}
         closest = sorted(others, key=lambda k: (-shared[k], -k))[:HELD]

@@ -24,14 +24,12 @@ class TwoViews:
         T_b_a: (4, 4), with a translation of length 1.
         xyz: (N, 3) points in the frame of a.
         good: (N,) mask of the reliable points.
-        angle: Median parallax of the good points in degrees.
         planar: Whether the motion comes from a homography.
     """
 
     T_b_a: NDArray[np.float64]
     xyz: NDArray[np.float64]
     good: NDArray[np.bool_]
-    angle: float
     planar: bool
 
 
@@ -78,10 +76,9 @@ def two_views(
     )
     if good.sum() < max(FEWEST, 0.5 * len(pixels_a)):
         return None
-    angle = float(np.degrees(np.median(_angles(T, xyz[good]))))
-    if angle < min_angle:
+    if np.degrees(np.median(_angles(T, xyz[good]))) < min_angle:
         return None
-    return TwoViews(T, xyz, good, angle, found.config == kinds.PLANAR)
+    return TwoViews(T, xyz, good, found.config == kinds.PLANAR)
 
 
 def _angles(T_b_a: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ __all__ = [
     "essential_matrix",
     "match_anywhere",
     "match_features",
+    "shrunk_grey",
 ]
 
 MAX_SIDE = 1000
@@ -67,25 +68,37 @@ def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES) -> Featu
     """
     import cv2
 
-    height, width = image.shape[:2]
-    pixel = max(1.0, max(height, width) / MAX_SIDE)
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    small = (max(1, round(width / pixel)), max(1, round(height / pixel)))
-    if small != (width, height):
-        gray = cv2.resize(gray, small, interpolation=cv2.INTER_AREA)
+    grey, pixel, to_stored = shrunk_grey(image, MAX_SIDE)
     # Without the precise upscale, all keypoints are shifted by a quarter of a pixel to the right and down.
     sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
-    keypoints, raw = sift.detectAndCompute(gray, None)
+    keypoints, raw = sift.detectAndCompute(grey, None)
     if raw is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), pixel)
 
     # In cv2 the first pixel's centre is 0.
     places = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
-    pixels = (places + 0.5) * np.divide((width, height), small)
+    pixels = (places + 0.5) * to_stored
     raw = raw.astype(np.float64)
     root = np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-12))  # RootSIFT
     descriptors = np.clip(np.floor(DESCRIPTOR_NORM * root), 0, 255).astype(np.uint8)
     return Features(pixels, descriptors, pixel)
+
+
+def shrunk_grey(image: NDArray[np.uint8], most: int) -> tuple[NDArray[np.uint8], float, NDArray[np.float64]]:
+    """Convert an image (H, W, 3) uint8 RGB to grey, and reduce a longer side above `most` px to that.
+
+    Returns:
+        The grey image, the size of its pixels in pixels of the image, and the exact ratios (2,) of widths and heights.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    pixel = max(1.0, max(height, width) / most)
+    size = (max(1, round(width / pixel)), max(1, round(height / pixel)))
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if size != (width, height):
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(grey, np.uint8), pixel, np.divide((width, height), size)
 
 
 def essential_matrix(T_a_world: NDArray[np.float64], T_b_world: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.multiview.features import essential_matrix
+from modp_ti.inputs.multiview.features import essential_matrix, shrunk_grey
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage
 from modp_ti.inputs.sources import ImageSource
@@ -50,18 +50,10 @@ class _Picture:
     """A frame for the optical flow: a resized grey image with its camera and pose."""
 
     def __init__(self, images: ImageSource, frame: PosedImage) -> None:
-        import cv2
-
         image = images.read(frame.name)
-        height, width = image.shape[:2]
-        self.pixel = max(1.0, max(height, width) / MAX_SIDE)
-        self.size = (max(1, round(width / self.pixel)), max(1, round(height / self.pixel)))
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        if self.size != (width, height):
-            grey = cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
-        self.grey = grey
+        self.grey, self.pixel, self._to_stored = shrunk_grey(image, MAX_SIDE)
+        self.size = (self.grey.shape[1], self.grey.shape[0])
         self.frame = frame
-        self._to_stored = np.divide((width, height), self.size)
 
     def stored(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
         """Pixels of the stored image, for pixels of the resized image in cv2's convention (first centre at 0)."""
@@ -69,19 +61,13 @@ class _Picture:
 
     def rays(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
         """Normalised coordinates (N, 2) of pixels in the resized image."""
-        camera, undistorter = self.frame.undistorter.camera, self.frame.undistorter
-        return (undistorter.points(self.stored(places)) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        return self.frame.undistorter.rays(self.stored(places))
 
     def places(self, rays: NDArray[np.float64]) -> NDArray[np.float32]:
         """Pixels in the resized image of normalised coordinates (N, 2)."""
         raw = self.frame.undistorter.raw
         pixels = self.frame.undistorter.distortion.distort(rays) * (raw.fx, raw.fy) + (raw.cx, raw.cy)
         return (pixels / self._to_stored - 0.5).astype(np.float32)
-
-    @property
-    def focal(self) -> float:
-        """Focal length in pixels of the resized image."""
-        return self.frame.undistorter.raw.focal / self.pixel
 
 
 def follow_features(
@@ -102,13 +88,14 @@ def follow_features(
         band: Largest distance [px] from the epipolar line.
     """
     chain = np.flatnonzero(solves)
-    seen: list[tuple[int, NDArray[np.int64], NDArray[np.float64]]] = []
+    nothing = np.zeros(0, np.int64)
+    seen = [(nothing, nothing, np.zeros((0, 2)))]  # frames, tracks and pixels
     places, tracks, next_track = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
     before: _Picture | None = None
     pixel = 1.0
 
     def tell(index: int, place: NDArray[np.float32], track: NDArray[np.int64], picture: _Picture) -> None:
-        seen.append((index, track, picture.stored(place)))
+        seen.append((np.full(len(track), index, np.int64), track, picture.stored(place)))
 
     for done, index in enumerate(chain.tolist()):
         picture = _Picture(images, frames[index])
@@ -131,14 +118,8 @@ def follow_features(
         before = picture
         if progress is not None:
             progress("following features", done + 1, len(chain))
-    if not seen:
-        return FollowedFeatures(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), pixel)
-    return FollowedFeatures(
-        np.concatenate([np.full(len(track), index, np.int64) for index, track, _ in seen]),
-        np.concatenate([track for _, track, _ in seen]),
-        np.concatenate([pixels for _, _, pixels in seen]),
-        pixel,
-    )
+    frame, track, pixels = map(np.concatenate, zip(*seen, strict=True))
+    return FollowedFeatures(frame, track, pixels, pixel)
 
 
 def looks_like_video(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
@@ -222,4 +203,4 @@ def _near_line(
     length = np.linalg.norm(lines[:, :2], axis=1)
     off = np.abs((lines * np.c_[rays_other, np.ones(len(rays_other))]).sum(axis=1))
     # Without camera motion there is no epipolar line: both sides are about 0, and the correspondence is accepted.
-    return off * other.focal <= band * np.maximum(length, 1e-12)
+    return off * (other.frame.undistorter.raw.focal / other.pixel) <= band * np.maximum(length, 1e-12)

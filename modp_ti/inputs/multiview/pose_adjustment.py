@@ -94,17 +94,8 @@ def _adjusted_stretch(
     side = int(2 * focal)
     camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=side, height=side, params=[focal, 0.0, 0.0])
     views = np.unique(seen.frame).tolist()
-    bundle = adjusted_bundle(
-        camera,
-        {i: poses[i] for i in views},
-        seen.frame,
-        seen.point,
-        focal * seen.rays,
-        xyz,
-        set(views),
-        STEPS,
-        loss_width,
-    )
+    starts, pixels = {i: poses[i] for i in views}, focal * seen.rays
+    bundle = adjusted_bundle(camera, starts, seen.frame, seen.point, pixels, xyz, set(views), STEPS, loss_width)
     if bundle is None or len(bundle.poses) < len(views):
         return None
     adjusted = np.stack([bundle.poses[i] for i in views])

@@ -62,9 +62,8 @@ def triangulated_frames(
     Returns:
         The frames with points, whose ids are the same in all views. The result depends only on the images and poses.
     """
-    follows = _are_followed(images, frames, solves)
-    seen = _seen(images, frames, solves, follows, EPIPOLAR_BAND, progress)
-    return _with_points(frames, seen, solves, follows)
+    sequence = _Sequence(images, frames, solves, progress)
+    return sequence.with_points(sequence.poses, sequence.seen(EPIPOLAR_BAND))
 
 
 def adjusted_frames(
@@ -88,63 +87,24 @@ def adjusted_frames(
     # Imported here, because readers must not load Taichi.
     from modp_ti.inputs.multiview.pose_adjustment import adjusted_poses
 
-    follows = _are_followed(images, frames, solves)
-    seen = _seen(images, frames, solves, follows, WIDE_BAND, progress)
-    given = poses = np.stack([frame.T_camera_world for frame in frames])
-    if follows:
+    sequence = _Sequence(images, frames, solves, progress)
+    seen = sequence.seen(WIDE_BAND)
+    given = poses = sequence.poses
+    if sequence.follows:
         poses = adjusted_poses(poses, seen, solves, FIRST_GATES)
-        views, most = _views_apart(seen, solves), FEATURES_OF_MANY_FRAMES
-        again = _matched(images, frames, poses, views, solves, most, REVISITED, WIDE_BAND, progress)
+        views = _views_apart(seen, solves)
+        again = sequence.matched(poses, views, FEATURES_OF_MANY_FRAMES, REVISITED, WIDE_BAND)
         poses = adjusted_poses(poses, seen.beside(again), solves, GATES)
     else:
         poses = adjusted_poses(poses, seen, solves, GATES)
     (before, count), (after, _) = (_median_error(each, seen, solves) for each in (given, poses))
-    frames = [replace(frame, T_camera_world=T) for frame, T in zip(frames, poses, strict=True)]
     note = (
         f"the poses are bundle adjusted with {count} points that the images show: median reprojection error "
         f"{before:.2f} px before, {after:.2f} px after (tracker.adjust)"
         if count
         else "the images show too little in common to adjust the poses: they stay as given (tracker.adjust)"
     )
-    return _with_points(frames, seen, solves, follows), note
-
-
-def _are_followed(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
-    return len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
-
-
-def _seen(
-    images: ImageSource,
-    frames: Sequence[PosedImage],
-    solves: NDArray[np.bool_],
-    follows: bool,
-    band: float,
-    progress: Progress | None,
-) -> Observations:
-    """Observations of the frames, from tracked corners or matched features."""
-    if follows:
-        return _followed(images, frames, solves, band, progress)
-    most = MAX_FEATURES if len(frames) <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
-    poses = np.stack([frame.T_camera_world for frame in frames])
-    return _matched(images, frames, poses, np.arange(len(frames)), solves, most, NEIGHBOURS, band, progress)
-
-
-def _with_points(
-    frames: Sequence[PosedImage], seen: Observations, solves: NDArray[np.bool_], follows: bool
-) -> list[PosedImage]:
-    """Triangulate the observations and give each frame its points."""
-    poses = np.stack([frame.T_camera_world for frame in frames])
-    xyz, seen = solve_points(poses, seen, solves)
-    if follows:
-        xyz, seen = surest_points(poses, seen, xyz, solves)
-    result = []
-    for i, frame in enumerate(frames):
-        mine = seen.where(seen.frame == i)
-        camera = frame.undistorter.camera
-        pixels = mine.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        points = points_inside(xyz[mine.point], pixels, mine.point, frame.undistorter, frame.T_camera_world)
-        result.append(frame.with_points(points))
-    return result
+    return sequence.with_points(poses, seen), note
 
 
 def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArray[np.bool_]) -> tuple[float, int]:
@@ -154,66 +114,85 @@ def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArra
     return (float(np.median(errors)) if len(errors) else float("nan")), len(xyz)
 
 
-def _followed(
-    images: ImageSource,
-    frames: Sequence[PosedImage],
-    solves: NDArray[np.bool_],
-    band: float,
-    progress: Progress | None,
-) -> Observations:
-    """Observations of corners tracked along the frames."""
-    found = follow_features(images, frames, solves, progress, band)
-    rays = np.zeros((len(found.frame), 2))
-    for i, frame in enumerate(frames):
-        mine = found.frame == i
-        rays[mine] = _ideal(frame, found.pixels[mine])
-    focal = np.array([frame.undistorter.raw.focal for frame in frames])
-    return Observations(found.frame, found.track, rays, found.pixel / focal[found.frame])
+class _Sequence:
+    """Frames whose features are observed.
 
+    Args:
+        images: Source of the images.
+        frames: The F frames with their poses.
+        solves: (F,) False for held-out frames.
+        progress: Called during the computation.
 
-def _matched(
-    images: ImageSource,
-    frames: Sequence[PosedImage],
-    poses: NDArray[np.float64],
-    views: NDArray[np.int64],
-    solves: NDArray[np.bool_],
-    most: int,
-    neighbours: int,
-    band: float,
-    progress: Progress | None,
-) -> Observations:
-    """Observations of SIFT features, at most `most` per view, matched between neighbouring frames of `views` (V,)."""
-    features: list[Features] = []
-    rays: list[NDArray[np.float64]] = []
-    for done, i in enumerate(views.tolist()):
-        found = detect_features(images.read(frames[i].name), most)
-        features.append(found)
-        rays.append(_ideal(frames[i], found.pixels))
-        if progress is not None:
-            progress("finding features", done + 1, len(views))
+    Attributes:
+        poses: (F, 4, 4) the given T_camera_world.
+        follows: Whether corners are tracked from frame to frame, instead of matching SIFT features.
+    """
 
-    poses = poses[views]
-    pairs = neighbouring_views(poses, neighbours)
-    focal = np.array([frames[i].undistorter.raw.focal for i in views])
-    sigma = np.array([each.pixel for each in features]) / focal
-    matches = []
-    for done, (a, b) in enumerate(pairs):
-        descriptors = features[a].descriptors, features[b].descriptors
-        essential = essential_matrix(poses[a], poses[b])
-        found = match_features(*descriptors, rays[a], rays[b], essential, band * sigma[b])
-        matches.append((a, b, found))
-        if progress is not None:
-            progress("matching features", done + 1, len(pairs))
+    def __init__(
+        self, images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_], progress: Progress | None
+    ) -> None:
+        self._images, self._frames, self._solves, self._progress = images, frames, solves, progress
+        self._focal = np.array([frame.undistorter.raw.focal for frame in frames])
+        self.poses = np.stack([frame.T_camera_world for frame in frames])
+        self.follows = len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
 
-    view, number, track = feature_tracks([each.pixels for each in features], matches, ~solves[views])
-    seen_rays = np.array([rays[i][j] for i, j in zip(view, number, strict=True)]).reshape(-1, 2)
-    return Observations(views[view], track, seen_rays, sigma[view])
+    def seen(self, band: float) -> Observations:
+        """Observations of the frames, from tracked corners or matched features."""
+        if not self.follows:
+            count = len(self._frames)
+            most = MAX_FEATURES if count <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
+            return self.matched(self.poses, np.arange(count), most, NEIGHBOURS, band)
+        found = follow_features(self._images, self._frames, self._solves, self._progress, band)
+        rays = np.zeros((len(found.frame), 2))
+        for i, frame in enumerate(self._frames):
+            mine = found.frame == i
+            rays[mine] = frame.undistorter.rays(found.pixels[mine])
+        return Observations(found.frame, found.track, rays, found.pixel / self._focal[found.frame])
 
+    def matched(
+        self, poses: NDArray[np.float64], views: NDArray[np.int64], most: int, neighbours: int, band: float
+    ) -> Observations:
+        """Observations of SIFT features, `most` per view, matched between neighbouring frames of `views` (V,)."""
+        features: list[Features] = []
+        rays: list[NDArray[np.float64]] = []
+        for i in views.tolist():
+            found = detect_features(self._images.read(self._frames[i].name), most)
+            features.append(found)
+            rays.append(self._frames[i].undistorter.rays(found.pixels))
+            self._tell("finding features", len(features), len(views))
 
-def _ideal(frame: PosedImage, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normalised coordinates (N, 2) of pixels of the stored image."""
-    camera = frame.undistorter.camera
-    return (frame.undistorter.points(pixels) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        poses = poses[views]
+        pairs = neighbouring_views(poses, neighbours)
+        sigma = np.array([each.pixel for each in features]) / self._focal[views]
+        matches = []
+        for a, b in pairs:
+            descriptors = features[a].descriptors, features[b].descriptors
+            essential = essential_matrix(poses[a], poses[b])
+            found = match_features(*descriptors, rays[a], rays[b], essential, band * sigma[b])
+            matches.append((a, b, found))
+            self._tell("matching features", len(matches), len(pairs))
+
+        view, number, track = feature_tracks([each.pixels for each in features], matches, ~self._solves[views])
+        seen_rays = np.array([rays[i][j] for i, j in zip(view, number, strict=True)]).reshape(-1, 2)
+        return Observations(views[view], track, seen_rays, sigma[view])
+
+    def with_points(self, poses: NDArray[np.float64], seen: Observations) -> list[PosedImage]:
+        """Triangulate the observations with these poses, and give each frame its pose and points."""
+        xyz, seen = solve_points(poses, seen, self._solves)
+        if self.follows:
+            xyz, seen = surest_points(poses, seen, xyz, self._solves)
+        result = []
+        for i, (frame, T) in enumerate(zip(self._frames, poses, strict=True)):
+            mine = seen.where(seen.frame == i)
+            camera = frame.undistorter.camera
+            pixels = mine.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+            points = points_inside(xyz[mine.point], pixels, mine.point, frame.undistorter, T)
+            result.append(replace(frame, T_camera_world=T, points=points))
+        return result
+
+    def _tell(self, what: str, done: int, total: int) -> None:
+        if self._progress is not None:
+            self._progress(what, done, total)
 
 
 def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
@@ -233,9 +212,7 @@ def neighbouring_views(poses: NDArray[np.float64], neighbours: int = NEIGHBOURS)
     pairs = {(a, a + gap) for gap in GAPS for a in range(count - gap) if alike[a, a + gap]}
     for a in range(count):
         distance = np.linalg.norm(centres - centres[a], axis=1)
-        distance[~alike[a]] = np.inf
-        distance[a] = np.inf
-        others = [int(b) for b in np.argsort(distance, kind="stable") if np.isfinite(distance[b])]
+        others = [int(b) for b in np.argsort(distance, kind="stable") if alike[a, b] and np.isfinite(distance[b])]
         fresh = [b for b in others if (min(a, b), max(a, b)) not in pairs and abs(a - b) > max(GAPS)]
         pairs.update((min(a, b), max(a, b)) for b in fresh[:neighbours])
     return sorted(pairs)

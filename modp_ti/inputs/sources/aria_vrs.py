@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.masks import read_vignette
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.sources.vignette import read_vignette
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import VrsSettings
@@ -83,6 +83,7 @@ class AriaRecording(ImageSource):
         fx, fy = (float(value) for value in camera.get_focal_lengths())
         cx, cy = (float(value) for value in camera.get_principal_point())  # with pixel centres at whole numbers
         self.intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, pinhole.width, pinhole.height))
+        self._size = (pinhole.width, pinhole.height)
         self.vignette = self._light(mask, width, height)
         self.add_note(
             f"{path.name} is undistorted to {pinhole.width}x{pinhole.height}, f = {pinhole.focal:g} px, and lies on "
@@ -93,11 +94,6 @@ class AriaRecording(ImageSource):
                 "Aria's lens darkens toward the edge: give its vignetting mask as source.vignette "
                 "(rgb_vignetting_half_reso_mask.png or rgb_vignetting_full_reso_mask.png of Project Aria)"
             )
-
-    def size(self, name: str) -> tuple[int, int]:
-        """Return the size (width, height) of the pinhole images."""
-        assert name in self._position and self.intrinsics is not None, name
-        return self.intrinsics.camera.width, self.intrinsics.camera.height
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Decode a pinhole image (H, W, 3) uint8 RGB, black outside the fisheye's field of view.

@@ -12,7 +12,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_folder import ImageFolder, natural_key
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.listed_images import ListedImages
-from modp_ti.inputs.sources.vignette import read_vignette
+from modp_ti.inputs.sources.masks import read_vignette
 
 __all__ = [
     "RELEASE_IMAGES",
@@ -61,16 +61,11 @@ def find_sevenscenes_images(path: Path) -> dict[int, Path]:
     """
     found: dict[int, Path] = {}
     for folder in (path, path / "images"):
-        for file in sorted(folder.glob("frame-*.color.*")):
-            match = SEVENSCENES_FRAME.fullmatch(file.name)
-            if match is None:
-                continue
-            number = int(match[1])
-            if number in found:
-                raise InputError(f"{file}: {found[number].name} has the same frame number; take one of them out")
-            found[number] = file
-        if found:
-            break
+        for file in [] if found else sorted(folder.glob("frame-*.color.*")):
+            if match := SEVENSCENES_FRAME.fullmatch(file.name):
+                other = found.setdefault(int(match[1]), file)
+                if other != file:
+                    raise InputError(f"{file}: {other.name} has the same frame number; take one of them out")
     return dict(sorted(found.items()))
 
 

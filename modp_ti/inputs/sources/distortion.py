@@ -129,18 +129,12 @@ def colmap_intrinsics(model: str, params: Sequence[float]) -> tuple[float, float
         The intrinsics, or None if the model is not supported.
     """
     p = [float(value) for value in params]
-    one_focal = model in (
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-        "SIMPLE_FISHEYE",
-    )
-    fx, fy, cx, cy, k = (p[0], p[0], p[1], p[2], p[3:]) if one_focal else (p[0], p[1], p[2], p[3], p[4:])
-    if model in ("SIMPLE_PINHOLE", "PINHOLE"):
-        distortion = NO_DISTORTION
-    elif model in ("SIMPLE_RADIAL", "RADIAL"):
+    if model.startswith(("SIMPLE_", "RADIAL")):  # one focal length
+        p.insert(0, p[0])
+    if len(p) < 4:
+        return None
+    fx, fy, cx, cy, *k = p
+    if model in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         distortion = Distortion(numerator=tuple(k))
     elif model == "OPENCV":
         distortion = Distortion(numerator=tuple(k[:2]), tangential=(k[2], k[3]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.masks import MaskFolder, differs_from_colour
+from modp_ti.inputs.sources.masks import LEAST_LIGHT, MaskFolder, differs_from_colour, read_vignette
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.sources.undistortion import Undistorter
-from modp_ti.inputs.sources.vignette import LEAST_LIGHT, read_vignette
+from modp_ti.inputs.sources.undistortion import Undistorter, both_valid
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
@@ -55,14 +54,14 @@ class FrameReader:
 
     def __init__(self, images: ImageSource, source: SourceSettings) -> None:
         self.images = images
-        self._source = source
+        self.source = source
         self._masks = None if source.masks is None else MaskFolder(source.masks)
         self._vignette = images.vignette
         if self._vignette is None and source.vignette is not None:
             self._vignette = read_vignette(source.vignette)
         self._of_camera: dict[Undistorter, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
 
-    def require_fitting(self, frames: Sequence[tuple[str, Undistorter]]) -> None:
+    def require_fitting(self, frames: Iterable[tuple[str, Undistorter]]) -> None:
         """Check that masks exist and match the images, and that the vignette has their aspect ratio.
 
         Only headers of the masks are read, so that a run with wrong masks fails at its start.
@@ -81,7 +80,7 @@ class FrameReader:
             if self._vignette is not None:
                 height, width = self._vignette.shape[:2]
                 if abs(width * raw.height / (height * raw.width) - 1.0) > ASPECT_TOLERANCE:
-                    what = self._source.vignette or f"the vignette of {self.images.path}"
+                    what = self.source.vignette or f"the vignette of {self.images.path}"
                     raise InputError(
                         f"{what} is {width}x{height}, the images are {raw.width}x{raw.height}: "
                         "the vignette must show the whole image (source.vignette)"
@@ -103,13 +102,13 @@ class FrameReader:
         if self._vignette is None:
             return Picture(image, mask, None)
         vignette, lit = self._light(undistorter, self._vignette)
-        return Picture(image, _both(mask, lit), vignette)
+        return Picture(image, both_valid(mask, lit), vignette)
 
     def valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         """Return the valid pixels (H0, W0) of the stored image `raw`, or None if all are valid."""
-        valid = _both(None if self._masks is None else self._masks.read(name), self.images.valid(name))
-        if self._source.mask_colour is not None:
-            valid = _both(valid, differs_from_colour(raw, self._source.mask_colour, self._source.mask_tolerance))
+        valid = both_valid(None if self._masks is None else self._masks.read(name), self.images.valid(name))
+        if self.source.mask_colour is not None:
+            valid = both_valid(valid, differs_from_colour(raw, self.source.mask_colour, self.source.mask_tolerance))
         return None if valid is None or valid.all() else valid
 
     def _light(
@@ -123,9 +122,3 @@ class FrameReader:
             vignette.flags.writeable = False
             self._of_camera[undistorter] = vignette, lit
         return self._of_camera[undistorter]
-
-
-def _both(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-    if a is None or b is None:
-        return b if a is None else a
-    return a & b

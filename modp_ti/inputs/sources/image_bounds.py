@@ -7,7 +7,6 @@ import re
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from PIL import BmpImagePlugin, PpmImagePlugin
 from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
@@ -32,13 +31,8 @@ MOST_JPEG_PIXELS = 2048  # per byte
 PNM_BITS = {b"1": 8, b"2": 16, b"3": 48, b"4": 1, b"5": 8, b"6": 24}
 
 
-@dataclass(frozen=True)
-class _Claim:
-    """Size stated in a header [px], and the smallest file size [bytes] (`least`) that it requires."""
-
-    width: int
-    height: int
-    least: int = 0
+# Width and height stated in a header [px], and the smallest file size [bytes] that they require.
+Claim = tuple[int, int, int]
 
 
 def why_undecodable(data: bytes) -> str | None:
@@ -51,30 +45,30 @@ def why_undecodable(data: bytes) -> str | None:
     if read is None:
         return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM or PGM)"
     try:
-        claim = read(data)
+        width, height, least = read(data)
     except HEADER_ERRORS:
         return "its header is damaged"
-    if claim.width < 1 or claim.height < 1:
-        return f"its header says {claim.width}x{claim.height} pixels"
-    if claim.width * claim.height > MAX_IMAGE_PIXELS:
-        return f"its {claim.width}x{claim.height} pixels are more than {MAX_IMAGE_PIXELS:,}"
-    if claim.width * claim.height * DECODED_BYTES > available_memory():
-        return f"its {claim.width}x{claim.height} pixels do not fit into this machine's memory"
-    if claim.least > len(data):
-        return f"the file is cut off: {claim.width}x{claim.height} pixels cannot be in {len(data)} bytes"
+    if width < 1 or height < 1:
+        return f"its header says {width}x{height} pixels"
+    if width * height > MAX_IMAGE_PIXELS:
+        return f"its {width}x{height} pixels are more than {MAX_IMAGE_PIXELS:,}"
+    if width * height * DECODED_BYTES > available_memory():
+        return f"its {width}x{height} pixels do not fit into this machine's memory"
+    if least > len(data):
+        return f"the file is cut off: {width}x{height} pixels cannot be in {len(data)} bytes"
     if read is _png and not _inflates(data):
         return "its pixels are damaged or missing"
     return None
 
 
-def _png(data: bytes) -> _Claim:
+def _png(data: bytes) -> Claim:
     if data[12:16] != b"IHDR":
         raise ValueError
     width, height, depth, kind, *_ = struct.unpack_from(">IIBBBBB", data, 16)
     channels = PNG_CHANNELS.get(kind, 0)
     if channels == 0 or depth not in (1, 2, 4, 8, 16):
         raise ValueError
-    return _Claim(width, height, height * (1 + width * channels * depth // 8) // MOST_INFLATED)
+    return width, height, height * (1 + width * channels * depth // 8) // MOST_INFLATED
 
 
 def _inflates(data: bytes) -> bool:
@@ -96,50 +90,49 @@ def _inflates(data: bytes) -> bool:
     return inflater.eof and found >= wanted
 
 
-def _jpeg(data: bytes) -> _Claim:
+def _jpeg(data: bytes) -> Claim:
     width, height = JpegHeader(bounded(io.BytesIO(data))).size
-    return _Claim(width, height, width * height // MOST_JPEG_PIXELS)
+    return width, height, width * height // MOST_JPEG_PIXELS
 
 
-def _bmp(data: bytes) -> _Claim:
+def _bmp(data: bytes) -> Claim:
     image = BmpImagePlugin.BmpImageFile(bounded(io.BytesIO(data)))
     tile, (width, height) = image.tile[0], image.size
     if tile.codec_name != "raw" or not isinstance(tile.args, tuple):
-        return _Claim(width, height)
-    # The last row may lack its padding.
-    return _Claim(width, height, (height - 1) * int(tile.args[1]))
+        return width, height, 0
+    return width, height, (height - 1) * int(tile.args[1])  # the last row may lack its padding
 
 
-def _pnm(data: bytes) -> _Claim:
+def _pnm(data: bytes) -> Claim:
     width, height = PpmImagePlugin.PpmImageFile(bounded(io.BytesIO(data))).size
-    return _Claim(width, height, width * height * PNM_BITS[data[1:2]] // 8)
+    return width, height, width * height * PNM_BITS[data[1:2]] // 8
 
 
-def _webp(data: bytes) -> _Claim:
+def _webp(data: bytes) -> Claim:
     """Read a WebP header without Pillow, whose reader allocates two canvases of the stated size."""
     kind = data[12:16]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 26)
-        return _Claim(width & 0x3FFF, height & 0x3FFF)
+        return width & 0x3FFF, height & 0x3FFF, 0
     if kind == b"VP8L":
         (bits,) = struct.unpack_from("<I", data, 21)
-        return _Claim((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1, 0
     if kind == b"VP8X":
         width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
-        return _Claim(width, height)
+        return width, height, 0
     raise ValueError
 
 
-def _tiff(data: bytes) -> _Claim:
+def _tiff(data: bytes) -> Claim:
     """Read the size of the first image in the file. A tile may be larger than the image and is decoded as a whole."""
     found = read_tiff_directory(data)
     sizes = found[IMAGEWIDTH], found[IMAGELENGTH], found.get(TILEWIDTH, 1), found.get(TILELENGTH, 1)
     if not all(isinstance(size, int) for size in sizes):
         raise ValueError
-    return _Claim(max(sizes[::2]), max(sizes[1::2]))
+    return max(sizes[::2]), max(sizes[1::2]), 0
 
 
-FORMATS: tuple[tuple[bytes, Callable[[bytes], _Claim]], ...] = (
+FORMATS: tuple[tuple[bytes, Callable[[bytes], Claim]], ...] = (
     (rb"\x89PNG\r\n\x1a\n", _png),
     (rb"\xff\xd8", _jpeg),
     (rb"BM", _bmp),

@@ -143,10 +143,7 @@ def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlug
 def _ends_with(file: BinaryIO, marker: bytes) -> bool:
     """Return whether the marker ends the file, or precedes data appended to it, as in motion photos."""
     here = file.tell()
-    end = file.seek(0, 2)
-    if end - here < len(marker):
-        return False
-    file.seek(end - len(marker))
+    file.seek(max(here, file.seek(0, 2) - len(marker)))
     if file.read() == marker:
         return True
     file.seek(here)

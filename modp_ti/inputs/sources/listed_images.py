@@ -29,7 +29,6 @@ class ListedImages(ImageSource):
         times: Time of each image [s].
         intrinsics: Camera of the data set, if known.
         notes: Remarks for the user.
-        vignette: Share of the light (H, W, 3), with maximum 1, that reaches each part of the stored image, if known.
     """
 
     def __init__(
@@ -39,12 +38,10 @@ class ListedImages(ImageSource):
         times: Sequence[float] | NDArray[np.float64],
         intrinsics: Intrinsics | None = None,
         notes: Iterable[str] = (),
-        vignette: NDArray[np.float32] | None = None,
     ) -> None:
         super().__init__(path, names, times)
         self.intrinsics = intrinsics
         self._notes += notes
-        self.vignette = vignette
         self._by_stem: dict[str, str] = {}
         for name in self.names:
             self._by_stem.setdefault(str(PurePosixPath(name).with_suffix("")), name)

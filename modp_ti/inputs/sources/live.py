@@ -67,7 +67,7 @@ class LiveSource(ImageSource):
         if first is None:
             self._capture.release()
             raise InputError(f"{self.path}: sends no frame (source.stream); is it in use by another program?")
-        self._frame_size = (first[1].shape[1], first[1].shape[0])
+        self._size = (first[1].shape[1], first[1].shape[0])
         self._waiting.append(first)
         self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
         # A daemon, so that a stalled stream does not keep the process alive. `close` is registered with atexit because
@@ -108,15 +108,6 @@ class LiveSource(ImageSource):
             yield self._names[position]
             position += step
         self.finish()
-
-    @property
-    def frame_size(self) -> tuple[int, int]:
-        return self._frame_size
-
-    def size(self, name: str) -> tuple[int, int]:
-        """Return the size (width, height) of the stream's frames."""
-        assert name in self._position, name
-        return self._frame_size
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Read a delivered frame (H, W, 3) uint8 RGB, exactly as it arrived.

@@ -41,6 +41,7 @@ class ImageSource(ABC):
         self.vignette: NDArray[np.float32] | None = None
         self.T_device_camera: NDArray[np.float64] | None = None
         self.scale = 1.0
+        self._size: tuple[int, int] | None = None  # (width, height) of every image, where they have one size
         self._notes: list[str] = []
         self._names: list[str] = []
         self._times: list[float] = []
@@ -110,15 +111,16 @@ class ImageSource(ABC):
     @property
     def frame_size(self) -> tuple[int, int]:
         """Size (width, height) of the first image. A live source knows it before it has delivered any."""
-        return self.size(self.names[0])
+        return self._size or self.size(self.names[0])
 
-    @abstractmethod
     def size(self, name: str) -> tuple[int, int]:
         """Return the size (width, height) of the stored image.
 
         Raises:
             InputError: If the image is unreadable.
         """
+        assert self._size is not None and name in self._position, name
+        return self._size
 
     @abstractmethod
     def read(self, name: str) -> NDArray[np.uint8]:

@@ -49,18 +49,20 @@ def open_tum_rgbd(path: Path) -> ListedImages:
     notes = []
     if len(there) < len(entries):
         notes.append(f"{len(entries) - len(there)} of the {len(entries)} images that {listing} lists are not there")
-    number = _camera_number(path, listing)
-    if number is None:
+    comments = (line for line in input_lines(listing, HINT) if line.startswith("#"))
+    named = CAMERA_NAME.search(path.resolve().name)
+    found = named or next(filter(None, map(CAMERA_NAME.search, comments)), None)
+    if found is None:
         intrinsics = None
         notes.append(
             f"{path} names none of the benchmark's cameras (freiburg1, freiburg2, freiburg3 or fr1, fr2, fr3): "
             "give source.intrinsics where the tracker brings no camera"
         )
     else:
-        fx, fy, cx, cy, distortion = CAMERAS[number]
+        fx, fy, cx, cy, distortion = CAMERAS[int(found[1])]
         # The benchmark has pixel centres at whole numbers, this project at +0.5.
         intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, WIDTH, HEIGHT), distortion)
-        notes.append(f"the camera is taken to be the benchmark's freiburg{number}")
+        notes.append(f"the camera is taken to be the benchmark's freiburg{found[1]}")
     return ListedImages(path, [name for _, name in there], [time for time, _ in there], intrinsics, notes)
 
 
@@ -102,12 +104,3 @@ def read_listing(file: Path) -> list[tuple[float, str]]:
     if not entries:
         raise InputError(f"{file}: lists no image; its lines must be a time stamp and a path")
     return entries
-
-
-def _camera_number(path: Path, listing: Path) -> int | None:
-    """Return the camera, 1, 2 or 3, from the folder's name or else from the comments of the listing."""
-    found = CAMERA_NAME.search(path.resolve().name)
-    if found is None:
-        comments = [line for line in input_lines(listing, HINT) if line.startswith("#")]
-        found = next(filter(None, map(CAMERA_NAME.search, comments)), None)
-    return None if found is None else int(found.group(1))

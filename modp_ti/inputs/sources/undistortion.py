@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 
-__all__ = ["Undistorter"]
+__all__ = ["Undistorter", "both_valid"]
 
 # The inverse of the lens model is searched up to this multiple of the image corner's radius.
 SEARCH_MARGIN = 1.5
@@ -48,6 +48,10 @@ class Undistorter:
             return np.asarray(pixels, dtype=np.float64) * np.divide(out, size)
         return _pixels(self.camera, self.distortion.undistort(_normalised(self.raw, pixels), self._limit))
 
+    def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Map pixels (N, 2) of the stored image to normalised coordinates (N, 2); NaN as for `points`."""
+        return _normalised(self.camera, self.points(pixels))
+
     def image(
         self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
@@ -67,16 +71,14 @@ class Undistorter:
         """
         if raw.shape != (self.raw.height, self.raw.width, 3) or raw.dtype != np.uint8:
             raise ValueError(f"image is {raw.shape} {raw.dtype}, the camera {self.raw.width}x{self.raw.height}")
-        mask = None if self._lookup is None else self._lookup[2]
         if valid is None:
-            return np.divide(self._resampled(raw), 255.0, dtype=np.float32), mask
+            return np.divide(self._resampled(raw), 255.0, dtype=np.float32), self._covered
         if valid.shape != raw.shape[:2]:
             raise ValueError(f"valid is {valid.shape}, the image {raw.shape}")
         share = self._resampled(valid.astype(np.float32))
         image = self._resampled(np.where(valid[..., None], raw, 0).astype(np.float32))
         image = np.clip(image / np.maximum(share, 0.5)[..., None] / 255.0, 0.0, 1.0, dtype=np.float32)
-        kept = share >= 0.5
-        return image, kept if mask is None else kept & mask
+        return image, both_valid(share >= 0.5, self._covered)
 
     def grey(
         self, raw: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None
@@ -94,12 +96,9 @@ class Undistorter:
         """
         import cv2
 
-        mask = None if self._lookup is None else self._lookup[2]
         grey = self._resampled(cv2.cvtColor(raw, cv2.COLOR_RGB2GRAY))
-        if valid is None:
-            return grey, mask
-        kept = self._resampled(valid.astype(np.float32)) >= 0.5
-        return grey, kept if mask is None else kept & mask
+        kept = None if valid is None else self._resampled(valid.astype(np.float32)) >= 0.5
+        return grey, both_valid(kept, self._covered)
 
     def smooth(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
         """Resample a smooth picture (H1, W1, 3) of the stored image's field of view to the result's (H, W, 3)."""
@@ -128,6 +127,11 @@ class Undistorter:
         x, y, _ = self._lookup
         return cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
+    @property
+    def _covered(self) -> NDArray[np.bool_] | None:
+        """Pixels (H, W) of the result that the stored image covers; None for all."""
+        return None if self._lookup is None else self._lookup[2]
+
     @cached_property
     def _lookup(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_] | None] | None:
         """Lookup maps x and y (H, W) into the scaled image, in cv2's coordinates, and the mask."""
@@ -137,14 +141,19 @@ class Undistorter:
         columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
         ideal = _normalised(camera, np.stack(np.meshgrid(columns, rows), axis=-1))
         source = _pixels(camera, self.distortion.distort(ideal))
-        valid_radius = self.distortion.valid_radius(self._limit)
-        inside = np.linalg.norm(ideal, axis=-1) <= valid_radius
+        inside = np.linalg.norm(ideal, axis=-1) <= self.distortion.valid_radius(self._limit)
         inside &= camera.contains(source.reshape(-1, 2)).reshape(inside.shape)
-        mask = None if inside.all() else inside
-        if mask is not None:
-            mask.flags.writeable = False  # shared by all frames
+        inside.flags.writeable = False  # shared by all frames
         lookup = (source - 0.5).astype(np.float32)
-        return np.ascontiguousarray(lookup[..., 0]), np.ascontiguousarray(lookup[..., 1]), mask
+        x, y = np.ascontiguousarray(lookup[..., 0]), np.ascontiguousarray(lookup[..., 1])
+        return x, y, None if inside.all() else inside
+
+
+def both_valid(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Combine two masks of valid pixels, of which None stands for all."""
+    if a is None or b is None:
+        return b if a is None else a
+    return a & b
 
 
 def _normalised(camera: PinholeCamera, pixels: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -75,11 +75,11 @@ class VideoFile(ImageSource):
             if len(shown) == 1:
                 first, self._form = self._front.image(), self._front.form
         cut_off = bool(missing) and (stop is None or len(shown) < stop)
-        if first is None or cut_off:
-            self.close()
         if first is None or self._form is None:
+            self.close()
             raise self._useless(missing)
         if cut_off:
+            self.close()
             raise InputError(
                 f"{self.path}: the video is cut off, {missing} bytes are missing: copy it again, or set source.stop: "
                 f"{len(shown)} to use the frames that can be read"
@@ -99,11 +99,6 @@ class VideoFile(ImageSource):
             self.add_note(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
         self._front.close()
         self._front = self._decoder(missing)
-
-    def size(self, name: str) -> tuple[int, int]:
-        """Return the size (width, height) of the frames."""
-        assert name in self._position, name
-        return self._size
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Decode a frame (H, W, 3) uint8 RGB.

@@ -21,7 +21,7 @@ CHUNK = 1 << 20
 
 
 class SenderGoneError(Exception):
-    """The connection has ended or timed out. The text says how."""
+    """The connection has ended or timed out. The text says how, in one line."""
 
 
 class Connection:
@@ -61,7 +61,7 @@ class Connection:
         data = bytearray()
         while len(data) < size:
             if self._closed.is_set():
-                raise SenderGoneError("is let go: the run is over")
+                raise SenderGoneError("the sender is let go: the run is over")
             left = deadline - time.monotonic()
             try:
                 self._socket.settimeout(min(max(left, 0.001), GLANCE))
@@ -70,17 +70,19 @@ class Connection:
                 if left > 0:
                     continue
                 where = "in mid-message" if begun or data else "without a message"
-                raise SenderGoneError(f"was silent for {patience:g} s {where}") from None
+                raise SenderGoneError(f"the sender was silent for {patience:g} s {where}") from None
             except ConnectionResetError:
                 # A sender that exits without reading WELCOME causes one reset. What it sent may still be readable.
                 if self._reset:
-                    raise SenderGoneError("is gone: the connection was reset") from None
+                    raise SenderGoneError("the sender is gone: the connection was reset") from None
                 self._reset = True
                 continue
             except OSError as error:
-                raise SenderGoneError(f"is gone: {error.strerror or error}") from None
+                raise SenderGoneError(f"the sender is gone: {error.strerror or error}") from None
             if not part:
-                raise SenderGoneError("ended in mid-message" if begun or data else "ended without END")
+                raise SenderGoneError(
+                    "the sender ended in mid-message" if begun or data else "the sender ended without END"
+                )
             data += part
         return bytes(data)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,34 +11,26 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.se3 import interpolate_se3, inverse_se3
+from modp_ti.inputs.replay import PosedImage
 
-__all__ = ["Delivered", "History"]
-
-
-@dataclass(frozen=True)
-class Delivered:
-    """A frame as delivered to the mapper. Its image and points are stored on disk under its name."""
-
-    name: str
-    timestamp: float
-    T_camera_world: NDArray[np.float64]
+__all__ = ["History"]
 
 
 class History:
-    """Delivered frames in order, with all corrections applied."""
+    """Delivered frames in order, with all corrections applied. Their images and points are stored on disk."""
 
     def __init__(self) -> None:
-        self.frames: list[Delivered] = []
+        self.frames: list[PosedImage] = []
         self._moved: dict[int, NDArray[np.float64]] = {}
         self._known: set[int] = set()
 
-    def add(self, frame: Delivered, points: SparsePoints) -> None:
-        """Add a delivered frame with the points that it observes."""
-        ids = points.ids.tolist()
+    def add(self, frame: PosedImage) -> None:
+        """Add a delivered frame. Only the ids of its points are kept."""
+        ids = frame.points.ids.tolist()
         self._known.update(ids)
         for i in ids:  # a later frame's position of a point is newer than an earlier correction
             self._moved.pop(i, None)
-        self.frames.append(frame)
+        self.frames.append(frame.with_points(SparsePoints()))
 
     def correct(self, correction: PoseCorrection) -> None:
         """Apply a correction.

@@ -7,8 +7,7 @@ import selectors
 import socket
 import stat
 import time
-from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
@@ -123,14 +122,14 @@ class Lobby:
         self.dropped = 0
         self._listener = listener
         self._patience = min(patience, HELLO_PATIENCE)
-        self._silent: OrderedDict[socket.socket, float] = OrderedDict()  # idle connections and their accept times
+        self._silent: dict[socket.socket, float] = {}  # idle connections and their accept times, oldest first
         self._selector = selectors.DefaultSelector()
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
 
     def next(self, timeout: float) -> socket.socket | None:
         """Return a connection with data to read or at its end, or None after `timeout` seconds without one."""
-        self._send_away(lambda since: time.monotonic() - since > self._patience)
+        self._drop(sock for sock, since in self._silent.items() if time.monotonic() - since > self._patience)
         spoken: socket.socket | None = None
         for key, _ in self._selector.select(timeout):
             if key.fileobj is self._listener:
@@ -138,13 +137,13 @@ class Lobby:
             elif spoken is None:
                 spoken = key.data
         if spoken is not None:
-            self._selector.unregister(spoken)
-            del self._silent[spoken]
+            self._forget(spoken)
         return spoken
 
     def close(self) -> None:
         """Close all idle connections."""
-        self._send_away(lambda since: True, counts=False)
+        for sock in self._silent:
+            sock.close()
         self._selector.close()
 
     def _accept(self) -> None:
@@ -154,13 +153,14 @@ class Lobby:
             return
         self._silent[sock] = time.monotonic()
         self._selector.register(sock, selectors.EVENT_READ, data=sock)
-        if len(self._silent) > MAX_SILENT:
-            oldest = next(iter(self._silent.values()))
-            self._send_away(lambda since: since <= oldest)
+        self._drop(list(self._silent)[:-MAX_SILENT])
 
-    def _send_away(self, whom: Callable[[float], bool], counts: bool = True) -> None:
-        for sock in [sock for sock, since in self._silent.items() if whom(since)]:
-            self._selector.unregister(sock)
-            del self._silent[sock]
+    def _drop(self, sockets: Iterable[socket.socket]) -> None:
+        for sock in list(sockets):
+            self._forget(sock)
             sock.close()
-            self.dropped += counts
+            self.dropped += 1
+
+    def _forget(self, sock: socket.socket) -> None:
+        self._selector.unregister(sock)
+        del self._silent[sock]

@@ -250,14 +250,13 @@ def parse_hello(payload: bytes) -> Hello:
         name = payload[HELLO.size :].decode("utf-8")
     except UnicodeDecodeError:
         raise ProtocolError("HELLO: the tracker's name must be UTF-8") from None
-    camera = PinholeCamera(fx, fy, cx, cy, width, height)
     try:
-        require_plausible(camera, distortion, "HELLO")
+        intrinsics = require_plausible(PinholeCamera(fx, fy, cx, cy, width, height), distortion, "HELLO")
     except InputError as error:
         raise ProtocolError(str(error)) from None
     # The name is printed to the terminal, so control characters are removed.
     name = "".join(c if c.isalnum() or c in " ._-" else "?" for c in name)
-    return Hello(Intrinsics(camera, distortion), Encoding(encoding), name)
+    return Hello(Intrinsics(*intrinsics), Encoding(encoding), name)
 
 
 def parse_frame(payload: bytes, kind: Kind) -> Frame:
@@ -296,7 +295,8 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
         pose = _pose(np.array(matrix).reshape(4, 4), what) if state is State.KNOWN else None
         points = parse_points(payload[FRAME.size : middle], what)
     except UnfitError as error:
-        raise UnfitError(str(error), number) from None
+        error.number = number
+        raise
     return Frame(number, state, timestamp, pose, points, payload[middle:])
 
 

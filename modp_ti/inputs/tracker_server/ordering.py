@@ -19,7 +19,6 @@ MAX_WAITING_BYTES = 256 << 20  # bytes of points and poses
 MAX_WAITING_IMAGES = 4 << 30  # bytes of images on disk
 # Corrections between two frames. Each one costs time proportional to all frames so far.
 MAX_CORRECTIONS = 100
-NO_POINTS = SparsePoints(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
 
 class Ordering:
@@ -126,7 +125,7 @@ class Ordering:
         self._left_out.add(number)
         if number in self._undecided:
             self._undecided.discard(number)
-            self._late[number] = Frame(number, State.LOST, 0.0, None, NO_POINTS, b"")
+            self._late[number] = Frame(number, State.LOST, 0.0, None, SparsePoints(), b"")
 
     def ready(self) -> Iterator[Frame | Correction]:
         """Yield the frames with known poses, and the corrections, that no earlier frame without a pose delays."""

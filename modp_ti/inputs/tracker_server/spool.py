@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
+from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.listed_images import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -35,12 +37,27 @@ class Spool(ImageSource):
 
     Args:
         hello: The HELLO message, with camera and image encoding.
+        source: Settings of the images.
+
+    Attributes:
+        hello: As the argument.
+        undistorter: Undistorter of the images.
+        reader: Reads and undistorts the images.
+
+    Raises:
+        InputError: If the settings do not fit the camera.
     """
 
-    def __init__(self, hello: Hello) -> None:
+    def __init__(self, hello: Hello, source: SourceSettings) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-server-")
         super().__init__(Path(self._folder.name))
+        self.hello = hello
         self.intrinsics = hello.intrinsics
+        self._size = (hello.intrinsics.camera.width, hello.intrinsics.camera.height)
+        # `auto` keeps the images' size, since their sender chooses it.
+        self.scale = 1.0 if source.scale == "auto" else source.scale
+        self.undistorter = hello.intrinsics.undistorter(self.scale)
+        self.reader = FrameReader(self, source)
         self._encoding = hello.encoding
         self._last: tuple[str, NDArray[np.uint8]] | None = None
 
@@ -71,11 +88,10 @@ class Spool(ImageSource):
 
     def _require_image(self, frame: Frame) -> None:
         """Check encoding and size from the image's header, so that no image of another size is ever decoded."""
-        assert self.intrinsics is not None
-        camera = self.intrinsics.camera
+        width, height = self.frame_size
         what = f"FRAME {frame.number}"
         if self._encoding.channels is not None:
-            wanted = camera.width * camera.height * self._encoding.channels
+            wanted = width * height * self._encoding.channels
             if len(frame.image) != wanted:
                 raise UnfitError(f"{what}: its image has {len(frame.image)} bytes, HELLO says {wanted}", frame.number)
             return
@@ -85,9 +101,9 @@ class Spool(ImageSource):
             raise UnfitError(f"{what}: its image is no {self._encoding.name}", frame.number)
         if not header.complete:
             raise UnfitError(f"{what}: its {self._encoding.name} image is cut off", frame.number)
-        if (header.width, header.height) != (camera.width, camera.height):
+        if (header.width, header.height) != (width, height):
             raise UnfitError(
-                f"{what}: its image is {header.width}x{header.height}, HELLO says {camera.width}x{camera.height}",
+                f"{what}: its image is {header.width}x{header.height}, HELLO says {width}x{height}",
                 frame.number,
             )
 
@@ -96,10 +112,6 @@ class Spool(ImageSource):
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
         return self._names[start:stop:step]
-
-    def size(self, name: str) -> tuple[int, int]:
-        assert self.intrinsics is not None
-        return self.intrinsics.camera.width, self.intrinsics.camera.height
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Read an image (H, W, 3); see `ImageSource`. Raises InputError if it does not decode."""
@@ -119,7 +131,7 @@ class Spool(ImageSource):
         return self._last[1]
 
     def _decode(self, name: str) -> NDArray[np.uint8]:
-        width, height = self.size(name)
+        width, height = self.frame_size
         data = (self.path / name).read_bytes()
         if self._encoding.channels is not None:
             image = np.frombuffer(data, np.uint8).reshape(height, width, self._encoding.channels)
@@ -131,10 +143,8 @@ class Spool(ImageSource):
         image = decoded_as(data, cv2.IMREAD_UNCHANGED if png else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None or image.dtype != np.uint8:
             raise InputError(f"{name}: its {self._encoding.name} image is damaged or not of 8 bits a channel")
-        if image.ndim == 2:
-            conversion = cv2.COLOR_GRAY2RGB
-        else:
-            conversion = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
+        channels = image.shape[2] if image.ndim == 3 else 1
+        conversion = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}[channels]
         return np.asarray(cv2.cvtColor(image, conversion), dtype=np.uint8)
 
     def keep_points(self, name: str, points: SparsePoints) -> None:

@@ -10,15 +10,14 @@ from threading import Event, Thread
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import is_held_out, points_inside, unmasked
-from modp_ti.inputs.sources import FrameReader, Undistorter
+from modp_ti.inputs.replay import PosedImage, points_inside, tracked_frame
 from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, SenderGoneError
-from modp_ti.inputs.tracker_server.history import Delivered, History
+from modp_ti.inputs.tracker_server.history import History
 from modp_ti.inputs.tracker_server.listening import Lobby, listen, open_to_others
 from modp_ti.inputs.tracker_server.messages import (
     Correction,
@@ -96,12 +95,9 @@ class TrackerServer(Tracker):
             self._notes.append(f"{self.address} is open to the network: whoever reaches it can send frames")
         self._progress = progress
         self._spool: Spool | None = None
-        self._reader: FrameReader | None = None
-        self._undistorter: Undistorter | None = None
         self._history = History()
         self._indices: dict[int, int] = {}  # indices of the delivered frames by the sender's frame numbers
         self._dropped, self._dropped_note = 0, ""
-        self._name = ""
         self._unfit: list[str] = []  # error messages of the skipped messages
         self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
         self._closed = Event()
@@ -135,19 +131,19 @@ class TrackerServer(Tracker):
                 self._ended = True
                 if event is not None:
                     raise event
-            elif isinstance(event, TrackedFrame):
-                self._history.add(Delivered(event.name, event.timestamp, event.T_camera_world), event.points)
-                yield event
+                return
+            if isinstance(event, TrackedFrame):
+                undistorter = self._received.undistorter
+                self._history.add(PosedImage(event.name, undistorter, event.T_camera_world, event.points))
             else:
                 self._history.correct(event)
-                yield event
+            yield event
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         """Iterate over the delivered frames with their corrected poses and points, then over frames that arrive."""
         for index, frame in enumerate(self._history.frames[:]):
-            assert self._spool is not None, "it holds the frames"
-            points = self._history.placed(self._spool.points(frame.name))
-            yield self._tracked(index, frame, points)
+            points = self._history.placed(self._received.points(frame.name))
+            yield tracked_frame(self._received.reader, index, frame.with_points(points))
         for event in self.events():
             if isinstance(event, TrackedFrame):
                 yield event
@@ -159,26 +155,16 @@ class TrackerServer(Tracker):
         if self._spool is not None:
             self._spool.close()
 
+    @property
+    def _received(self) -> Spool:
+        """The received frames. A HELLO must have arrived."""
+        assert self._spool is not None
+        return self._spool
+
     def _say_waiting(self, done: int) -> None:
         if self._progress is not None:
             self._progress(f"waiting for a tracker at {self.address}", done, 1)
             self._progress = self._progress if done == 0 else None
-
-    def _tracked(self, index: int, frame: Delivered, points: SparsePoints) -> TrackedFrame:
-        assert self._reader is not None and self._undistorter is not None, "HELLO came before"
-        picture = self._reader.read(frame.name, self._undistorter)
-        return TrackedFrame(
-            index=index,
-            timestamp=frame.timestamp,
-            name=frame.name,
-            image=picture.image,
-            camera=self._undistorter.camera,
-            T_camera_world=frame.T_camera_world,
-            points=unmasked(points, picture.mask),
-            mask=picture.mask,
-            vignette=picture.vignette,
-            held_out=is_held_out(index, self._source),
-        )
 
     # ---- the server's thread -----------------------------------------------------------------------------------
 
@@ -216,8 +202,9 @@ class TrackerServer(Tracker):
                     break
                 if kind is Kind.HELLO:
                     hello = parse_hello(payload)
-                    self._prepare(hello)
-                    self._name = hello.name
+                    if self._spool is not None:
+                        self._spool.close()  # left by a connection that sent no frame
+                    self._spool = Spool(hello, self._source)
                     connection.say(Kind.WELCOME)
                 else:
                     try:
@@ -225,10 +212,7 @@ class TrackerServer(Tracker):
                     except UnfitError as error:
                         self._leave_out(error, ordering)
                     self._deliver(ordering)
-        except SenderGoneError as error:
-            problem = f"the sender {error}"
-            connection.refuse(problem)
-        except ProtocolError as error:
+        except (SenderGoneError, ProtocolError) as error:
             problem = str(error)
             connection.refuse(problem)
         except SpoolFullError as error:
@@ -279,15 +263,6 @@ class TrackerServer(Tracker):
         self._notes = [*(other for other in self._notes if other != self._dropped_note), note]
         self._dropped_note = note
 
-    def _prepare(self, hello: Hello) -> None:
-        """Prepare to receive images of this camera. Raises InputError if the settings do not fit it."""
-        if self._spool is not None:
-            self._spool.close()  # left by a connection that sent no frame
-        undistorter = hello.intrinsics.undistorter(self.scale)
-        spool = Spool(hello)
-        self._reader = FrameReader(spool, self._source)
-        self._undistorter, self._spool = undistorter, spool
-
     def _take(self, kind: Kind, payload: bytes, ordering: Ordering) -> None:
         """Process one FRAME, POSE or CORRECTION message.
 
@@ -300,37 +275,37 @@ class TrackerServer(Tracker):
         if kind is Kind.POSE:
             ordering.add_pose(frame)
             return
-        assert self._spool is not None and self._reader is not None and self._undistorter is not None
+        spool = self._received
         ordering.require_next(frame)
-        name = self._spool.add(frame)
-        self._reader.require_fitting([(name, self._undistorter)])
+        name = spool.add(frame)
+        spool.reader.require_fitting([(name, spool.undistorter)])
         ordering.add_frame(frame)
-        if len(self._spool) == 1 and self._name:
-            self._notes.append(f"the tracker there is {self._name}")
+        if len(spool) == 1 and spool.hello.name:
+            self._notes.append(f"the tracker there is {spool.hello.name}")
 
     def _deliver(self, ordering: Ordering) -> None:
         """Queue what is ready for the mapper; block while the queue is full."""
         for item in ordering.ready():
             if self._closed.is_set():
                 return
-            self._put(self._revised(item) if isinstance(item, Correction) else self._arrived(item))
+            if isinstance(item, Correction):
+                index = np.array([self._indices[number] for number in item.numbers.tolist()], dtype=np.int64)
+                self._put(PoseCorrection(index, item.T_camera_world, item.ids, item.xyz))
+            else:
+                self._put(self._arrived(item))
 
     def _arrived(self, frame: Frame) -> TrackedFrame:
-        assert self._spool is not None and self._undistorter is not None and frame.T_camera_world is not None
+        spool, pose = self._received, frame.T_camera_world
+        assert pose is not None
         index = len(self._indices)
         self._indices[frame.number] = index
-        pixels = self._undistorter.points(frame.points.pixels)
-        pose = frame.T_camera_world
-        points = points_inside(frame.points.xyz, pixels, frame.points.ids, self._undistorter, pose)
-        name = self._spool.name(frame.number)
-        tracked = self._tracked(index, Delivered(name, frame.timestamp, pose), points)
-        self._spool.keep_points(name, tracked.points)
+        pixels = spool.undistorter.points(frame.points.pixels)
+        points = points_inside(frame.points.xyz, pixels, frame.points.ids, spool.undistorter, pose)
+        name = spool.name(frame.number)
+        tracked = tracked_frame(spool.reader, index, PosedImage(name, spool.undistorter, pose, points))
+        spool.keep_points(name, tracked.points)
         _ = tracked.pyramid  # computed and cached here, in this thread, to save the mapper time
         return tracked
-
-    def _revised(self, correction: Correction) -> PoseCorrection:
-        index = np.array([self._indices[number] for number in correction.numbers.tolist()], dtype=np.int64)
-        return PoseCorrection(index, correction.T_camera_world, correction.ids, correction.xyz)
 
     def _put(self, event: TrackedFrame | PoseCorrection | InputError | None) -> None:
         while not self._closed.is_set():

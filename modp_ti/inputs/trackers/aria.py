@@ -14,21 +14,17 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
-from modp_ti.inputs.sources import ImageSource, open_source
-from modp_ti.inputs.sources.protocol import require_intrinsics
+from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.trackers.aria_mps import (
     CameraMounts,
     DeviceTrajectory,
     read_calibration,
-    read_closed_loop,
+    read_device_trajectory,
     read_observations,
-    read_open_loop,
     read_points,
 )
 from modp_ti.inputs.trackers.given_poses import (
-    checked_reader,
-    missing_frames_note,
-    selected_frames,
+    posed_images,
     solving,
     spread_points,
 )
@@ -64,23 +60,21 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
     """
     place = source.require_path()
     folder, file = _trajectory_file(tracker.path, place)
-    device = read_open_loop(file) if file.name == OPEN_LOOP else read_closed_loop(file)
+    device = read_device_trajectory(file, open_loop=file.name == OPEN_LOOP)
     calibration = folder / CALIBRATION
     mounts = read_calibration(calibration, tracker.camera) if calibration.is_file() else None
     images = open_source(source)
     missing = []
     if mounts is None:
-        mounts, missing = _recorded_mount(images, calibration, tracker.camera)
-    selected = selected_frames(images, source)
-    rows = rows_at_frames(images, selected, file, device.times, tracker)
-    names = sorted(rows, key=images.position)
-    T_world_camera = np.stack(
-        [device.T_world_device[rows[name]] @ mounts.at(device.times[rows[name]]) for name in names]
-    )
-    undistorter = require_intrinsics(images).undistorter(images.scale)
-    reader = checked_reader(images, source, [(name, undistorter) for name in names], "source.intrinsics")
-    frames = [PosedImage(name, undistorter, T) for name, T in zip(names, inverse_poses(T_world_camera), strict=True)]
-    notes = [*missing_frames_note(selected, rows, file.name), *_notes(device, mounts, file), *missing]
+        lost = f"{calibration} is missing: it would have brought where the camera {tracker.camera} sits on the device"
+        if images.T_device_camera is None:
+            raise InputError(f"{lost} (T_device_camera), without which device poses are no camera poses")
+        mounts = CameraMounts(np.zeros(1), images.T_device_camera[None])
+        missing.append(f"{lost} (T_device_camera) over time; the recording's own is taken")
+    rows, notes = rows_at_frames(images, source, file, device.times, tracker)
+    T_world_camera = np.stack([device.T_world_device[row] @ mounts.at(device.times[row]) for row in rows.values()])
+    reader, frames = posed_images(images, source, dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
+    notes += [*_notes(device, None if missing else mounts, file), *missing]
 
     cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     if file.name == OPEN_LOOP or cloud is None:
@@ -90,12 +84,11 @@ def open_aria(source: SourceSettings, tracker: AriaSettings, progress: Progress 
                 "tracked and triangulated instead"
             )
         frames = triangulated_frames(images, frames, solving(frames, source), progress)
-        return ReplayedTracker(reader, frames, source, notes)
+        return ReplayedTracker(reader, frames, notes)
     numbers, xyz, total = read_points(cloud, device.world, tracker.max_inv_dist_std, tracker.max_dist_std)
     notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
-    times = device.times[[rows[name] for name in names]]
-    frames, note = _with_points(folder, frames, times, numbers, xyz, tracker.max_points)
-    return ReplayedTracker(reader, frames, source, [*notes, *note])
+    frames, note = _with_points(folder, frames, device.times[list(rows.values())], numbers, xyz, tracker.max_points)
+    return ReplayedTracker(reader, frames, [*notes, note])
 
 
 def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
@@ -119,16 +112,7 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
     )
 
 
-def _recorded_mount(images: ImageSource, file: Path, label: str) -> tuple[CameraMounts, list[str]]:
-    """Return the camera mount stored in a VRS recording, for use without the online calibration, and a remark."""
-    mount = images.T_device_camera
-    lost = f"{file} is missing: it would have brought where the camera {label} sits on the device (T_device_camera)"
-    if mount is None:
-        raise InputError(f"{lost}, without which device poses are no camera poses")
-    return CameraMounts(images.path, np.zeros(1), mount[None]), [f"{lost} over time; the recording's own is taken"]
-
-
-def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[str]:
+def _notes(device: DeviceTrajectory, mounts: CameraMounts | None, file: Path) -> list[str]:
     notes = []
     if file.name == OPEN_LOOP:
         notes.append(
@@ -137,11 +121,12 @@ def _notes(device: DeviceTrajectory, mounts: CameraMounts, file: Path) -> list[s
         )
     if device.left_out:
         notes.append(f"{device.left_out} poses of {file.name} are of another world than most (its graph): left out")
-    gap = max(device.times[0] - mounts.times[-1], mounts.times[0] - device.times[-1])
-    if mounts.path.name == CALIBRATION and gap > 0:
-        notes.append(
-            f"{mounts.path.name} is of another time than {file.name} ({gap:.1f} s apart): is it of one recording?"
-        )
+    if mounts is not None:
+        gap = max(device.times[0] - mounts.times[-1], mounts.times[0] - device.times[-1])
+        if gap > 0:
+            notes.append(
+                f"{CALIBRATION} is of another time than {file.name} ({gap:.1f} s apart): is it of one recording?"
+            )
     return notes
 
 
@@ -152,8 +137,8 @@ def _with_points(
     numbers: NDArray[np.int64],
     xyz: NDArray[np.float64],
     limit: int,
-) -> tuple[list[PosedImage], list[str]]:
-    """Return the frames, taken at device times (F,), with the points that they observe, and remarks for the user."""
+) -> tuple[list[PosedImage], str]:
+    """Return the frames, taken at device times (F,), with the points that they observe, and a remark for the user."""
     file = next((folder / name for name in OBSERVATIONS if (folder / name).is_file()), None)
     if file is None:
         seen = [np.arange(len(xyz))] * len(frames)
@@ -168,11 +153,12 @@ def _with_points(
             a, b = np.searchsorted(instants, (time - SEEN_WITHIN, time + SEEN_WITHIN))
             seen.append(np.unique(np.concatenate([np.zeros(0, np.int64), *groups[a:b]])))
         note = f"points seen within {SEEN_WITHIN} s by the tracking cameras, at the pixels that they project to"
-    result = []
-    for frame, mine in zip(frames, seen, strict=True):
-        result.append(frame.with_points(spread_points(xyz[mine], numbers[mine], frame, limit)))
+    result = [
+        frame.with_points(spread_points(xyz[mine], numbers[mine], frame, limit))
+        for frame, mine in zip(frames, seen, strict=True)
+    ]
     if not any(len(frame.points) for frame in result):
         raise InputError(
             f"{folder}: none of the {len(xyz)} points projects into any frame: is source.intrinsics right?"
         )
-    return result, [note]
+    return result, note

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from modp_ti.files import LARGEST, input_lines, parse_json
 from modp_ti.files.csv_columns import read_csv_blocks
 from modp_ti.files.errors import InputError
+from modp_ti.files.number_rows import NumberRows
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.trackers.trajectory import require_rising
 
@@ -23,9 +23,8 @@ __all__ = [
     "CameraMounts",
     "DeviceTrajectory",
     "read_calibration",
-    "read_closed_loop",
+    "read_device_trajectory",
     "read_observations",
-    "read_open_loop",
     "read_points",
 ]
 
@@ -37,14 +36,12 @@ class DeviceTrajectory:
     """Device poses over time.
 
     Attributes:
-        path: The file.
         times: Times (N,) on the device clock [s], strictly increasing.
         T_world_device: Poses (N, 4, 4), device to world.
         world: Name of the world frame (`graph_uid` or `session_uid`).
         left_out: Number of poses that belong to other worlds and were dropped.
     """
 
-    path: Path
     times: NDArray[np.float64]
     T_world_device: NDArray[np.float64]
     world: str
@@ -56,12 +53,10 @@ class CameraMounts:
     """Pose of a camera on the device, estimated over time.
 
     Attributes:
-        path: The file.
         times: Times (N,) [s].
         T_device_camera: Poses (N, 4, 4), camera to device.
     """
 
-    path: Path
     times: NDArray[np.float64]
     T_device_camera: NDArray[np.float64]
 
@@ -70,69 +65,52 @@ class CameraMounts:
         return self.T_device_camera[int(np.abs(self.times - time).argmin())]
 
 
-def read_closed_loop(path: Path) -> DeviceTrajectory:
-    """Read closed_loop_trajectory.csv.
+def read_device_trajectory(path: Path, open_loop: bool) -> DeviceTrajectory:
+    """Read closed_loop_trajectory.csv, or open_loop_trajectory.csv, the odometry, which drifts.
 
-    If there are several worlds (`graph_uid`), the one with most poses is used; poses of the others are counted in
-    `left_out`.
+    If there are several worlds (`graph_uid`; `session_uid` of the open loop), the one with most poses is used; poses of
+    the others are counted in `left_out`.
+
+    Args:
+        path: The file.
+        open_loop: Whether it is that of the open loop.
 
     Raises:
         InputError: If the file is malformed. The message names file and line. The other readers do the same.
     """
-    return _trajectory(path, "graph_uid", "world_device")
-
-
-def read_open_loop(path: Path) -> DeviceTrajectory:
-    """Read open_loop_trajectory.csv, the odometry, which drifts. The session with most poses is used."""
-    return _trajectory(path, "session_uid", "odometry_device")
-
-
-def _trajectory(path: Path, world: str, frame: str) -> DeviceTrajectory:
+    world, frame = ("session_uid", "odometry_device") if open_loop else ("graph_uid", "world_device")
     names = [f"{axis}_{frame}" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
     columns = {"tracking_timestamp_us": "i8", world: "U64", **dict.fromkeys(names, "f8")}
     blocks = list(read_csv_blocks(path, columns))
-    table = np.concatenate([rows for _, rows in blocks]) if blocks else np.zeros(0, dtype=list(columns.items()))
-    if len(table) == 0:
+    if not blocks:
         raise InputError(f"{path}: holds no pose")
+    table = np.concatenate([rows for _, rows in blocks])
     worlds, count = np.unique(table[world], return_counts=True)
     main = worlds[count.argmax()]
     rows = np.flatnonzero(table[world] == main)
     table = table[rows]
-
-    def where(row: int) -> str:
-        return f"{path}:{rows[row] + 2}"
-
     times = table["tracking_timestamp_us"] * MICROSECONDS
-    require_rising(times, where)
-    values = np.stack([table[name] for name in names], axis=1)
-    poses = poses_of_quaternions(values[:, :3], values[:, 3:], where)
-    return DeviceTrajectory(path, times, poses, str(main), int(count.sum() - count.max()))
+    poses = _poses(NumberRows(path, np.stack([times, *(table[name] for name in names)], axis=1), rows + 2))
+    return DeviceTrajectory(times, poses, str(main), int(count.sum() - count.max()))
 
 
 def read_calibration(path: Path, label: str) -> CameraMounts:
     """Read `T_device_camera` of the camera with this label from online_calibration.jsonl."""
-    times, translations, quaternions, lines = [], [], [], []
-    for number, line in enumerate(input_lines(path), start=1):
-        if not line.strip():
-            continue
-        time, translation, quaternion = _mount(line, label, path, number)
-        times.append(time)
-        translations.append(translation)
-        quaternions.append(quaternion)
-        lines.append(number)
-    if not times:
+    numbered = enumerate(input_lines(path), start=1)
+    table = np.array([(number, *_mount(line, label, path, number)) for number, line in numbered if line.strip()])
+    if len(table) == 0:
         raise InputError(f"{path}: holds no calibration")
-
-    def where(row: int) -> str:
-        return f"{path}:{lines[row]}"
-
-    require_rising(np.array(times), where)
-    return CameraMounts(
-        path, np.array(times), poses_of_quaternions(np.array(translations), np.array(quaternions), where)
-    )
+    rows = NumberRows(path, table[:, 1:], table[:, 0].astype(np.int64))
+    return CameraMounts(rows.values[:, 0], _poses(rows))
 
 
-def _mount(line: str, label: str, path: Path, number: int) -> tuple[float, list[float], list[float]]:
+def _poses(rows: NumberRows) -> NDArray[np.float64]:
+    """Poses (N, 4, 4) of rows `time tx ty tz qx qy qz qw`, whose times must increase."""
+    require_rising(rows.values[:, 0], rows.where)
+    return poses_of_quaternions(rows.values[:, 1:4], rows.values[:, 4:], rows.where)
+
+
+def _mount(line: str, label: str, path: Path, number: int) -> list[float]:
     """Parse time, translation and quaternion (x, y, z, w) of the camera from one line."""
     data, what = parse_json(line, str(path), number), f"{path}:{number}"
     cameras = data.get("CameraCalibrations") if isinstance(data, Mapping) else None
@@ -144,24 +122,16 @@ def _mount(line: str, label: str, path: Path, number: int) -> tuple[float, list[
         raise InputError(f"{what}: holds no camera {label}, only {known} (tracker.camera)")
     try:
         mount = cameras[labels.index(label)]["T_Device_Camera"]
-        real, imaginary = mount["UnitQuaternion"]
-        time = float(data["tracking_timestamp_us"]) * MICROSECONDS
-        translation, quaternion = _numbers(mount["Translation"], 3), [*_numbers(imaginary, 3), float(real)]
-        if not (np.abs([time, *translation, *quaternion]) <= LARGEST).all():
+        (x, y, z), (w, (qx, qy, qz)) = mount["Translation"], mount["UnitQuaternion"]
+        row = [float(data["tracking_timestamp_us"]) * MICROSECONDS, *map(float, (x, y, z, qx, qy, qz, w))]
+        if not (np.abs(row) <= LARGEST).all():
             raise ValueError
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
         raise InputError(
             f"{what}: `tracking_timestamp_us` and T_Device_Camera of {label} must be numbers: Translation [x, y, z], "
             "UnitQuaternion [w, [x, y, z]]"
         ) from None
-    return time, translation, quaternion
-
-
-def _numbers(values: Any, count: int) -> list[float]:
-    numbers = [float(value) for value in values]
-    if len(numbers) != count:
-        raise ValueError
-    return numbers
+    return row
 
 
 def read_points(

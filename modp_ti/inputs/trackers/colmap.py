@@ -44,19 +44,17 @@ def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTrac
         raise InputError(f"{folder}: the COLMAP model holds no image{' with a pose' if model.images else ''}")
     posed, notes = matched_entries(images, source, stated, folder, str(folder), "images")
     undistorters = {i: _undistorter(camera, images.scale, folder) for i, camera in model.cameras.items()}
-    cameras = [(name, undistorters[image.camera_id]) for name, image in posed.items()]
+    cameras = {name: undistorters[image.camera_id] for name, image in posed.items()}
     reader = checked_reader(images, source, cameras, str(folder))
 
     positions = {i: np.asarray(point.xyz, dtype=np.float64) for i, point in model.points3D.items()}
     frames = []
     for name, image in posed.items():
-        undistorter = undistorters[image.camera_id]
-        T_camera_world = np.eye(4)
-        T_camera_world[:3] = image.cam_from_world().matrix()
-        T_camera_world = checked_pose(T_camera_world, f"{folder}: image {image.name}")
-        points = _observed_points(image, positions, undistorter, T_camera_world, folder)
-        frames.append(PosedImage(name, undistorter, T_camera_world, points))
-    return ReplayedTracker(reader, frames, source, notes)
+        matrix = np.vstack([image.cam_from_world().matrix(), (0.0, 0.0, 0.0, 1.0)])
+        T_camera_world = checked_pose(matrix, f"{folder}: image {image.name}")
+        points = _observed_points(image, positions, cameras[name], T_camera_world, folder)
+        frames.append(PosedImage(name, cameras[name], T_camera_world, points))
+    return ReplayedTracker(reader, frames, notes)
 
 
 def _model_folder(images: Path, given: Path | None) -> Path:

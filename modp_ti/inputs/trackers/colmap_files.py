@@ -24,7 +24,6 @@ __all__ = ["read_colmap_model"]
 # Number of parameters of each camera model, by COLMAP's model id.
 CAMERA_PARAMS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
 
-
 STEMS = ("cameras", "images", "points3D")
 # Longest line of a text model [characters]. All observations of an image are in one line.
 MAX_TEXT_LINE = 1 << 24
@@ -38,13 +37,14 @@ def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-    if not any(all((folder / f"{stem}{suffix}").exists() for stem in STEMS) for suffix in (".bin", ".txt")):
-        missing = [stem for stem in STEMS if not any((folder / f"{stem}{s}").exists() for s in (".bin", ".txt"))]
-        raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
-    if all((folder / f"{stem}.bin").exists() for stem in STEMS):
+    lacking = {s: {stem for stem in STEMS if not (folder / f"{stem}{s}").exists()} for s in (".bin", ".txt")}
+    if not lacking[".bin"]:
         _require_whole_binary_model(folder)
-    else:
+    elif not lacking[".txt"]:
         _require_text_model(folder)
+    else:
+        missing = sorted(lacking[".bin"] & lacking[".txt"])
+        raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
     try:
         model = pycolmap.Reconstruction(str(folder))
         for image in model.images.values():
@@ -55,103 +55,86 @@ def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def _number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise _DamagedError(f"{word[:40]!r} stands where a number should") from None
-
-
 def _require_text_model(folder: Path) -> None:
     """Raise InputError if a .txt file of the model is not text or an image's quaternion is invalid."""
-    for stem in RECORDS:
-        file = folder / f"{stem}.txt"
-        if not file.exists():
-            continue
-        try:
-            lines = input_lines(file, "; export the COLMAP model again", MAX_TEXT_LINE)
-            for line in lines:
-                words = line.split(maxsplit=5)
-                if stem == "images" and words and not words[0].startswith("#"):
-                    _require_quaternion([_number(word) for word in words[1:5]])
-                    next(lines, None)  # the image's observations
-        except _DamagedError as error:
-            raise InputError(f"{file}: {error}; the file is damaged") from None
+    for file in filter(Path.exists, (folder / f"{stem}.txt" for stem in RECORDS)):
+        lines = input_lines(file, "; export the COLMAP model again", MAX_TEXT_LINE)
+        for line in lines:
+            words = line.split(maxsplit=5)
+            if file.stem == "images" and words and not words[0].startswith("#"):
+                try:
+                    _require_quaternion(file, [float(word) for word in words[1:5]])
+                except ValueError as error:
+                    raise InputError(f"{file}: {error!s:.80}; the file is damaged") from None
+                next(lines, None)  # the image's observations
 
 
-class _CutOffError(Exception):
-    """A record extends beyond the end of the file."""
-
-
-class _DamagedError(Exception):
-    """A record contains values that COLMAP never writes."""
+def _require_quaternion(file: Path, q: Sequence[float]) -> None:
+    """Raise InputError if a quaternion is not of unit length. COLMAP would normalise it silently."""
+    length = math.hypot(*q)
+    if not 0.9 < length < 1.1:
+        raise InputError(
+            f"{file}: the quaternion of an image has length {length:.4g} instead of 1; the file is damaged"
+        )
 
 
 class _Cursor:
-    def __init__(self, data: bytes) -> None:
-        self.data = data
+    """A position in a file. Moving it beyond the end raises InputError."""
+
+    def __init__(self, file: Path) -> None:
+        with readable(file):
+            self.data = read_bytes(file)
+        self.file = file
         self.at = 0
 
     def skip(self, size: int) -> None:
         self.at += size
         if self.at > len(self.data):
-            raise _CutOffError
+            raise InputError(f"{self.file}: the file is cut off; copy or export the COLMAP model again")
 
     def read(self, form: str) -> tuple[Any, ...]:
         size = struct.calcsize(form)
         self.skip(size)
         return struct.unpack_from(form, self.data, self.at - size)
 
-    def skip_text(self) -> None:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise _CutOffError
-        self.at = end + 1
-
-
-def _require_quaternion(q: Sequence[float]) -> None:
-    """Raise _DamagedError if a quaternion is not of unit length. COLMAP would normalise it silently."""
-    length = math.hypot(*q)
-    if not 0.9 < length < 1.1:
-        raise _DamagedError(f"the quaternion of an image has length {length:.4g} instead of 1")
+    def skip_list(self, count: str, size: int) -> None:
+        """Skip items of this size and, before them, their number in the format `count`."""
+        self.skip(size * self.read(count)[0])
 
 
 def _camera(cursor: _Cursor) -> None:
-    cursor.skip(4)  # id
-    (model,) = cursor.read("<i")
-    cursor.skip(16)  # width, height
+    (model,) = cursor.read("<4xi16x")  # id, model, width, height
     if model not in CAMERA_PARAMS:
-        raise _DamagedError(f"camera model number {model} is not known")
+        raise InputError(
+            f"{cursor.file}: camera model number {model} is not known; the file is damaged or of a newer COLMAP"
+        )
     cursor.skip(8 * CAMERA_PARAMS[model])
 
 
 def _image(cursor: _Cursor) -> None:
-    cursor.skip(4)  # id
-    _require_quaternion(cursor.read("<4d"))
-    cursor.skip(3 * 8 + 4)  # position, camera
-    cursor.skip_text()
-    cursor.skip(24 * cursor.read("<Q")[0])  # x, y, point
+    _require_quaternion(cursor.file, cursor.read("<4x4d28x"))  # id, quaternion, position, camera
+    end = cursor.data.find(b"\0", cursor.at)  # of the name
+    cursor.skip((len(cursor.data) if end < 0 else end) + 1 - cursor.at)
+    cursor.skip_list("<Q", 24)  # x, y, point
 
 
 def _point(cursor: _Cursor) -> None:
     cursor.skip(8 + 3 * 8 + 3 + 8)  # id, position, colour, error
-    cursor.skip(8 * cursor.read("<Q")[0])  # image, observation
+    cursor.skip_list("<Q", 8)  # image, observation
 
 
 def _rig(cursor: _Cursor) -> None:
-    cursor.skip(4)  # id
-    (sensors,) = cursor.read("<I")
+    (sensors,) = cursor.read("<4xI")  # id, number of sensors
     if sensors > 0:
         cursor.skip(8)  # the reference sensor has no pose
     for _ in range(sensors - 1):
-        cursor.skip(8)
-        if cursor.read("<B")[0]:
+        if cursor.read("<8xB")[0]:
             cursor.skip(7 * 8)
 
 
 def _frame(cursor: _Cursor) -> None:
     cursor.skip(4 + 4 + 7 * 8)  # id, rig, pose
-    cursor.skip(16 * cursor.read("<I")[0])  # sensor type, sensor, data
+    cursor.skip_list("<I", 16)  # sensor type, sensor, data
 
 
 RECORDS: dict[str, Callable[[_Cursor], None]] = {
@@ -169,14 +152,8 @@ def _require_whole_binary_model(folder: Path) -> None:
         file = folder / f"{stem}.bin"
         if not file.exists():
             continue
-        with readable(file):
-            cursor = _Cursor(read_bytes(file))
-        try:
-            for _ in range(cursor.read("<Q")[0]):
-                skip_record(cursor)
-        except _CutOffError:
-            raise InputError(f"{file}: the file is cut off; copy or export the COLMAP model again") from None
-        except _DamagedError as error:
-            raise InputError(f"{file}: {error}; the file is damaged or of a newer COLMAP") from None
+        cursor = _Cursor(file)
+        for _ in range(cursor.read("<Q")[0]):
+            skip_record(cursor)
         if cursor.at != len(cursor.data):
             raise InputError(f"{file}: {len(cursor.data) - cursor.at} bytes too long; export the COLMAP model again")

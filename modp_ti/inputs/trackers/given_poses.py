@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import GivenPosesSettings
+from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out, require_fitting_sizes
-from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out, readable_sizes
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, Undistorter
 from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.trackers.point_cloud import read_point_file, visible_points
 
@@ -28,6 +29,8 @@ __all__ = [
     "found_file",
     "matched_entries",
     "missing_frames_note",
+    "posed_images",
+    "read_entries",
     "replay_poses",
     "selected_frames",
     "solving",
@@ -40,6 +43,33 @@ T = TypeVar("T")
 def selected_frames(images: ImageSource, source: SourceSettings) -> Sequence[str]:
     """Return the images selected by source.start/stop/step, in order."""
     return images.selected(source.start, source.stop, source.step)
+
+
+def read_entries(
+    file: Path, key: str, image: str, what: str
+) -> tuple[dict[str, Any], list[tuple[str, dict[str, Any]]]]:
+    """Read a JSON file whose list under `key` has an entry for each image.
+
+    Args:
+        file: The file.
+        key: Key of the list, in the plural.
+        image: Key of an entry that names its image.
+        what: Description of the file, for error messages.
+
+    Returns:
+        The content of the file, and the image name and content of each entry.
+
+    Raises:
+        InputError: If the file is not JSON, or lacks the list or an image name.
+    """
+    data = read_json(file, "tracker.path")
+    entries = data.get(key) if isinstance(data, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{file}: holds no list of `{key}`; it is not {what}")
+    for number, entry in enumerate(entries):
+        if not isinstance(entry, dict) or not isinstance(entry.get(image), str):
+            raise InputError(f"{file}: {key[:-1]} {number} has no `{image}`")
+    return data, [(entry[image], entry) for entry in entries]
 
 
 def matched_entries(
@@ -115,23 +145,67 @@ def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
 
 
 def checked_reader(
-    images: ImageSource, source: SourceSettings, cameras: Sequence[tuple[str, Undistorter]], intrinsics: str
+    images: ImageSource, source: SourceSettings, cameras: Mapping[str, Undistorter], intrinsics: str
 ) -> FrameReader:
     """Create the reader of the frames and check that images, masks and vignette match the cameras.
+
+    Only headers of the images are read, so that a run with wrong intrinsics fails at its start.
 
     Args:
         images: The image source.
         source: Settings of the images.
-        cameras: Name and undistorter of each image that will be read.
+        cameras: Undistorter of each image that will be read, by name.
         intrinsics: Origin of the cameras, for error messages.
 
     Raises:
         InputError: If an image, a mask or the vignette does not match its camera.
+        UnreadableImageError: If more than a share `FEW` of the images are unreadable.
     """
-    require_fitting_sizes(images, cameras, intrinsics)
+    for name, (width, height) in readable_sizes(images, list(cameras)):
+        raw = cameras[name].raw
+        if (width, height) == (raw.width, raw.height):
+            continue
+        advice = "give source.path the images that belong to these intrinsics"
+        ratio = width / raw.width
+        if (width, height) == (raw.height, raw.width):
+            advice = "the image lies on its side: turn the pixels (an EXIF orientation is not applied)"
+        elif abs(ratio * raw.height - height) <= 1.0:
+            advice = (
+                f"the image is the same view at {ratio:.4g} of the size: {advice}"
+                + (f" and set source.scale: {ratio:.4g}" if ratio < 1 else "")
+                + f", or multiply the intrinsics and the size in {intrinsics} by {ratio:.4g}"
+            )
+        raise InputError(
+            f"{images.path / name} is {width}x{height}, its camera in {intrinsics} is "
+            f"{raw.width}x{raw.height}; {advice}"
+        )
     reader = FrameReader(images, source)
-    reader.require_fitting(cameras)
+    reader.require_fitting(cameras.items())
     return reader
+
+
+def posed_images(
+    images: ImageSource,
+    source: SourceSettings,
+    poses: Mapping[str, NDArray[np.float64]],
+    intrinsics: Intrinsics | None = None,
+    origin: str = "source.intrinsics",
+) -> tuple[FrameReader, list[PosedImage]]:
+    """Create the reader and the frames of images that one camera took; see `checked_reader`.
+
+    Args:
+        images: The image source.
+        source: Settings of the images.
+        poses: T_camera_world (4, 4) by image name, in the source's order.
+        intrinsics: The camera; that of the image source if None.
+        origin: Origin of the camera, for error messages.
+
+    Raises:
+        InputError: As for `checked_reader`, or if the camera is unknown.
+    """
+    undistorter = (intrinsics or require_intrinsics(images)).undistorter(images.scale)
+    reader = checked_reader(images, source, dict.fromkeys(poses, undistorter), origin)
+    return reader, [PosedImage(name, undistorter, T) for name, T in poses.items()]
 
 
 def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], origin: str) -> list[str]:
@@ -150,7 +224,7 @@ def replay_poses(
     notes: Sequence[str],
     progress: Progress | None,
 ) -> ReplayedTracker:
-    """Create a tracker over the images that have a pose, in the source's order.
+    """Create a tracker over the images that have a pose.
 
     If `tracker.points` is set, each frame gets the points of that file that project into it. Otherwise features are
     tracked and triangulated with the given poses before the first frame is delivered. With `tracker.adjust`, the poses
@@ -160,17 +234,14 @@ def replay_poses(
         images: The image source.
         source: Settings of the images.
         tracker: Settings of the tracker.
-        poses: T_camera_world (4, 4) by image name.
+        poses: T_camera_world (4, 4) by image name, in the source's order.
         notes: Remarks for the user.
         progress: Called while points are triangulated.
 
     Raises:
         InputError: If the camera is unknown, images do not match it, or the point file is invalid.
     """
-    undistorter = require_intrinsics(images).undistorter(images.scale)
-    names = sorted(poses, key=images.position)
-    reader = checked_reader(images, source, [(name, undistorter) for name in names], "source.intrinsics")
-    frames = [PosedImage(name, undistorter, poses[name]) for name in names]
+    reader, frames = posed_images(images, source, poses)
     if tracker.points is not None:
         xyz = read_point_file(tracker.points)
         numbers = np.arange(len(xyz))
@@ -187,7 +258,7 @@ def replay_poses(
             notes = [*notes, note]
         else:
             frames = triangulated_frames(images, frames, solves, progress)
-    return ReplayedTracker(reader, frames, source, notes)
+    return ReplayedTracker(reader, frames, notes)
 
 
 def solving(frames: Sequence[PosedImage], source: SourceSettings) -> NDArray[np.bool_]:

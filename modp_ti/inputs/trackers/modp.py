@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ModpSettings
-from modp_ti.files import LARGEST, open_file, read_json, readable
+from modp_ti.files import LARGEST, open_file, readable
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import read_number_rows
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
+from modp_ti.inputs.replay import ReplayedTracker, checked_pose
 from modp_ti.inputs.sources import open_source
-from modp_ti.inputs.sources.protocol import require_intrinsics
-from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, matched_entries
+from modp_ti.inputs.trackers.given_poses import found_file, matched_entries, posed_images, read_entries
 from modp_ti.inputs.trackers.point_cloud import projected_points
 
 __all__ = ["open_modp"]
@@ -50,53 +49,44 @@ def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
     place = source.require_path()
     guesses = [folder / name for name in (POSES, POSES_ORB) for folder in (place, place.parent)]
     file = found_file(tracker.path, guesses, f"the release's {POSES} or {POSES_ORB}")
-    cameras = _cameras(file)
+    _, cameras = read_entries(file, "cameras", "image", "a trajectory of the release")
+    stated = [
+        (image, (number, _pose(file, number, image, camera.get("T_camera_world"))))
+        for number, (image, camera) in enumerate(cameras)
+    ]
     folder = file.parent / CLOUDS.get(file.name, CLOUDS[POSES])
     clouds = _cloud_files(folder)
     images = open_source(source)
-    stated = ((image, (number, T)) for number, (image, T) in enumerate(cameras))
     entries, notes = matched_entries(images, source, stated, file, file.name, "cameras")
     numbers = [number for number, _ in entries.values()]
-    undistorter = require_intrinsics(images).undistorter(images.scale)
-    reader = checked_reader(images, source, [(name, undistorter) for name in entries], "source.intrinsics")
+    reader, posed = posed_images(images, source, {name: T for name, (_, T) in entries.items()})
     xyz = [_read_cloud(clouds[number]) if number in clouds else np.zeros((0, 3)) for number in numbers]
     if not any(len(each) for each in xyz):
         raise InputError(f"{folder}: holds no point for any of the {len(entries)} frames")
     # The same coordinates get the same id in all files.
     _, ids = np.unique(np.concatenate(xyz), axis=0, return_inverse=True)
-    ids = ids.reshape(-1).astype(np.int64)
-    frames, first = [], 0
-    for (name, (_, T)), cloud in zip(entries.items(), xyz, strict=True):
-        mine, rows = np.unique(ids[first : first + len(cloud)], return_index=True)
-        frames.append(PosedImage(name, undistorter, T, projected_points(cloud[rows], mine, undistorter, T)))
-        first += len(cloud)
-
+    ends = np.cumsum([len(cloud) for cloud in xyz])
+    frames = []
+    for frame, cloud, stated_ids in zip(posed, xyz, np.split(ids.reshape(-1), ends[:-1]), strict=True):
+        mine, rows = np.unique(stated_ids, return_index=True)
+        points = projected_points(cloud[rows], mine, frame.undistorter, frame.T_camera_world)
+        frames.append(frame.with_points(points))
     without = sum(number not in clouds for number in numbers)
     if without:
         notes.append(f"{without} frames have no file of points in {folder}: they bring none")
-    return ReplayedTracker(reader, frames, source, notes)
+    return ReplayedTracker(reader, frames, notes)
 
 
-def _cameras(file: Path) -> list[tuple[str, NDArray[np.float64]]]:
-    """Read image name and `T_camera_world` of each entry."""
-    data = read_json(file, "tracker.path")
-    entries = data.get("cameras") if isinstance(data, dict) else None
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f"{file}: holds no list of `cameras`; it is not a trajectory of the release")
-    return [_camera(file, number, entry) for number, entry in enumerate(entries)]
-
-
-def _camera(file: Path, number: int, entry: Any) -> tuple[str, NDArray[np.float64]]:
-    image = entry.get("image") if isinstance(entry, dict) else None
-    if not isinstance(image, str):
-        raise InputError(f"{file}: camera {number} has no `image`")
+def _pose(file: Path, number: int, image: str, stated: Any) -> NDArray[np.float64]:
+    """Read `T_camera_world` of an entry."""
+    what = f"{file}: camera {number} ({image})"
     try:
-        matrix = np.array(entry.get("T_camera_world"), dtype=np.float64)
+        matrix = np.array(stated, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4):
-        raise InputError(f"{file}: camera {number} ({image}): `T_camera_world` must be 4 rows of 4 numbers")
-    return image, checked_pose(matrix, f"{file}: camera {number} ({image})")
+        raise InputError(f"{what}: `T_camera_world` must be 4 rows of 4 numbers")
+    return checked_pose(matrix, what)
 
 
 def _cloud_files(folder: Path) -> dict[int, Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from fields.frames.tracked_frame import SparsePoints
 from modp_ti.files import limited_lines, open_file, read_bytes, readable
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import read_number_rows
-from modp_ti.files.ply import PlyHeader, parse_ply_header
+from modp_ti.files.ply import parse_ply_header
 from modp_ti.files.trajectory import FARTHEST
 from modp_ti.inputs.replay import points_inside
 from modp_ti.inputs.sources import Undistorter
@@ -59,8 +59,11 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
     xyz = np.empty((header.count, 3))
     try:
         if header.form == "ascii":
-            for row, line in zip(xyz, _ascii_rows(data, header), strict=False):
-                words = line.split()
+            file = io.BytesIO(data)
+            file.seek(header.start)
+            lines = limited_lines(io.TextIOWrapper(file, encoding="ascii"))
+            rows = islice((line.split() for line in lines if not line.isspace()), header.count)
+            for row, words in zip(xyz, rows, strict=True):
                 if len(words) < len(header.properties):
                     raise ValueError
                 row[:] = [float(words[place]) for place in places]
@@ -71,21 +74,9 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
             with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
                 for column, axis in enumerate("xyz"):
                     xyz[:, column] = vertices[axis]
-    except (ValueError, UnicodeDecodeError):
+    except (ValueError, OSError):  # OSError: a line is too long
         raise InputError(f"{path}: the PLY file is damaged or cut off") from None
     return xyz[(np.abs(xyz) <= FARTHEST).all(axis=1)]
-
-
-def _ascii_rows(data: bytes, header: PlyHeader) -> Iterator[str]:
-    """Yield the vertex lines. Raises ValueError if there are fewer than the header states."""
-    with io.TextIOWrapper(io.BytesIO(data), encoding="ascii") as text:
-        text.buffer.seek(header.start)
-        rows = (line for line in limited_lines(text) if not line.isspace())
-        for _ in range(header.count):
-            line = next(rows, None)
-            if line is None:
-                raise ValueError
-            yield line
 
 
 def projected_points(

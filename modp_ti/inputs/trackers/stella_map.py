@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -120,9 +120,9 @@ def _read(path: Path, file: BinaryIO) -> StellaMap:
     cameras: dict[str, Intrinsics] = {}
     keyframes: list[StellaKeyframe] = []
     landmarks: dict[int, NDArray[np.float64]] = {}
-    sections = set()
+    missing = {"cameras": 0, "keyframes": 0, "landmarks": 0}
     for section in _keys(unpacker, "the map"):
-        sections.add(section)
+        missing.pop(section, None)
         if section == "cameras":
             cameras = {name: _camera(name, unpacker.unpack()) for name in _keys(unpacker, "cameras")}
         elif section == "keyframes":
@@ -131,9 +131,8 @@ def _read(path: Path, file: BinaryIO) -> StellaMap:
             landmarks = {_number(key, "landmark"): _landmark(unpacker, key) for key in _keys(unpacker, "landmarks")}
         else:
             unpacker.skip()
-    missing = [section for section in ("cameras", "keyframes", "landmarks") if section not in sections]
     if missing:
-        raise _DamagedError(f"the map holds no `{missing[0]}`")
+        raise _DamagedError(f"the map holds no `{next(iter(missing))}`")
     if not keyframes:
         raise InputError(f"{path}: the map holds no keyframe: stella_vslam did not initialise")
     if not landmarks:
@@ -155,15 +154,29 @@ def _keys(unpacker: msgpack.Unpacker, what: str) -> Iterator[str]:
     """Yield the keys of the next map. The caller must consume each value before it requests the next key."""
     try:
         count = unpacker.read_map_header()
-    except (ValueError, msgpack.UnpackException) as error:
-        if isinstance(error, msgpack.OutOfData):
-            raise
+    except msgpack.OutOfData:
+        raise
+    except (ValueError, msgpack.UnpackException):
         raise _DamagedError(f"{what}: a table of names is expected") from None
     for _ in range(count):
         key = unpacker.unpack()
         if not isinstance(key, str):
             raise _DamagedError(f"{what}: a name is expected, not {key!r:.40}")
         yield key
+
+
+def _values(unpacker: msgpack.Unpacker, what: str, wanted: Sequence[str]) -> dict[str, Any]:
+    """Read the wanted values of the next map, which must have all of them. The others are skipped."""
+    values: dict[str, Any] = {}
+    for name in _keys(unpacker, what):
+        if name in wanted:
+            values[name] = unpacker.unpack()
+        else:
+            unpacker.skip()
+    for name in wanted:
+        if name not in values:
+            raise _DamagedError(f"{what} has no `{name}`")
+    return values
 
 
 def _number(key: str, what: str) -> int:
@@ -199,21 +212,14 @@ def _camera(name: str, values: Any) -> Intrinsics:
 
     try:
         # stella_vslam has pixel centres at whole numbers, as OpenCV does.
-        camera = PinholeCamera(
-            number("fx"),
-            number("fy"),
-            number("cx") + 0.5,
-            number("cy") + 0.5,
-            int(number("cols")),
-            int(number("rows")),
-        )
+        fx, fy, cx, cy, width, height = map(number, ("fx", "fy", "cx", "cy", "cols", "rows"))
+        camera = PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, int(width), int(height))
     except ValueError as error:
         raise _DamagedError(f"{what}: {error}") from None
     if model == "Fisheye":
-        lens = Distortion(tuple(number(key) for key in ("k1", "k2", "k3", "k4")), fisheye=True)
+        lens = Distortion(tuple(map(number, ("k1", "k2", "k3", "k4"))), fisheye=True)
     else:
-        radial = tuple(number(key) for key in ("k1", "k2", "k3"))
-        lens = Distortion(radial, tangential=(number("p1"), number("p2")))
+        lens = Distortion(tuple(map(number, ("k1", "k2", "k3"))), tangential=(number("p1"), number("p2")))
     try:
         return Intrinsics(*require_plausible(camera, lens, what))
     except InputError as error:
@@ -223,15 +229,7 @@ def _camera(name: str, values: Any) -> Intrinsics:
 def _keyframe(unpacker: msgpack.Unpacker, key: str) -> StellaKeyframe:
     number = _number(key, "keyframe")
     what = f"keyframe {number}"
-    values: dict[str, Any] = {}
-    for name in _keys(unpacker, what):
-        if name in WANTED:
-            values[name] = unpacker.unpack()
-        else:
-            unpacker.skip()
-    missing = [name for name in WANTED if name not in values]
-    if missing:
-        raise _DamagedError(f"{what} has no `{missing[0]}`")
+    values = _values(unpacker, what, WANTED)
     time = _floats(values["ts"], (), f"{what}: `ts`")
     rotation = _floats(values["rot_cw"], (1, 4), f"{what}: `rot_cw`")
     translation = _floats(values["trans_cw"], (1, 3), f"{what}: `trans_cw`")
@@ -255,12 +253,5 @@ def _keyframe(unpacker: msgpack.Unpacker, key: str) -> StellaKeyframe:
 
 
 def _landmark(unpacker: msgpack.Unpacker, key: str) -> NDArray[np.float64]:
-    position = None
-    for name in _keys(unpacker, f"landmark {key}"):
-        if name == "pos_w":
-            position = _floats(unpacker.unpack(), (3,), f"landmark {key}: `pos_w`")
-        else:
-            unpacker.skip()
-    if position is None:
-        raise _DamagedError(f"landmark {key} has no `pos_w`")
-    return position
+    values = _values(unpacker, f"landmark {key}", ("pos_w",))
+    return _floats(values["pos_w"], (3,), f"landmark {key}: `pos_w`")

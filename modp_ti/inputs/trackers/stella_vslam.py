@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,8 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import StellaVslamSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, points_inside
-from modp_ti.inputs.sources import ImageSource, Intrinsics, Undistorter, open_source
-from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, missing_frames_note, selected_frames
+from modp_ti.inputs.sources import ImageSource, Intrinsics, open_source
+from modp_ti.inputs.trackers.given_poses import found_file, posed_images
 from modp_ti.inputs.trackers.point_cloud import visible_points
 from modp_ti.inputs.trackers.stella_map import StellaKeyframe, StellaMap, read_stella_map
 from modp_ti.inputs.trackers.trajectory import TimedPoses, read_trajectory_file, rows_at_frames
@@ -44,37 +45,31 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
     world = read_stella_map(file)
     beside = file.with_name(TRAJECTORY)
     images = open_source(source)
-    selected = selected_frames(images, source)
     keyframe_times = np.array([keyframe.time for keyframe in world.keyframes])
     keyframes_alone = not beside.is_file()
     if keyframes_alone:
         trajectory = TimedPoses(file, keyframe_times, np.stack([each.T_camera_world for each in world.keyframes]))
     else:
         trajectory = read_trajectory_file(beside)
-    rows = rows_at_frames(images, selected, trajectory.path, trajectory.times, tracker)
+    rows, notes = rows_at_frames(images, source, trajectory.path, trajectory.times, tracker)
 
-    intrinsics, said_by = _intrinsics(images, world, source)
-    undistorter = intrinsics.undistorter(images.scale)
-    names = sorted(rows, key=images.position)
-    reader = checked_reader(images, source, [(name, undistorter) for name in names], said_by)
-
+    poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
+    reader, posed = posed_images(images, source, poses, *_intrinsics(images, world, source))
     frames, between = [], 0
-    for name in names:
-        time = trajectory.times[rows[name]]
+    for frame in posed:
+        time = trajectory.times[rows[frame.name]]
         nearest = int(np.abs(keyframe_times - time).argmin())
         if abs(keyframe_times[nearest] - time) <= SAME_TIME:
             keyframe = world.keyframes[nearest]
             # The map's pose comes from the same optimisation as its landmarks.
-            T = keyframe.T_camera_world
-            points = _observed(keyframe, world, undistorter)
+            frame = replace(frame, T_camera_world=keyframe.T_camera_world)
+            points = _observed(keyframe, world, frame)
         else:
-            T = trajectory.T_camera_world[rows[name]]
             after = int(np.searchsorted(keyframe_times, time))
-            points = _projected(world.keyframes[max(0, after - NEIGHBOURS) : after + NEIGHBOURS], world, undistorter, T)
+            points = _projected(world.keyframes[max(0, after - NEIGHBOURS) : after + NEIGHBOURS], world, frame)
             between += 1
-        frames.append(PosedImage(name, undistorter, T, points))
+        frames.append(frame.with_points(points))
 
-    notes = missing_frames_note(selected, rows, trajectory.path.name)
     if keyframes_alone:
         notes.append(f"{beside} is missing: it would have brought the poses of the frames between the keyframes")
     if between:
@@ -82,7 +77,7 @@ def open_stella_vslam(source: SourceSettings, tracker: StellaVslamSettings) -> R
             f"{between} frames between keyframes: the landmarks of the {NEIGHBOURS} keyframes on either side, at the "
             "pixels that they project to"
         )
-    return ReplayedTracker(reader, frames, source, notes)
+    return ReplayedTracker(reader, frames, notes)
 
 
 def _intrinsics(images: ImageSource, world: StellaMap, source: SourceSettings) -> tuple[Intrinsics, str]:
@@ -95,18 +90,16 @@ def _intrinsics(images: ImageSource, world: StellaMap, source: SourceSettings) -
     return world.cameras[cameras.pop()], str(world.path)
 
 
-def _observed(keyframe: StellaKeyframe, world: StellaMap, undistorter: Undistorter) -> SparsePoints:
+def _observed(keyframe: StellaKeyframe, world: StellaMap, frame: PosedImage) -> SparsePoints:
     xyz = _positions(keyframe.landmarks, world)
-    camera = undistorter.camera
-    pixels = keyframe.pixels * np.divide((camera.width, camera.height), (undistorter.raw.width, undistorter.raw.height))
-    return points_inside(xyz, pixels, keyframe.landmarks, undistorter, keyframe.T_camera_world)
+    camera, raw = frame.undistorter.camera, frame.undistorter.raw
+    pixels = keyframe.pixels * np.divide((camera.width, camera.height), (raw.width, raw.height))
+    return points_inside(xyz, pixels, keyframe.landmarks, frame.undistorter, keyframe.T_camera_world)
 
 
-def _projected(
-    keyframes: Sequence[StellaKeyframe], world: StellaMap, undistorter: Undistorter, T_camera_world: NDArray[np.float64]
-) -> SparsePoints:
+def _projected(keyframes: Sequence[StellaKeyframe], world: StellaMap, frame: PosedImage) -> SparsePoints:
     ids = np.unique(np.concatenate([keyframe.landmarks for keyframe in keyframes]))
-    points = visible_points(_positions(ids, world), undistorter, T_camera_world)
+    points = visible_points(_positions(ids, world), frame.undistorter, frame.T_camera_world)
     return SparsePoints(points.xyz, points.pixels, ids[points.ids])
 
 

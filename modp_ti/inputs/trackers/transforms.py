@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,19 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
-from modp_ti.files import is_file, read_json
+from modp_ti.files import is_file
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
 from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter, open_source
 from modp_ti.inputs.sources.intrinsics import require_plausible
-from modp_ti.inputs.trackers.given_poses import checked_reader, matched_entries, solving
+from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, matched_entries, read_entries, solving
 from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
 
 __all__ = ["open_transforms"]
+
+NAME = "transforms.json"
 
 # From OpenGL camera axes (x right, y up, z back) to OpenCV axes. The matrix is its own inverse.
 OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -48,9 +50,9 @@ def open_transforms(
     """
     place = source.require_path()
     images = open_source(source)
-    file = _transforms_file(place, tracker.path)
-    data = _read_json(file)
-    entries, notes = matched_entries(images, source, _named(data["frames"], file), file, file.name, "frames")
+    file = found_file(tracker.path, [place.parent / NAME, place / NAME], f"a {NAME}")
+    data, stated = read_entries(file, "frames", "file_path", f"a {NAME}")
+    entries, notes = matched_entries(images, source, stated, file, file.name, "frames")
 
     undistorters: dict[tuple[PinholeCamera, Distortion], Undistorter] = {}
     frames = []
@@ -58,7 +60,7 @@ def open_transforms(
         raw, distortion = _intrinsics({**data, **entry}, images, name, file)
         undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, images.scale))
         frames.append(PosedImage(name, undistorter, _pose(entry, file)))
-    reader = checked_reader(images, source, [(frame.name, frame.undistorter) for frame in frames], str(file))
+    reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(file))
 
     cloud = data.get("ply_file_path")
     if isinstance(cloud, str) and is_file(file.parent / cloud):
@@ -68,35 +70,7 @@ def open_transforms(
         if isinstance(cloud, str):
             notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
         frames = triangulated_frames(images, frames, solving(frames, source), progress)
-    return ReplayedTracker(reader, frames, source, notes)
-
-
-def _named(entries: list[Any], file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for number, entry in enumerate(entries):
-        path = entry.get("file_path") if isinstance(entry, dict) else None
-        if not isinstance(path, str):
-            raise InputError(f"{file}: frame {number} has no `file_path`")
-        yield path, entry
-
-
-def _transforms_file(images: Path, given: Path | None) -> Path:
-    if given is None:
-        guesses = [images.parent / "transforms.json", images / "transforms.json"]
-        for guess in guesses:
-            if guess.exists():
-                return guess
-        raise InputError(f"no transforms.json in {images.parent} or {images}: set tracker.path")
-    file = given / "transforms.json" if given.is_dir() else given
-    if not file.exists():
-        raise InputError(f"{file}: no such file (tracker.path)")
-    return file
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    data = read_json(file, "tracker.path")
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
-        raise InputError(f"{file}: holds no list of `frames`; it is not a transforms.json")
-    return data
+    return ReplayedTracker(reader, frames, notes)
 
 
 def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:

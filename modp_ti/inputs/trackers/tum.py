@@ -10,7 +10,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.sources import open_source
-from modp_ti.inputs.trackers.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
+from modp_ti.inputs.trackers.given_poses import found_file, replay_poses
 from modp_ti.inputs.trackers.trajectory import read_trajectory_file, rows_at_frames
 
 __all__ = ["open_orbslam3", "open_tum"]
@@ -71,10 +71,8 @@ def _replayed(
 ) -> ReplayedTracker:
     trajectory = read_trajectory_file(file)  # first, so that a wrong file is reported before images are listed
     images = open_source(source)
-    selected = selected_frames(images, source)
-    rows = rows_at_frames(images, selected, file, trajectory.times, tracker)
+    rows, notes = rows_at_frames(images, source, file, trajectory.times, tracker)
     poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
-    notes = missing_frames_note(selected, poses, file.name)
     if trajectory.left_out:
         of = trajectory.left_out + len(trajectory.times)
         notes.insert(0, f"{trajectory.left_out} of {of} lines of {file.name} hold NaN or a time out of order: left out")

@@ -8,14 +8,12 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, inverse_se3
-from modp_ti.inputs.klt.bundle_adjustment import adjust_bundle
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, triangulated
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.optical_flow import corners, flow
 from modp_ti.inputs.klt.patch_alignment import align_landmarks, reference_views
 from modp_ti.inputs.klt.two_view import two_views
-from modp_ti.inputs.multiview.camera_pose import pose_from_points
-from modp_ti.inputs.multiview.reprojection import ray_errors, refine_pose
+from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 
 CAMERA = PinholeCamera(500.0, 500.0, 320.0, 240.0, 640, 480)
 
@@ -120,7 +118,7 @@ def small_map(rng: np.random.Generator, noise: float, lens: Lens | None = None) 
 def test_bundle_adjustment_finds_the_scene_and_leaves_held_keyframes():
     landmarks, truth, xyz = small_map(np.random.default_rng(5), 0.01)
     held = [landmarks.keyframes[i].T_camera_world.copy() for i in (0, 1)]
-    cost = adjust_bundle(landmarks, free=[2, 3, 4, 5], held=[0, 1], steps=50)
+    cost = landmarks.adjust(free=[2, 3, 4, 5], held=[0, 1], steps=50)
     assert cost < 1e-6
     for i in (0, 1):
         np.testing.assert_array_equal(landmarks.keyframes[i].T_camera_world, held[i])
@@ -131,7 +129,7 @@ def test_bundle_adjustment_finds_the_scene_and_leaves_held_keyframes():
 
 def test_bundle_adjustment_finds_the_focal_length():
     landmarks, _, _ = small_map(np.random.default_rng(6), 0.0, Lens.radial(430.0, 0.0, 640, 480))
-    adjust_bundle(landmarks, range(6), steps=100, refined=["focal"])
+    landmarks.adjust(range(6), steps=100, refined=["focal"])
     assert landmarks.lens.focal == pytest.approx(500.0, rel=1e-3)
 
 

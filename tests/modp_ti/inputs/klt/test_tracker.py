@@ -13,7 +13,6 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
-from modp_ti.inputs.klt.tracker import ArrivingNames
 from modp_ti.inputs.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 
@@ -24,7 +23,7 @@ def known_camera(folder: Path, box_room, **settings) -> KltTracker:
     source, images = SourceSettings(path=folder, **settings), ImageFolder(folder)
     images.scale = settings.get("scale", 1.0)
     intrinsics = Intrinsics(box_room.camera)
-    return KltTracker(FrameReader(images, source), ArrivingNames(images, source), intrinsics, source)
+    return KltTracker(FrameReader(images, source), intrinsics)
 
 
 @pytest.fixture(scope="module")
