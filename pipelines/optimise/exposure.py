@@ -117,6 +117,7 @@ class ExposureRefinement:
                 return
             for keyframe in store:
                 keyframe.exposure = np.array(IDENTITY)
+        before = IDENTITY if view.exposure is None else view.exposure
         small = view.at_level(store.levels)
         renderer.forward(small.camera, view.T_camera_world, near)
         known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
@@ -125,7 +126,7 @@ class ExposureRefinement:
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:
             image = image / _resized(view.vignette, small.rgba)[known]
-        gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(view.exposure))
+        gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(before))
         view.exposure = np.column_stack([np.diag(gains), np.zeros(3)])
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], weight: float = 1.0) -> None:

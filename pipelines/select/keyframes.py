@@ -13,7 +13,7 @@ from fields.map.trajectory import Trajectory
 from pipelines.select.sharpness import sharpness
 from pipelines.settings import KeyframeSettings
 
-__all__ = ["KeyframeSelector", "SeenPoints", "covisibility"]
+__all__ = ["KeyframeSelector"]
 
 
 class KeyframeSelector:

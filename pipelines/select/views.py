@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
+from fields.map.covisibility import SeenPoints, covisibility
 from fields.map.keyframes import KeyframeStore
-from pipelines.select.keyframes import SeenPoints, covisibility
 from pipelines.settings import ViewSettings
 
 __all__ = ["LocalGlobalViews", "ViewSelection", "global_probabilities"]
