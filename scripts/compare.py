@@ -144,17 +144,15 @@ def report(figures: Mapping[str, Mapping[str, Figures]], breakdown: Mapping[str,
     times = dict(breakdown)
     if len(figures) > 1:
         times["mean"] = mean_figures(list(breakdown.values()))
-    lines = [
+    parts = [
         "# Online and offline",
-        "",
         "Held-out frames; all frames where none is held out. Time without compiling, the tracker's preparation and "
         "evaluation.",
     ]
     for title, rows in with_mean(figures).items():
-        lines += ["", f"## {title}", "", markdown_table("map", COLUMNS, rows)]
+        parts += [f"## {title}", markdown_table("map", COLUMNS, rows)]
     columns = {label: (label, ".2f") for label in (*BREAKDOWN, "FPS")}
-    lines += ["", "## Time of the online run, percent", "", markdown_table("scene", columns, times)]
-    return "\n".join(lines)
+    return "\n\n".join([*parts, "## Time of the online run, percent", markdown_table("scene", columns, times)])
 
 
 if __name__ == "__main__":

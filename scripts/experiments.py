@@ -61,6 +61,10 @@ class Job:
         except InputError:  # from an incompatible version
             return False
 
+    def metrics(self) -> dict[str, Any]:
+        """Read metrics.json of the finished run."""
+        return json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
+
 
 def parser(description: str | None, example: str) -> argparse.ArgumentParser:
     """Return a command line parser that keeps the lines of the description, with the option `--set`."""
@@ -123,26 +127,20 @@ def execute(jobs: Sequence[Job], fresh: bool = False, say: Callable[[str], None]
     for number, job in enumerate(jobs, 1):
         done = not fresh and job.is_done()
         say(f"[{number}/{len(jobs)}] {job.label}{': already there (--fresh runs it again)' if done else ''}")
-        if not done:
-            _run(job)
-    return [load_metrics(job.folder) for job in jobs]
+        if not done and (code := run(job)):
+            raise InputError(
+                f"{job.label}: the run ended with exit code {code}; start again to go on, finished runs are kept"
+            )
+    return [job.metrics() for job in jobs]
 
 
-def _run(job: Job) -> None:
+def run(job: Job, **options: Any) -> int:
+    """Run a job in its own process, with options of `subprocess.run`, and return the exit code."""
     command = [sys.executable, "-m", "modp_ti.run", str(job.scene)]
     for argument in job.arguments():
         command += ["--set", argument]
     # Standard output carries only the Markdown.
-    code = subprocess.run(command, stdout=sys.stderr, check=False).returncode
-    if code:
-        raise InputError(
-            f"{job.label}: the run ended with exit code {code}; start again to go on, finished runs are kept"
-        )
-
-
-def load_metrics(folder: Path) -> dict[str, Any]:
-    """Read metrics.json in a run's folder."""
-    return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return subprocess.run(command, stdout=sys.stderr, check=False, **options).returncode
 
 
 def quality(section: Mapping[str, Any]) -> dict[str, float | None]:
