@@ -31,7 +31,7 @@ from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, keyframe_psnr, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import retention
 from pipelines.pipeline import FrameReport
 from pipelines.stopwatch import Stopwatch, breakdown_percent
@@ -195,7 +195,7 @@ class _Session:
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Callback after a step of the offline optimisation."""
         self.line.step(step, psnr, gaussians)
-        self.record.optimised(step, gaussians, psnr)
+        self.record.steps.append(StepNote(step, psnr, gaussians))
         self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
         self.stop.check()
 
@@ -250,7 +250,7 @@ class _Session:
         """Callback after a step of refinement."""
         steps = self.config.refine.steps
         self.line.step(step, psnr)
-        self.record.refined(step, psnr)
+        self.record.steps.append(StepNote(step, psnr))
         self.observer.on_step("refining", step, steps, psnr)
         self.checkpointer.after_step(step, steps)
         self.stop.check()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from fields.geometry.se3 import inverse_se3
+from fields.geometry.se3 import camera_centres
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe
 from modp_ti.outputs.detail import explained_detail
@@ -231,8 +231,7 @@ def absolute_trajectory_error(
         truth: Ground-truth T_camera_world (4, 4) of every frame, NaN for frames without one, which do not count.
         with_scale: Whether to align by a similarity; by a rigid motion otherwise.
     """
-    source = np.array([inverse_se3(T)[:3, 3] for T in estimate])
-    target = np.array([inverse_se3(T)[:3, 3] for T in truth])
+    source, target = camera_centres(estimate), camera_centres(truth)
     known = np.isfinite(target).all(axis=1)
     source, target = source[known], target[known]
     s, R, t = umeyama(source, target, with_scale)

@@ -15,7 +15,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.outputs.evaluation import FrameScore
 from modp_ti.outputs.playback.map_renderer import eight_bits
 
-__all__ = ["FULL_SCALE", "Album", "Comparison", "data_uri", "error_colours", "error_map", "picked"]
+__all__ = ["FULL_SCALE", "Album", "Comparison", "as_uri", "data_uri", "error_colours", "error_map", "picked"]
 
 # Error at which the colour scale ends.
 FULL_SCALE = 0.2
@@ -131,7 +131,12 @@ def data_uri(picture: NDArray[np.uint8], longest: int = LONGEST) -> str:
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return as_uri("jpeg", data.tobytes())
+
+
+def as_uri(kind: str, data: bytes) -> str:
+    """Return an image file of this kind as a data URI."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def _comparison(score: FrameScore, rank: str, image: NDArray[np.uint8], render: NDArray[np.uint8]) -> Comparison:
