@@ -96,7 +96,9 @@ class _Session:
     def run(self, resumed: Snapshot | None) -> Path:
         """Run all stages and return the output folder."""
         self._map_the_stream(resumed)
-        self._say_which_frames_were_refused()
+        refused = [f"{count} {why}" for why, count in self.mapper.pipeline.refused.items() if count]
+        if refused:
+            self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
         self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
         versions = self._versions()
         self.observer.on_stage("evaluating the saved map")
@@ -199,15 +201,6 @@ class _Session:
         self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
         self.stop.check()
 
-    def _say_which_frames_were_refused(self) -> None:
-        refused = [f"{count} {why}" for why, count in self._left_out().items() if count and why != "unreadable"]
-        if refused:
-            self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
-
-    def _left_out(self) -> dict[str, int]:
-        """Count the frames that did not touch the map because they are faulty, by reason."""
-        return {"unreadable": len(self.tracker.unreadable), **self.mapper.pipeline.refused}
-
     # ---- the finished map ------------------------------------------------------------------------------------
 
     def _versions(self) -> dict[str, MapVersion]:
@@ -220,23 +213,18 @@ class _Session:
             )
         versions = {config.mode: checkpointer.online or self.mapper.version()}
         if config.refine.steps and config.mode != "offline":
+            checkpointer.after_mapping()
+            checkpointer.online = versions[config.mode]
+            self.line.start("refining", config.refine.steps, checkpointer.refined)
             try:
-                checkpointer.after_mapping()
-                checkpointer.online = versions[config.mode]
-                self._refine()
+                try:
+                    self.mapper.refine(config.refine.steps, config.refine, self._refined, checkpointer.refined)
+                finally:
+                    self.line.stop()
             except RunStopped:
                 raise self._stopped() from None
             versions["refined"] = self.mapper.version()
         return versions
-
-    def _refine(self) -> None:
-        """Refine the map, or continue its refinement. Raises RunStopped between two steps."""
-        refine = self.config.refine
-        self.line.start("refining", refine.steps, self.checkpointer.refined)
-        try:
-            self.mapper.refine(refine.steps, refine, self._refined, self.checkpointer.refined)
-        finally:
-            self.line.stop()
 
     def _refinement_time(self) -> float:
         """Estimate the time of the refinement [s] from that of the views optimised so far."""
@@ -299,7 +287,10 @@ class _Session:
     def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
         """Write the scores, the metrics and the report, and return the metrics."""
         pipeline, frames, checkpointer = self.mapper.pipeline, self.mapper.frames, self.checkpointer
-        truth = self._true_poses()
+        truth: list[NDArray[np.float64]] = []  # of every frame, NaN where it is unknown; empty without ground truth
+        if self.truth is not None:
+            truth, note = true_poses(self.truth, frames.timestamp)
+            self._say(*([note] if note else []))
         caught = pipeline.caught()
         if warning := caught.warning():
             self._say(warning)
@@ -310,13 +301,9 @@ class _Session:
             "seed": self.config.seed,
             "frames_per_second": round(len(frames) / self.clock.mapping, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "snapshots": {
-                "written": checkpointer.written,
-                "failed": checkpointer.failed,
-                "resumed": checkpointer.resumed,
-            },
+            "snapshots": {name: getattr(checkpointer, name) for name in ("written", "failed", "resumed")},
             "guards": caught.counts(),
-            "frames_left_out": self._left_out(),
+            "frames_left_out": {"unreadable": len(self.tracker.unreadable), **pipeline.refused},
             "lpips_note": self.no_lpips,
             "breakdown_percent": self.breakdown,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
@@ -330,15 +317,6 @@ class _Session:
             if problem:
                 self._say(problem)
         return metrics
-
-    def _true_poses(self) -> list[NDArray[np.float64]]:
-        """Return the true pose of every frame, NaN where it is unknown; empty without ground truth."""
-        if self.truth is None:
-            return []
-        truth, note = true_poses(self.truth, self.mapper.frames.timestamp)
-        if note:
-            self._say(note)
-        return truth
 
     # ---- interruption, viewer, notes -------------------------------------------------------------------------
 

@@ -87,11 +87,12 @@ class Album:
         """
         scores = list(scores)
         held_out = [score for score in scores if score.held_out]
-        chosen = picked(held_out or [score for score in scores if score.index in self.kept])
-        return [
-            _comparison(score, rank, *(self.kept.get(score.index) or _read_pair(renders / f"{score.index:06d}.png")))
-            for score, rank in chosen
-        ]
+        comparisons = []
+        for score, rank in picked(held_out or [score for score in scores if score.index in self.kept]):
+            image, render = self.kept.get(score.index) or _read_pair(renders / f"{score.index:06d}.png")
+            error = error_colours(error_map(image, render))
+            comparisons.append(Comparison(score, rank, data_uri(image), data_uri(render), data_uri(error)))
+        return comparisons
 
 
 def picked(scores: Sequence[FrameScore]) -> list[tuple[FrameScore, str]]:
@@ -137,11 +138,6 @@ def data_uri(picture: NDArray[np.uint8], longest: int = LONGEST) -> str:
 def as_uri(kind: str, data: bytes) -> str:
     """Return an image file of this kind as a data URI."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-
-
-def _comparison(score: FrameScore, rank: str, image: NDArray[np.uint8], render: NDArray[np.uint8]) -> Comparison:
-    error = error_colours(error_map(image, render))
-    return Comparison(score, rank, *(data_uri(picture) for picture in (image, render, error)))
 
 
 def _read_pair(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
