@@ -6,7 +6,6 @@ Used by ablate.py and compare.py.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import statistics
 import subprocess
@@ -18,6 +17,7 @@ from typing import Any
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.scores_csv import read_scores
 
 # Figures of one table row by name; None if a run does not have the figure.
 Figures = Mapping[str, float | None]
@@ -169,13 +169,11 @@ def first_third_psnr(folder: Path, stage: str) -> float | None:
     file = folder / "scores.csv"
     if not file.is_file():
         return None
-    with file.open(encoding="utf-8", newline="") as lines:
-        rows = [row for row in csv.DictReader(lines) if row["stage"] == stage]
-    rows.sort(key=lambda row: int(row["index"]))
-    some_held_out = any(row["held_out"] == "1" for row in rows)
-    early = rows[: -(-len(rows) // 3)]
-    scores = [float(row["psnr"]) for row in early if row["held_out"] == "1" or not some_held_out]
-    return statistics.fmean(scores) if scores else None
+    scores = sorted((score for score in read_scores(file) if score.stage == stage), key=lambda score: score.index)
+    some_held_out = any(score.held_out for score in scores)
+    early = scores[: -(-len(scores) // 3)]
+    counted = [score.psnr for score in early if score.held_out or not some_held_out]
+    return statistics.fmean(counted) if counted else None
 
 
 def mean_figures(scenes: Sequence[Figures]) -> Figures:
