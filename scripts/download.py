@@ -245,10 +245,8 @@ def fetch(name: str, folder: Path, say: Callable[[str], None], sequences: dict[s
             say(f"{sequence.archive}: {done >> 20} MiB" + ("" if total is None else f" of {total >> 20}"))
 
     download(sequence.url, archive, progress)
-    if verify(archive):
-        say(f"{sequence.archive}: SHA-256 as at the first download")
-    else:
-        say(f"{sequence.archive}: its SHA-256 is not known here; kept in {archive.with_name(CHECKSUMS)} for next time")
+    unknown = f"its SHA-256 is not known here; kept in {archive.with_name(CHECKSUMS)} for next time"
+    say(f"{sequence.archive}: {'SHA-256 as at the first download' if verify(archive) else unknown}")
     target.parent.mkdir(parents=True, exist_ok=True)
     count = unpack(archive, sequence.folder, target)
     say(f"{name}: {count} files in {target} (licence: {sequence.licence})")

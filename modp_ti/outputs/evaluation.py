@@ -78,18 +78,11 @@ class FrameScore:
 
 def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
     """Return the mean scores over the frames, as in metrics.json. A mean is None if there is nothing to average."""
-
-    def mean(values: list[float | None], digits: int) -> float | None:
-        known = [value for value in values if value is not None]
-        return None if not known or len(known) < len(values) else round(float(np.mean(known)), digits)
-
-    return {
-        "psnr": mean([score.psnr for score in scores], 4),
-        "ssim": mean([score.ssim for score in scores], 5),
-        "lpips": mean([score.lpips for score in scores], 5),
-        "detail": mean([score.detail for score in scores], 5),
-        "count": len(scores),
-    }
+    means: dict[str, float | int | None] = {}
+    for name, digits in (("psnr", 4), ("ssim", 5), ("lpips", 5), ("detail", 5)):
+        known = [value for score in scores if (value := getattr(score, name)) is not None]
+        means[name] = round(float(np.mean(known)), digits) if known and len(known) == len(scores) else None
+    return means | {"count": len(scores)}
 
 
 def score_frame(

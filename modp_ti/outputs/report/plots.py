@@ -63,12 +63,12 @@ def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:
     return svg
 
 
-def _panels(height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Sequence[Axes]]:
+def _panels(height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, list[Axes]]:
     """Return a figure with panels of this height [inches]. Panels above each other share their x axis."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH, rows * height))
-    return figure, figure.subplots(rows, columns, sharex=rows > 1, squeeze=False).ravel()
+    return figure, figure.subplots(rows, columns, sharex=rows > 1, squeeze=False).ravel().tolist()
 
 
 @_drawn
@@ -81,11 +81,11 @@ def psnr_of_frames(scores: Sequence[FrameScore], frames: Sequence[FrameNote] = (
     """
     figure, (axes,) = _panels(3.0)
     if mapped := [note for note in frames if note.mapped_psnr is not None]:
-        x, y = _columns(mapped, "index", "mapped_psnr")
+        x, y = _xy(mapped, "index", "mapped_psnr")
         _line(axes, x, y, "psnr-mapped", color=GREY, lw=1.0, label="keyframes, just mapped")
     for stage in dict.fromkeys(score.stage for score in scores):
         of = [score for score in scores if score.stage == stage]
-        x, y = _columns(of, "index", "psnr")
+        x, y = _xy(of, "index", "psnr")
         _line(axes, x, y, f"psnr-{stage}", color=OF_STAGE[stage], label=stage)
         held_out = np.array([score.held_out for score in of])
         if held_out.any():
@@ -101,17 +101,17 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
     mapped = [note for note in frames if note.psnr is not None]
     window = max(5, len(frames) // 20)
     figure, axes = _panels(1.75, 3 if mapped else 2)
-    x, count = _columns(frames, "index", "gaussians")
+    x, count = _xy(frames, "index", "gaussians")
     _gaussians(axes[0], x, count, "gaussians")
     keyframes = [note for note in frames if note.is_keyframe]
     if len(keyframes) < len(frames):
-        axes[0].plot(*_columns(keyframes, "index", "gaussians"), ".", ms=4, color=BLUE, label="keyframes")
+        axes[0].plot(*_xy(keyframes, "index", "gaussians"), ".", ms=4, color=BLUE, label="keyframes")
         axes[0].legend(loc="upper left")
     _line(axes[1], x, frame_rate(frames, window), "frame-rate", color=GREEN)
     axes[1].set_yscale("log")  # frames that are not keyframes are a hundred times faster
     _label(axes[1], "" if mapped else "frame", f"frames per second\n(last {window})")
     if mapped:
-        _line(axes[2], *_columns(mapped, "index", "psnr"), "view-psnr", color=ORANGE)
+        _line(axes[2], *_xy(mapped, "index", "psnr"), "view-psnr", color=ORANGE)
         _label(axes[2], "frame", "PSNR of the views\nbeing optimised [dB]")
     return figure
 
@@ -121,10 +121,10 @@ def steps(notes: Sequence[StepNote]) -> Figure:
     """Plot the smoothed PSNR over the steps of refinement or offline optimisation, and the Gaussians if recorded."""
     counted = notes[0].gaussians is not None
     figure, axes = _panels(2.1, 2 if counted else 1)
-    _line(axes[-1], *binned(*_columns(notes, "step", "psnr"), 100), "step-psnr", color=ORANGE)
+    _line(axes[-1], *binned(*_xy(notes, "step", "psnr"), 100), "step-psnr", color=ORANGE)
     _label(axes[-1], "step", "PSNR of the views\nbeing optimised [dB]")
     if counted:
-        _gaussians(axes[0], *binned(*_columns(notes, "step", "gaussians")), "step-gaussians")
+        _gaussians(axes[0], *binned(*_xy(notes, "step", "gaussians")), "step-gaussians")
     return figure
 
 
@@ -205,9 +205,9 @@ def pose_changes(
     return figure
 
 
-def _columns(notes: Sequence[FrameNote | StepNote | FrameScore], *names: str) -> list[NDArray[np.float64]]:
-    """Return these attributes of the notes as arrays. None becomes NaN."""
-    return [np.array([getattr(note, name) for note in notes], float) for name in names]
+def _xy(notes: Sequence[FrameNote | StepNote | FrameScore], x: str, y: str) -> tuple[NDArray, NDArray]:
+    """Return two attributes of the notes as arrays. None becomes NaN."""
+    return np.array([getattr(note, x) for note in notes], float), np.array([getattr(note, y) for note in notes], float)
 
 
 def _gaussians(axes: Axes, x: NDArray, count: NDArray, name: str) -> None:
