@@ -64,8 +64,7 @@ def main() -> None:
     scenes = named_scenes(arguments.scenes)
     common = {"refine.steps": str(arguments.refine)} | command_line(arguments.set)
     jobs = plan(scenes, arguments.output, common, arguments.tracker, arguments.only or VARIANTS)
-    metrics = execute([job for of_scene in jobs.values() for job in of_scene.values()], arguments.fresh)
-    rest = iter(metrics)
+    rest = iter(execute([job for of_scene in jobs.values() for job in of_scene.values()], arguments.fresh))
     figures = {
         scene: {variant: summary(next(rest), job.folder) for variant, job in of_scene.items()}
         for scene, of_scene in jobs.items()
@@ -120,14 +119,14 @@ def report(figures: Mapping[str, Mapping[str, Figures]]) -> str:
     Args:
         figures: Figures by scene and variant.
     """
-    lines = ["# Ablations", "", "Held-out frames; all frames where none is held out."]
+    parts = ["# Ablations", "Held-out frames; all frames where none is held out."]
     for title, rows in with_mean(figures).items():
-        lines += ["", f"## {title}"]
+        parts.append(f"## {title}")
         for name, columns, variants in TABLES:
             shown = {v: rows[v] for v in variants if v in rows}
             if len(shown) > 1:
-                lines += ["", markdown_table(name, columns, shown)]
-    return "\n".join(lines)
+                parts.append(markdown_table(name, columns, shown))
+    return "\n\n".join(parts)
 
 
 if __name__ == "__main__":

@@ -62,21 +62,19 @@ def main() -> None:
     figures: dict[str, dict[str, Figures]] = {}
     breakdown: dict[str, Figures] = {}
     common = command_line(arguments.set)
+    refinements = list(dict.fromkeys(arguments.steps))
+    scenes = named_scenes(arguments.scenes)
     jobs = {
-        (scene, file): [
-            refined_job(scene, file, arguments.output / scene, steps, common)
-            for steps in dict.fromkeys(arguments.steps)
-        ]
-        for scene, file in named_scenes(arguments.scenes).items()
+        scene: [refined_job(scene, file, arguments.output / scene, steps, common) for steps in refinements]
+        for scene, file in scenes.items()
     }
-    for (scene, file), of_scene in jobs.items():  # reports bad settings before the first run, which may take hours
-        for job in of_scene:
+    for scene, file in scenes.items():  # reports bad settings before the first run, which may take hours
+        offline = [] if arguments.no_offline else [offline_job(scene, file, arguments.output / scene, 1, common)]
+        for job in (*jobs[scene], *offline):
             job.check()
-        if not arguments.no_offline:
-            offline_job(scene, file, arguments.output / scene, 1, common).check()
-    for (scene, file), of_scene in jobs.items():
-        runs = execute(of_scene, arguments.fresh)
-        figures[scene] = online_rows(runs, [job.check()["refine"]["steps"] for job in of_scene])
+    for scene, file in scenes.items():
+        runs = execute(jobs[scene], arguments.fresh)
+        figures[scene] = online_rows(runs, refinements)
         breakdown[scene] = time_breakdown(runs[0])
         if not arguments.no_offline:
             renders = counts(runs[0], "refined")["view_renders"]
@@ -144,17 +142,15 @@ def report(figures: Mapping[str, Mapping[str, Figures]], breakdown: Mapping[str,
     times = dict(breakdown)
     if len(figures) > 1:
         times["mean"] = mean_figures(list(breakdown.values()))
-    lines = [
+    parts = [
         "# Online and offline",
-        "",
         "Held-out frames; all frames where none is held out. Time without compiling, the tracker's preparation and "
         "evaluation.",
     ]
     for title, rows in with_mean(figures).items():
-        lines += ["", f"## {title}", "", markdown_table("map", COLUMNS, rows)]
+        parts += [f"## {title}", markdown_table("map", COLUMNS, rows)]
     columns = {label: (label, ".2f") for label in (*BREAKDOWN, "FPS")}
-    lines += ["", "## Time of the online run, percent", "", markdown_table("scene", columns, times)]
-    return "\n".join(lines)
+    return "\n\n".join([*parts, "## Time of the online run, percent", markdown_table("scene", columns, times)])
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ tracked depth.
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from ending import documented_ending
+from experiments import parser
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
@@ -29,8 +29,6 @@ from pipelines.online import OnlineMapper
 
 # Deviation below which version 0.1.0, which only had the constant process, accepted a depth.
 FIRST_LIMIT = 0.06
-# Index of a keyframe, width of its image, pixels (N, 2), and the answer of each estimator there.
-Record = tuple[int, int, NDArray, dict[str, DepthEstimate]]
 
 
 class Recorder:
@@ -40,7 +38,7 @@ class Recorder:
         self.fused = fused
         self.sources: dict[str, DepthEstimator] = {"constant process": constant}
         self.sources |= {type(e).__name__: e for e in fused.estimators}
-        self.records: list[Record] = []
+        self.records: list[tuple[int, int, NDArray, dict[str, DepthEstimate]]] = []
 
     def estimate(self, view, neighbours, pixels) -> DepthEstimate:
         """See `DepthEstimator`."""
@@ -79,95 +77,81 @@ def tracked_ratio(frame: TrackedFrame, depth: NDArray) -> NDArray:
     return ratio[np.isfinite(ratio)]
 
 
-def parsed_arguments() -> argparse.Namespace:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog="example: scripts/depth redkitchen.yaml data/redkitchen/depth --frames 200",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("scene", type=Path, help="scene.yaml")
-    parser.add_argument("sensor", type=Path, help="folder of depth images")
-    parser.add_argument("--focal", type=float, default=585.0, help="of the depth camera [px] (default 585)")
-    # Best fit for redkitchen's tracked points: a median error of 1.1 percent, and 1.4 without the rotation.
-    rotation, offset = (0.81, -1.13, 0.54), (0.011, 0.019, 0.008)
-    parser.add_argument(
-        "--rotation", type=float, nargs=3, default=rotation, help="depth to colour camera, axis times angle [degrees]"
-    )
-    parser.add_argument("--offset", type=float, nargs=3, default=offset, help="depth to colour camera [m]")
-    parser.add_argument("--frames", type=int, default=10**9, help="map only so many")
-    parser.add_argument("--set", action="append", default=[], help="override a setting, key=value")
-    return parser.parse_args()
-
-
-def record_scene(config: SceneConfig, frames: list[TrackedFrame]) -> list[Record]:
-    """Map the frames, and return what the estimators answered at every keyframe."""
-    mapper = OnlineMapper(config.mapping, frames[0].camera.width, frames[0].camera.height, config.seed)
+def recorded(config: SceneConfig, count: int) -> tuple[Recorder, dict[int, TrackedFrame]]:
+    """Map the scene's first `count` frames; return the answers at its keyframes, and the frames by index."""
+    initialise(config.device, config.threads, config.seed)
+    frames = {f.index: f for f in open_tracker(config) if f.index < count and not f.held_out}
+    camera = next(iter(frames.values())).camera
+    mapper = OnlineMapper(config.mapping, camera.width, camera.height, config.seed)
     constant = GaussianProcessDepth(config.mapping.depth, np.random.default_rng(config.seed))
     mapper.densifier.depth = recorder = Recorder(mapper.densifier.depth, constant)
-    for n, frame in enumerate(frames):
+    for n, frame in enumerate(frames.values(), 1):
         mapper.process(frame)
-        print(f"\r{n + 1} of {len(frames)} frames", end="", file=sys.stderr, flush=True)
+        print(f"\r{n} of {len(frames)} frames", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    return recorder.records
+    return recorder, frames
 
 
-def print_table(records: list[Record], truth: dict[int, NDArray], scale: float, limit: float, floor: float) -> None:
-    """Print the errors of the estimators.
+def compared(recorder: Recorder, truth: dict[int, NDArray], scale: float) -> dict[str, NDArray]:
+    """Return every estimator's relative errors and deviations (2, N) at the pixels with a sensor depth.
 
     Args:
-        records: What the estimators answered.
-        truth: Sensor depth (H, W) [m] of the keyframes that have one.
-        scale: Metres per unit of the map.
-        limit: Deviation up to which the mapper accepts a depth.
-        floor: Median relative error of the tracked points.
+        recorder: Answers at the keyframes.
+        truth: Sensor depth (H, W) [m] by keyframe.
+        scale: Metres per scene unit.
     """
-    names = list(records[0][3])
-    error: dict[str, list[NDArray]] = {name: [] for name in names}
-    deviation: dict[str, list[NDArray]] = {name: [] for name in names}
-    for index, width, pixels, said in records:
+    parts: dict[str, list[NDArray]] = {}
+    for index, width, pixels, said in recorder.records:
         if index not in truth:
             continue
         depth = truth[index]
         column, row = np.floor(pixels * depth.shape[1] / width).astype(int).T
         there = depth[np.minimum(row, depth.shape[0] - 1), np.minimum(column, depth.shape[1] - 1)]
-        seen = np.isfinite(there)
-        for name in names:
-            error[name].append(np.abs(said[name].depth[seen] * scale / there[seen] - 1))
-            deviation[name].append(said[name].deviation[seen])
-    sure = np.concatenate(deviation["fused"]) < limit
-    print(f"{len(sure)} pixels of {len(truth)} keyframes; tracked points themselves: {100 * floor:.2f} %\n")
-    print("| estimator | accepted below | pixels | median error there | 90th percentile | where fused is sure |")
-    print("|---|---|---|---|---|---|")
-    for name, below in [(names[0], FIRST_LIMIT), *((name, limit) for name in names)]:
-        e, known = np.concatenate(error[name]), np.concatenate(deviation[name])
-        own, both = known < below, sure & np.isfinite(known)
-        # An estimator may accept no pixel, such as the map early in a run.
-        there = f"{100 * np.median(e[own]):.2f} % | {100 * np.percentile(e[own], 90):.1f} %" if own.any() else "– | –"
-        where_fused = f"{100 * np.median(e[both]):.2f} %" if both.any() else "–"
-        print(f"| {name} | {below:g} | {100 * own.mean():.0f} % | {there} | {where_fused} |")
+        for name, answer in said.items():
+            both = np.stack([np.abs(answer.depth * scale / there - 1), answer.deviation])
+            parts.setdefault(name, []).append(both[:, np.isfinite(there)])
+    return {name: np.concatenate(of, axis=1) for name, of in parts.items()}
 
 
 @documented_ending()
 def main() -> None:
     """Map the scene, compare the estimators and print the table."""
-    arguments = parsed_arguments()
+    options = parser(__doc__, "scripts/depth redkitchen.yaml data/redkitchen/depth --frames 200")
+    options.add_argument("scene", type=Path, help="scene.yaml")
+    options.add_argument("sensor", type=Path, help="folder of depth images")
+    options.add_argument("--focal", type=float, default=585.0, help="of the depth camera [px] (default 585)")
+    # Best fit for redkitchen's tracked points: a median error of 1.1 percent, and 1.4 without the rotation.
+    rotation, offset = (0.81, -1.13, 0.54), (0.011, 0.019, 0.008)
+    options.add_argument(
+        "--rotation", type=float, nargs=3, default=rotation, help="depth to colour camera, axis times angle [degrees]"
+    )
+    options.add_argument("--offset", type=float, nargs=3, default=offset, help="depth to colour camera [m]")
+    options.add_argument("--frames", type=int, default=10**9, help="map only so many")
+    arguments = options.parse_args()
     config = load_scene(arguments.scene, arguments.set)
-    initialise(config.device, config.threads, config.seed)
-    frames = [f for f in open_tracker(config) if f.index < arguments.frames and not f.held_out]
-    records = record_scene(config, frames)
-
-    by_index = {f.index: f for f in frames}
+    recorder, frames = recorded(config, arguments.frames)
     turn = cv2.Rodrigues(np.radians(arguments.rotation))[0]
-    truth, ratios = {}, []
-    for index, *_ in records:
-        depth = sensor_depth(arguments.sensor, by_index[index], arguments.focal, turn, np.array(arguments.offset))
+    truth = {}
+    for index, *_ in recorder.records:
+        depth = sensor_depth(arguments.sensor, frames[index], arguments.focal, turn, np.array(arguments.offset))
         if depth is not None:
             truth[index] = depth
-            ratios.append(tracked_ratio(by_index[index], depth))
-    scale = np.median(np.concatenate(ratios))
-    floor = np.median(np.abs(np.concatenate(ratios) / scale - 1))
-    print_table(records, truth, float(scale), config.mapping.depth.max_deviation, float(floor))
+    ratios = np.concatenate([tracked_ratio(frames[index], depth) for index, depth in truth.items()])
+    scale = np.median(ratios)
+    floor = np.median(np.abs(ratios / scale - 1))
+    answers = compared(recorder, truth, scale)
+    limit = config.mapping.depth.max_deviation
+    sure = answers["fused"][1] < limit
+    print(f"{len(sure)} pixels of {len(truth)} keyframes; tracked points themselves: {100 * floor:.2f} %\n")
+    print("| estimator | accepted below | pixels | median error there | 90th percentile | where fused is sure |")
+    print("|---|---|---|---|---|---|")
+    for name, below in [(next(iter(answers)), FIRST_LIMIT), *((name, limit) for name in answers)]:
+        e, known = answers[name]
+        own, both = known < below, sure & np.isfinite(known)
+        # An estimator may accept no pixel, such as the map early in a run.
+        there = f"{100 * np.median(e[own]):.2f} % | {100 * np.percentile(e[own], 90):.1f} %" if own.any() else "– | –"
+        where_fused = f"{100 * np.median(e[both]):.2f} %" if both.any() else "–"
+        print(f"| {name} | {below:g} | {100 * own.mean():.0f} % | {there} | {where_fused} |")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ import urllib.error
 import urllib.request
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -214,14 +213,7 @@ def _members(archive: Path) -> Iterator[tuple[str, int, Callable[[], IO[bytes]]]
                 continue
             if not entry.isfile():
                 raise DownloadError(f"{archive}: holds a link or a device ({entry.name}): not unpacked")
-            yield entry.name, entry.size, lambda entry=entry: _content(bundle, entry)
-
-
-@contextmanager
-def _content(bundle: tarfile.TarFile, entry: tarfile.TarInfo) -> Iterator[IO[bytes]]:
-    file = bundle.extractfile(entry)
-    assert file is not None, "it is a file"
-    yield file
+            yield entry.name, entry.size, lambda entry=entry: bundle.extractfile(entry)
 
 
 def _inside(name: str, folder: str, archive: Path) -> PurePosixPath | None:
@@ -253,10 +245,8 @@ def fetch(name: str, folder: Path, say: Callable[[str], None], sequences: dict[s
             say(f"{sequence.archive}: {done >> 20} MiB" + ("" if total is None else f" of {total >> 20}"))
 
     download(sequence.url, archive, progress)
-    if verify(archive):
-        say(f"{sequence.archive}: SHA-256 as at the first download")
-    else:
-        say(f"{sequence.archive}: its SHA-256 is not known here; kept in {archive.with_name(CHECKSUMS)} for next time")
+    unknown = f"its SHA-256 is not known here; kept in {archive.with_name(CHECKSUMS)} for next time"
+    say(f"{sequence.archive}: {'SHA-256 as at the first download' if verify(archive) else unknown}")
     target.parent.mkdir(parents=True, exist_ok=True)
     count = unpack(archive, sequence.folder, target)
     say(f"{name}: {count} files in {target} (licence: {sequence.licence})")

@@ -6,7 +6,6 @@ Used by ablate.py and compare.py.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import statistics
 import subprocess
@@ -18,6 +17,7 @@ from typing import Any
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.scores_csv import read_scores
 
 # Figures of one table row by name; None if a run does not have the figure.
 Figures = Mapping[str, float | None]
@@ -60,6 +60,10 @@ class Job:
             return load_scene(written).model_dump(mode="json") == self.check()
         except InputError:  # from an incompatible version
             return False
+
+    def metrics(self) -> dict[str, Any]:
+        """Read metrics.json of the finished run."""
+        return json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
 
 
 def parser(description: str | None, example: str) -> argparse.ArgumentParser:
@@ -123,26 +127,20 @@ def execute(jobs: Sequence[Job], fresh: bool = False, say: Callable[[str], None]
     for number, job in enumerate(jobs, 1):
         done = not fresh and job.is_done()
         say(f"[{number}/{len(jobs)}] {job.label}{': already there (--fresh runs it again)' if done else ''}")
-        if not done:
-            _run(job)
-    return [load_metrics(job.folder) for job in jobs]
+        if not done and (code := run(job)):
+            raise InputError(
+                f"{job.label}: the run ended with exit code {code}; start again to go on, finished runs are kept"
+            )
+    return [job.metrics() for job in jobs]
 
 
-def _run(job: Job) -> None:
+def run(job: Job, **options: Any) -> int:
+    """Run a job in its own process, with options of `subprocess.run`, and return the exit code."""
     command = [sys.executable, "-m", "modp_ti.run", str(job.scene)]
     for argument in job.arguments():
         command += ["--set", argument]
     # Standard output carries only the Markdown.
-    code = subprocess.run(command, stdout=sys.stderr, check=False).returncode
-    if code:
-        raise InputError(
-            f"{job.label}: the run ended with exit code {code}; start again to go on, finished runs are kept"
-        )
-
-
-def load_metrics(folder: Path) -> dict[str, Any]:
-    """Read metrics.json in a run's folder."""
-    return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return subprocess.run(command, stdout=sys.stderr, check=False, **options).returncode
 
 
 def quality(section: Mapping[str, Any]) -> dict[str, float | None]:
@@ -171,13 +169,11 @@ def first_third_psnr(folder: Path, stage: str) -> float | None:
     file = folder / "scores.csv"
     if not file.is_file():
         return None
-    with file.open(encoding="utf-8", newline="") as lines:
-        rows = [row for row in csv.DictReader(lines) if row["stage"] == stage]
-    rows.sort(key=lambda row: int(row["index"]))
-    some_held_out = any(row["held_out"] == "1" for row in rows)
-    early = rows[: -(-len(rows) // 3)]
-    scores = [float(row["psnr"]) for row in early if row["held_out"] == "1" or not some_held_out]
-    return statistics.fmean(scores) if scores else None
+    scores = sorted((score for score in read_scores(file) if score.stage == stage), key=lambda score: score.index)
+    some_held_out = any(score.held_out for score in scores)
+    early = scores[: -(-len(scores) // 3)]
+    counted = [score.psnr for score in early if score.held_out or not some_held_out]
+    return statistics.fmean(counted) if counted else None
 
 
 def mean_figures(scenes: Sequence[Figures]) -> Figures:

@@ -19,6 +19,7 @@ import numpy as np
 from ending import documented_ending
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import camera_centres
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
@@ -72,7 +73,7 @@ def in_the_room(run: FinishedRun, truth: list[NDArray], points: NDArray) -> NDAr
     turns = sum(there[:3, :3].T @ here[:3, :3] for here, there in zip(run.poses, truth, strict=True))
     U, _, Vt = np.linalg.svd(turns)
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    estimate, target = (np.array([-T[:3, :3].T @ T[:3, 3] for T in poses]) for poses in (run.poses, truth))
+    estimate, target = camera_centres(run.poses), camera_centres(truth)
     a, b = (estimate - estimate.mean(axis=0)) @ R.T, target - target.mean(axis=0)
     s = (a * b).sum() / (a * a).sum()
     return s * (points - estimate.mean(axis=0)) @ R.T + target.mean(axis=0)

@@ -29,8 +29,7 @@ def pictures(mesh, camera: PinholeCamera, T_camera_world: NDArray) -> tuple[NDAr
     o3d = open3d()
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
-    K, T = o3d.core.Tensor(camera.matrix()), o3d.core.Tensor(T_camera_world)
-    rays = scene.create_rays_pinhole(K, T, camera.width, camera.height)
+    rays = scene.create_rays_pinhole(camera.matrix(), T_camera_world, camera.width, camera.height)
     hits = scene.cast_rays(rays)
     triangle = hits["primitive_ids"].numpy()
     hit = triangle != scene.INVALID_ID

@@ -80,8 +80,7 @@ def main() -> None:
     parser.add_argument("--wait", type=float, default=15.0, help="seconds for the page to show it")
     parser.add_argument("--until", help="text in the page that is waited for first, two minutes long: `frame 30`")
     arguments = parser.parse_args()
-    lacking = missing()
-    if lacking:
+    if lacking := missing():
         raise InputError(lacking)
     with open_page(arguments.url) as page:
         if arguments.until:

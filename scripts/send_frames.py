@@ -225,13 +225,16 @@ def play(
     waiting: deque = deque()
     next_time = time.monotonic()
     sender: Sender | None = None
+
+    def send_poses(kept: int) -> None:
+        while len(waiting) > kept:
+            sender.pose(*waiting.popleft())
+
     try:
         for event in tracker.events():
             if isinstance(event, PoseCorrection):
                 assert sender is not None, "frames come before their corrections"
-                for each in waiting:  # the frames that it revises must have poses
-                    _send_pose(sender, each)
-                waiting.clear()
+                send_poses(0)  # the frames that it revises must have poses
                 sender.correction(event.index, event.T_camera_world, event.ids, event.xyz)
                 continue
             if sender is None:  # connect late, as the server drops silent clients
@@ -243,27 +246,17 @@ def play(
             if rate is not None:
                 time.sleep(max(next_time - time.monotonic(), 0.0))
                 next_time = max(next_time + 1.0 / rate, time.monotonic())
-            image = event.rgba.tobytes()
+            image, points = event.rgba.tobytes(), (event.points.xyz, event.points.pixels, event.points.ids)
             if late:
                 sender.frame(event.index, event.timestamp, image)
-                waiting.append(event)
-                if len(waiting) > late:
-                    _send_pose(sender, waiting.popleft())
+                waiting.append((event.index, event.T_camera_world, points))
+                send_poses(late)
             else:
-                sender.frame(event.index, event.timestamp, image, event.T_camera_world, _points(event))
-        for each in waiting:
-            _send_pose(sender, each)
+                sender.frame(event.index, event.timestamp, image, event.T_camera_world, points)
+        send_poses(0)
         return 0 if sender is None else sender.end()
     finally:
         tracker.close()
-
-
-def _send_pose(sender: Sender, frame) -> None:
-    sender.pose(frame.index, frame.T_camera_world, _points(frame))
-
-
-def _points(frame) -> tuple[NDArray, NDArray, NDArray]:
-    return frame.points.xyz, frame.points.pixels, frame.points.ids
 
 
 def main() -> None:

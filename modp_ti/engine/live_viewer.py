@@ -18,7 +18,7 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
 from modp_ti.outputs.viewer.budget import CostLimit, ThreadClock
 from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Latest
-from modp_ti.outputs.viewer.modes import SPLATS, Photograph, nearest_photograph, painter, pinhole_of
+from modp_ti.outputs.viewer.modes import SPLATS, Photograph, painter
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from modp_ti.outputs.viewer.splats import splats_of
 from pipelines.pipeline import FrameReport
@@ -98,7 +98,7 @@ class LiveViewer(Observer):
         self._publisher = threading.Thread(target=self._publish, name="viewer", daemon=True)
         self._publisher.start()
         self._serving = ThreadClock([self._publisher, *self.page.threads])
-        self._begun_mapper: Mapper | None = None
+        self._mapper: Mapper  # from `begin` on
         self._frame: TrackedFrame | None = None
         self._state = self._psnr = ""
         self._frames: int | None = None
@@ -122,7 +122,7 @@ class LiveViewer(Observer):
     # ---- the observer ----------------------------------------------------------------------------------------
 
     def begin(self, mapper: Mapper, frames: int | None) -> None:
-        self._begun_mapper, self._frames = mapper, frames
+        self._mapper, self._frames = mapper, frames
         self._began = self._clock()
         self._serving.since_last()  # do not charge for browsers that connected before mapping began
 
@@ -142,12 +142,6 @@ class LiveViewer(Observer):
 
     def on_stage(self, stage: str) -> None:
         self._updates.put(Update(numbers=f"{stage}\n\nThe page ends with the run; `modp-ti view` shows the map."))
-
-    @property
-    def _mapper(self) -> Mapper:
-        if self._begun_mapper is None:
-            raise RuntimeError("the viewer has no map yet: call `begin` before `on_frame`")
-        return self._begun_mapper
 
     # ---- the mapping thread ----------------------------------------------------------------------------------
 
@@ -202,7 +196,7 @@ class LiveViewer(Observer):
             alone_since = None if len(self.page.requests) or not self._visited else alone_since or now
             if alone_since is not None and now - alone_since > PATIENCE:
                 self._gate.pause(False)
-                self.page.show_paused(False)
+                self.page.show_paused()
             else:
                 self._show_map()
 
@@ -250,18 +244,15 @@ class LiveViewer(Observer):
         """Render the map for one browser. The publishing thread converts the result to a picture."""
         pipeline = self._mapper.pipeline
         images, store = pipeline.renderer.images, pipeline.keyframes
-        seen_from = pinhole_of(browser, self.page.units, images.max_width, images.max_height)
-        if seen_from is None:
-            return
-        camera, T = seen_from
-        size = images.width, images.height
+        size, poses = (images.width, images.height), np.stack([view.T_camera_world for view in store])
 
-        def photograph() -> Photograph:
-            k = store[nearest_photograph(np.stack([view.T_camera_world for view in store]), T, store.scene_depth)]
+        def photograph(index: int) -> Photograph:
+            k = store[index]
             return Photograph(k.rgba, k.camera, k.T_camera_world.copy(), copy(k.exposure), k.vignette)
 
+        of_map = pipeline.renderer, pipeline.near, store.scene_depth
         try:
-            paint = painter(mode, camera, T, store.scene_depth, self._mapper.render, photograph)
+            paint = painter(mode, browser, self.page.units, *of_map, poses, photograph)
         finally:
             images.resize(*size)  # also clears the buffers, so that the mapper's next step does not pay for it
         if paint is not None:
@@ -270,15 +261,11 @@ class LiveViewer(Observer):
     # ---- the publishing thread -------------------------------------------------------------------------------
 
     def _publish(self) -> None:
-        while not self._updates.closed:
-            update = self._updates.take()
-            if update is None:
-                continue
-            try:
+        try:
+            for update in iter(self._updates.take, None):  # until it is closed
                 self._show(update)
-            except Exception as error:
-                self._give_up(error)
-                return
+        except Exception as error:
+            self._give_up(error)
 
     def _show(self, update: Update) -> None:
         page = self.page

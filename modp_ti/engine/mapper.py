@@ -45,6 +45,7 @@ class Mapper:
     Attributes:
         pipeline: The online or offline mapper, with its Gaussians, keyframes and renderer.
         frames: Metadata and tracked points of all frames so far, without their images.
+        finished: Whether `finish` has run since the last frame was added.
 
     Example:
         modp_ti.initialise("cpu")
@@ -64,7 +65,7 @@ class Mapper:
         else:
             self.pipeline = OnlineMapper(settings or MappingSettings(), width, height, seed)
         self.frames = DeliveredFrames(trajectory=self.pipeline.trajectory)
-        self._finished = True
+        self.finished = True
 
     def add(self, frame: TrackedFrame) -> FrameReport | None:
         """Process the next frame. Frames must come in increasing order of their indices.
@@ -87,7 +88,7 @@ class Mapper:
         # The frame's metadata are kept, and its points as far as the memory budget allows.
         self.frames.add(frame, with_points=self.pipeline.takes_observations(len(frame.points)))
         self.pipeline.count_beside(self.frames.points.nbytes)
-        self._finished = False
+        self.finished = False
         return report
 
     def correct(self, correction: PoseCorrection) -> None:
@@ -115,9 +116,9 @@ class Mapper:
         Raises:
             InputError: If the offline baseline has no tracked points to start from.
         """
-        if self._finished:
+        if self.finished:
             return
-        self._finished = True
+        self.finished = True
         try:
             self.pipeline.finish(progress)
         except NothingToMapError as error:
@@ -147,11 +148,6 @@ class Mapper:
         settings = RefineSettings() if settings is None else settings
         self.pipeline.refine(settings.model_copy(update={"steps": steps}), progress, done)
 
-    @property
-    def finished(self) -> bool:
-        """Whether `finish` has run since the last frame was added."""
-        return self._finished
-
     def restore(self, state: MapState, frames: DeliveredFrames, again: Iterable[TrackedFrame], finished: bool) -> None:
         """Restore the state of another mapper with the same settings.
 
@@ -169,7 +165,7 @@ class Mapper:
             raise ValueError("the frames differ from those with tracked poses")
         self.frames = frames
         self.pipeline.count_beside(frames.points.nbytes)
-        self._finished = finished
+        self.finished = finished
 
     def trajectory(self) -> list[NDArray[np.float64]]:
         """Return the refined T_camera_world (4, 4) of every frame so far."""

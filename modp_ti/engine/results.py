@@ -138,18 +138,17 @@ def metrics_of(
     """
     points, camera = frames.points, frames.camera
     trajectories = {"": list(versions.values())[-1].trajectory, "_tracked": frames.T_tracked}
-    as_tracked = {name: points.reprojection_error(camera, poses) for name, poses in trajectories.items()}
-    anew = {
-        name: points.reprojection_error(camera, poses, points.placed_anew(camera, poses))
-        for name, poses in trajectories.items()
-    }
+    errors = {name: points.reprojection_error(camera, poses) for name, poses in trajectories.items()}
+    for name, poses in trajectories.items():
+        errors["_anew" + name] = points.reprojection_error(camera, poses, points.placed_anew(camera, poses))
+    taken = {stage: seconds.get(stage, 0.0) for stage in STAGES}
+    taken = {"total": seconds["total"], **taken, "other": seconds["total"] - sum(taken.values())}
     return {
         "frames": len(frames),
         "corrections": frames.corrections,
         **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
-        **{f"reprojection_error{name}": _rounded(error) for name, error in as_tracked.items()},
-        **{f"reprojection_error_anew{name}": _rounded(error) for name, error in anew.items()},
-        "seconds": _seconds(seconds),
+        **{f"reprojection_error{name}": None if error is None else round(error, 4) for name, error in errors.items()},
+        "seconds": {name: round(time, 3) for name, time in taken.items()},
     }
 
 
@@ -162,15 +161,3 @@ def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[
         "gaussians": len(version.gaussians["position"]),
         "view_renders": version.view_renders,
     }
-
-
-def _seconds(stages: dict[str, float]) -> dict[str, float]:
-    """Return the time of each stage [s], and the remainder of the total as `other`."""
-    seconds = {"total": round(stages["total"], 3)}
-    seconds |= {stage: round(stages.get(stage, 0.0), 3) for stage in STAGES}
-    seconds["other"] = round(stages["total"] - sum(stages.get(stage, 0.0) for stage in STAGES), 3)
-    return seconds
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)

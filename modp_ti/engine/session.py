@@ -31,7 +31,7 @@ from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, keyframe_psnr, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import retention
 from modp_ti.outputs.time_left import TimeAfterMapping
 from pipelines.pipeline import FrameReport
@@ -97,7 +97,9 @@ class _Session:
     def run(self, resumed: Snapshot | None) -> Path:
         """Run all stages and return the output folder."""
         self._map_the_stream(resumed)
-        self._say_which_frames_were_refused()
+        refused = [f"{count} {why}" for why, count in self.mapper.pipeline.refused.items() if count]
+        if refused:
+            self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
         self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
         versions = self._versions()
         self.observer.on_stage("evaluating the saved map")
@@ -201,18 +203,9 @@ class _Session:
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Callback after a step of the offline optimisation."""
         self.line.step(step, psnr, gaussians)
-        self.record.optimised(step, gaussians, psnr)
+        self.record.steps.append(StepNote(step, psnr, gaussians))
         self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
         self.stop.check()
-
-    def _say_which_frames_were_refused(self) -> None:
-        refused = [f"{count} {why}" for why, count in self._left_out().items() if count and why != "unreadable"]
-        if refused:
-            self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
-
-    def _left_out(self) -> dict[str, int]:
-        """Count the frames that did not touch the map because they are faulty, by reason."""
-        return {"unreadable": len(self.tracker.unreadable), **self.mapper.pipeline.refused}
 
     # ---- the finished map ------------------------------------------------------------------------------------
 
@@ -226,30 +219,25 @@ class _Session:
             )
         versions = {config.mode: checkpointer.online or self.mapper.version()}
         if config.refine.steps and config.mode != "offline":
+            checkpointer.after_mapping()
+            checkpointer.online = versions[config.mode]
+            scores = self.after_mapping.scores(len(self.mapper.frames)) / config.refine.views  # in steps
+            self.line.start("refining", config.refine.steps, checkpointer.refined, lambda step: step * scores)
             try:
-                checkpointer.after_mapping()
-                checkpointer.online = versions[config.mode]
-                self._refine()
+                try:
+                    self.mapper.refine(config.refine.steps, config.refine, self._refined, checkpointer.refined)
+                finally:
+                    self.line.stop()
             except RunStopped:
                 raise self._stopped() from None
             versions["refined"] = self.mapper.version()
         return versions
 
-    def _refine(self) -> None:
-        """Refine the map, or continue its refinement. Raises RunStopped between two steps."""
-        refine = self.config.refine
-        scores = self.after_mapping.scores(len(self.mapper.frames)) / refine.views  # in steps
-        self.line.start("refining", refine.steps, self.checkpointer.refined, lambda step: step * scores)
-        try:
-            self.mapper.refine(refine.steps, refine, self._refined, self.checkpointer.refined)
-        finally:
-            self.line.stop()
-
     def _refined(self, step: int, psnr: float) -> None:
         """Callback after a step of refinement."""
         steps = self.config.refine.steps
         self.line.step(step, psnr)
-        self.record.refined(step, psnr)
+        self.record.steps.append(StepNote(step, psnr))
         self.observer.on_step("refining", step, steps, psnr)
         self.checkpointer.after_step(step, steps)
         self.stop.check()
@@ -298,7 +286,10 @@ class _Session:
     def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
         """Write the scores, the metrics and the report, and return the metrics."""
         pipeline, frames, checkpointer = self.mapper.pipeline, self.mapper.frames, self.checkpointer
-        truth = self._true_poses()
+        truth: list[NDArray[np.float64]] = []  # of every frame, NaN where it is unknown; empty without ground truth
+        if self.truth is not None:
+            truth, note = true_poses(self.truth, frames.timestamp)
+            self._say(*([note] if note else []))
         caught = pipeline.caught()
         if warning := caught.warning():
             self._say(warning)
@@ -315,7 +306,7 @@ class _Session:
                 "resumed": checkpointer.resumed,
             },
             "guards": caught.counts(),
-            "frames_left_out": self._left_out(),
+            "frames_left_out": {"unreadable": len(self.tracker.unreadable), **pipeline.refused},
             "lpips_note": self.no_lpips,
             "breakdown_percent": self.breakdown,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
@@ -329,15 +320,6 @@ class _Session:
             if problem:
                 self._say(problem)
         return metrics
-
-    def _true_poses(self) -> list[NDArray[np.float64]]:
-        """Return the true pose of every frame, NaN where it is unknown; empty without ground truth."""
-        if self.truth is None:
-            return []
-        truth, note = true_poses(self.truth, self.mapper.frames.timestamp)
-        if note:
-            self._say(note)
-        return truth
 
     # ---- interruption, viewer, notes -------------------------------------------------------------------------
 

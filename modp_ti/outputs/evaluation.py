@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from fields.geometry.se3 import inverse_se3
-from fields.map.gaussians import GaussianField
+from fields.geometry.se3 import camera_centres
 from fields.map.keyframes import Keyframe
 from modp_ti.outputs.detail import explained_detail
 from modp_ti.outputs.lpips import Lpips
-from pipelines.optimise.losses import LossValues, PhotometricLoss
-from pipelines.render.renderer import Renderer
+from pipelines.optimise.losses import LossValues
+from pipelines.pipeline import Pipeline
 
 __all__ = [
-    "EvaluatedMap",
     "FrameScore",
     "MapVersion",
     "absolute_trajectory_error",
@@ -34,19 +31,6 @@ __all__ = [
 
 # Batch size. Each version of the map is loaded once per batch, whose frames are all held in memory.
 EVALUATED_TOGETHER = 32
-
-
-class EvaluatedMap(Protocol):
-    """The part of a mapper that evaluation uses: storage for the map, the renderer and the loss."""
-
-    gaussians: GaussianField
-    renderer: Renderer
-    loss: PhotometricLoss
-
-    @property
-    def near(self) -> float:
-        """Depth below which nothing is drawn [scene units]."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -94,41 +78,30 @@ class FrameScore:
 
 def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
     """Return the mean scores over the frames, as in metrics.json. A mean is None if there is nothing to average."""
-
-    def mean(values: list[float | None], digits: int) -> float | None:
-        known = [value for value in values if value is not None]
-        return None if not known or len(known) < len(values) else round(float(np.mean(known)), digits)
-
-    return {
-        "psnr": mean([score.psnr for score in scores], 4),
-        "ssim": mean([score.ssim for score in scores], 5),
-        "lpips": mean([score.lpips for score in scores], 5),
-        "detail": mean([score.detail for score in scores], 5),
-        "count": len(scores),
-    }
+    means: dict[str, float | int | None] = {}
+    for name, digits in (("psnr", 4), ("ssim", 5), ("lpips", 5), ("detail", 5)):
+        known = [value for score in scores if (value := getattr(score, name)) is not None]
+        means[name] = round(float(np.mean(known)), digits) if known and len(known) == len(scores) else None
+    return means | {"count": len(scores)}
 
 
 def score_frame(
-    renderer: Renderer,
-    loss: PhotometricLoss,
+    pipeline: Pipeline,
     frame: TrackedFrame,
     T_camera_world: NDArray[np.float64],
-    near: float,
     stage: str,
     lpips: Lpips | None = None,
     exposure: NDArray[np.float64] | None = None,
 ) -> tuple[FrameScore, NDArray[np.float32]]:
-    """Render a frame's view in the renderer's current map and score it.
+    """Render a frame's view in the current map and score it.
 
     The render is developed with the frame's exposure and vignette and clipped to [0, 1]. Masked pixels do not count,
     and have the frame's colours in the returned render.
 
     Args:
-        renderer: Holds the map.
-        loss: Computes PSNR and SSIM.
+        pipeline: Holds the map.
         frame: The frame to compare with.
         T_camera_world: (4, 4) pose to render from.
-        near: Depth below which nothing is drawn [scene units].
         stage: Name of the map's version, stored in the score.
         lpips: The LPIPS network, None to leave it out.
         exposure: (3, 4) affine colour transform of the frame, None for the identity.
@@ -137,8 +110,8 @@ def score_frame(
         The score, and the render (H, W, 3).
     """
     rgba = frame.rgba
-    values = _compare(renderer, loss, frame, T_camera_world, near, exposure)
-    render = renderer.images.colour_to_numpy()
+    values = _compare(pipeline, frame, T_camera_world, exposure)
+    render = pipeline.renderer.images.colour_to_numpy()
     image = np.asarray(rgba[..., :3] / np.float32(255.0), dtype=np.float32)
     distance = None if lpips is None else lpips(render, image)
     detail = explained_detail(render, image, rgba[..., 3] > 0)
@@ -146,29 +119,28 @@ def score_frame(
     return score, render
 
 
-def keyframe_psnr(mapper: EvaluatedMap, view: Keyframe) -> float:
+def keyframe_psnr(pipeline: Pipeline, view: Keyframe) -> float:
     """Return the PSNR [dB] of a keyframe in the current map, computed as `score_frame` does."""
-    return _compare(mapper.renderer, mapper.loss, view, view.T_camera_world, mapper.near, view.exposure).psnr
+    return _compare(pipeline, view, view.T_camera_world, view.exposure).psnr
 
 
 def _compare(
-    renderer: Renderer,
-    loss: PhotometricLoss,
+    pipeline: Pipeline,
     frame: TrackedFrame | Keyframe,
     T_camera_world: NDArray[np.float64],
-    near: float,
     exposure: NDArray[np.float64] | None,
 ) -> LossValues:
     """Render a frame's view, develop and clip it, and compare it with the frame's image."""
-    renderer.forward(frame.camera, T_camera_world, near)
+    renderer = pipeline.renderer
+    renderer.forward(frame.camera, T_camera_world, pipeline.near)
     renderer.develop(exposure, frame.vignette)
     renderer.images.clip_colour()
     renderer.images.set_reference(frame.rgba)
-    return loss.forward()
+    return pipeline.loss.forward()
 
 
 def evaluate(
-    mapper: EvaluatedMap,
+    pipeline: Pipeline,
     frames: Iterable[TrackedFrame],
     versions: Mapping[str, MapVersion],
     lpips: Lpips | None,
@@ -177,7 +149,7 @@ def evaluate(
     """Score every frame in every version of the map.
 
     Args:
-        mapper: Receives the maps in turn. The last version stays loaded.
+        pipeline: Receives the maps in turn. The last version stays loaded.
         frames: All frames.
         versions: Map versions by name.
         lpips: The LPIPS network, None to leave it out.
@@ -190,10 +162,10 @@ def evaluate(
     frames = iter(frames)
     while batch := list(islice(frames, EVALUATED_TOGETHER)):
         for name, version in versions.items():
-            mapper.gaussians.load(version.gaussians)
+            pipeline.gaussians.load(version.gaussians)
             for frame in batch:
                 T, exposure = version.trajectory[frame.index], version.exposures[frame.index]
-                score, render = score_frame(mapper.renderer, mapper.loss, frame, T, mapper.near, name, lpips, exposure)
+                score, render = score_frame(pipeline, frame, T, name, lpips, exposure)
                 scores[name].append(score)
                 rendered(name, frame, render)
     return [score for of in scores.values() for score in of]
@@ -231,8 +203,7 @@ def absolute_trajectory_error(
         truth: Ground-truth T_camera_world (4, 4) of every frame, NaN for frames without one, which do not count.
         with_scale: Whether to align by a similarity; by a rigid motion otherwise.
     """
-    source = np.array([inverse_se3(T)[:3, 3] for T in estimate])
-    target = np.array([inverse_se3(T)[:3, 3] for T in truth])
+    source, target = camera_centres(estimate), camera_centres(truth)
     known = np.isfinite(target).all(axis=1)
     source, target = source[known], target[known]
     s, R, t = umeyama(source, target, with_scale)

@@ -8,11 +8,11 @@ not counted. The best of several runs is used, as both are upper limits.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import torch
 
+from benchmarks.timing import seconds
 from fields.runtime.backend import initialise
 
 __all__ = ["measure_machine"]
@@ -39,11 +39,5 @@ def measure_machine(device: str, threads: int) -> dict[str, float]:
 def _best(call: Callable[[], object], where: str) -> float:
     """Return the time of the fastest of several calls [s]."""
     wait = torch.cuda.synchronize if where == "cuda" else lambda: None
-    times = []
-    for _ in range(RUNS + 1):
-        wait()
-        start = time.perf_counter()
-        call()
-        wait()
-        times.append(time.perf_counter() - start)
-    return min(times[1:])
+    call()
+    return min(seconds(call, wait) for _ in range(RUNS))

@@ -13,6 +13,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from experiments import Job, run
+
 from modp_ti.files.errors import InputError
 
 __all__ = ["Point", "Program", "against", "curves", "frontier", "psnr_at", "seconds_to", "this_program"]
@@ -155,28 +158,23 @@ def _points(program: Program, scene: Path, steps: int, settings: Mapping[str, st
         if record["scene"] == scene.read_text(encoding="utf-8") and record["overrides"] == overrides:
             return [Point(**point) for point in record["points"]]
     with tempfile.TemporaryDirectory() as folder:
-        output = Path(folder) / "out"
-        seconds = _run(program, scene, {**overrides, "output": json.dumps(str(output))})
-        points = points_of(json.loads((output / "metrics.json").read_text(encoding="utf-8")), seconds, steps)
+        job = Job(f"the run of {scene} by {program.label}", scene, Path(folder) / "out", overrides)
+        seconds = _run(program, job)
+        points = points_of(job.metrics(), seconds, steps)
     kept.parent.mkdir(parents=True, exist_ok=True)
     record = {"scene": scene.read_text(encoding="utf-8"), "overrides": overrides, "points": [asdict(p) for p in points]}
     kept.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     return points
 
 
-def _run(program: Program, scene: Path, overrides: Mapping[str, str]) -> float:
-    """Run a scene and return the processor time of the process [s]."""
-    command = [sys.executable, "-m", "modp_ti.run", str(scene)]
-    for key, value in overrides.items():
-        command += ["--set", f"{key}={value}"]
+def _run(program: Program, job: Job) -> float:
+    """Run a job and return the processor time of the process [s]."""
     before = os.times()
     # The module is found in the working folder, before the installed package.
-    code = subprocess.run(
-        command, cwd=program.root, env=os.environ | {"PYTHONPATH": str(program.root)}, stdout=sys.stderr, check=False
-    ).returncode
+    code = run(job, cwd=program.root, env=os.environ | {"PYTHONPATH": str(program.root)})
     after = os.times()
     if code:
-        raise InputError(f"the run of {scene} by {program.label} ended with exit code {code}")
+        raise InputError(f"{job.label} ended with exit code {code}")
     return after.children_user + after.children_system - before.children_user - before.children_system
 
 
@@ -192,23 +190,13 @@ def points_of(metrics: Mapping[str, Any], processor: float, steps: int) -> list[
     """
     seconds = metrics["seconds"]
     all_stages = seconds["total"] - sum(seconds.get(stage, 0.0) for stage in NOT_MAPPING)
-    online = all_stages - seconds.get("refine", 0.0)
+    shares = {"online": all_stages - seconds.get("refine", 0.0), "refined": all_stages}
     points = []
-    for stage, share in (("online", online), ("refined", all_stages)):
-        scores = metrics[stage]
-        if scores is not None:
-            held_out = scores["held_out"]
-            points.append(
-                Point(
-                    steps=steps,
-                    stage=stage,
-                    seconds=processor * share / seconds["total"],
-                    psnr=held_out["psnr"],
-                    ssim=held_out["ssim"],
-                    gaussians=scores["gaussians"],
-                    view_renders=scores["view_renders"],
-                )
-            )
+    for stage, share in shares.items():
+        if (scores := metrics[stage]) is not None:
+            psnr, ssim = scores["held_out"]["psnr"], scores["held_out"]["ssim"]
+            made_of = scores["gaussians"], scores["view_renders"]
+            points.append(Point(steps, stage, processor * share / seconds["total"], psnr, ssim, *made_of))
     return points
 
 
@@ -236,17 +224,11 @@ def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
     Returns:
         The PSNR, that of the best point beyond the last one, None before the first.
     """
-    import numpy as np
-
     times, values = zip(*frontier(points), strict=True)
     return None if seconds < times[0] else float(np.interp(np.log(seconds), np.log(times), values))
 
 
 def seconds_to(points: Sequence[Point], psnr: float) -> float | None:
     """Return the processor time that reaches a PSNR [s], as `psnr_at` reads the frontier; None if none does."""
-    import numpy as np
-
     times, values = zip(*frontier(points), strict=True)
-    if psnr > values[-1]:
-        return None
-    return float(np.exp(np.interp(psnr, values, np.log(times))))
+    return None if psnr > values[-1] else float(np.exp(np.interp(psnr, values, np.log(times))))

@@ -12,6 +12,13 @@ from benchmarks.quality import Point, psnr_at, seconds_to
 __all__ = ["plot", "report"]
 
 MINUTES = (0.5, 1, 2, 4, 8, 16)
+POINTS = {
+    "PSNR": ("psnr", ".2f"),
+    "SSIM": ("ssim", ".3f"),
+    "Gaussians": ("gaussians", ",.0f"),
+    "view renders": ("view_renders", ",.0f"),
+    "processor [s]": ("seconds", ",.1f"),
+}
 Curves = Mapping[str, Mapping[str, Sequence[Point]]]
 
 
@@ -21,28 +28,27 @@ def report(curves: Curves) -> str:
     Args:
         curves: Points by scene and program.
     """
-    lines = [
+    parts = [
         "# Quality per minute",
-        "",
         "Held-out PSNR [dB] after so many minutes of processor time on one thread, from the first frame on, without "
         "compilation and scoring: the best of the online and the refined maps of all budgets, interpolated.",
-        "",
     ]
     columns = {f"{minutes:g} min": (f"{minutes:g}", ".2f") for minutes in MINUTES}
     rows: dict[str, Figures] = {}
     for scene, of in curves.items():
         for program, points in of.items():
             rows[f"{scene}, {program}"] = {f"{minutes:g}": psnr_at(points, 60 * minutes) for minutes in MINUTES}
-    lines.append(markdown_table("scene, program", columns, rows))
+    parts.append(markdown_table("scene, program", columns, rows))
     if all(len(of) == 2 for of in curves.values()):
-        lines += ["", "## Time for the same quality", "", *_equal_quality(curves)]
+        parts += ["## Time for the same quality", _equal_quality(curves)]
     for scene, of in curves.items():
-        lines += ["", f"## {scene}", "", _points_table(of)]
-    return "\n".join(lines)
+        points = {f"{label}, {p.steps}, {p.stage}": vars(p) for label, points in of.items() for p in points}
+        parts += [f"## {scene}", markdown_table("program, steps a keyframe, map", POINTS, points)]
+    return "\n\n".join(parts)
 
 
-def _equal_quality(curves: Curves) -> list[str]:
-    """Return the share of the second program's time in which the first one reaches the same PSNR."""
+def _equal_quality(curves: Curves) -> str:
+    """Return the table of the share of the second program's time in which the first one reaches the same PSNR."""
     rows: dict[str, Figures] = {}
     for scene, of in curves.items():
         new, old = of.values()
@@ -63,21 +69,7 @@ def _equal_quality(curves: Curves) -> list[str]:
         f"{first} [s]": ("new", ",.0f"),
         "share [%]": ("share", ".0f"),
     }
-    return [markdown_table(f"as {second} reaches it", columns, rows)]
-
-
-def _points_table(of: Mapping[str, Sequence[Point]]) -> str:
-    columns = {
-        "PSNR": ("psnr", ".2f"),
-        "SSIM": ("ssim", ".3f"),
-        "Gaussians": ("gaussians", ",.0f"),
-        "view renders": ("view_renders", ",.0f"),
-        "processor [s]": ("seconds", ",.1f"),
-    }
-    rows: dict[str, Figures] = {
-        f"{program}, {point.steps}, {point.stage}": vars(point) for program, points in of.items() for point in points
-    }
-    return markdown_table("program, steps a keyframe, map", columns, rows)
+    return markdown_table(f"as {second} reaches it", columns, rows)
 
 
 def plot(curves: Curves, file: Path) -> None:
@@ -94,10 +86,8 @@ def plot(curves: Curves, file: Path) -> None:
         for colour, (program, points) in enumerate(of.items()):
             for stage, line in (("online", "o-"), ("refined", "s--")):
                 shown = [point for point in points if point.stage == stage]
-                label = f"{program}, {stage}"
-                axes.plot(
-                    [p.seconds for p in shown], [p.psnr for p in shown], line, color=f"C{colour}", ms=4, label=label
-                )
+                style = {"color": f"C{colour}", "ms": 4, "label": f"{program}, {stage}"}
+                axes.plot([p.seconds for p in shown], [p.psnr for p in shown], line, **style)
         axes.set(xscale="log", title=scene, xlabel="processor time [s]", ylabel="held-out PSNR [dB]")
         axes.grid(alpha=0.3, which="both")
     figure.axes[0].legend(fontsize="small")

@@ -9,7 +9,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import taichi as ti
 
-__all__ = ["milliseconds", "peak_memory_mb", "stage_milliseconds"]
+__all__ = ["milliseconds", "peak_memory_mb", "seconds", "stage_milliseconds"]
+
+
+def seconds(call: Callable[[], object], wait: Callable[[], object] = ti.sync) -> float:
+    """Return the time of a call [s], with the device synchronised by `wait` before and after it."""
+    wait()
+    start = time.perf_counter()
+    call()
+    wait()
+    return time.perf_counter() - start
 
 
 def stage_milliseconds(stages: Sequence[tuple[str, Callable[[], object]]], repeats: int) -> dict[str, float]:
@@ -20,12 +29,9 @@ def stage_milliseconds(stages: Sequence[tuple[str, Callable[[], object]]], repea
     times: dict[str, list[float]] = {name: [] for name, _ in stages}
     for number in range(repeats + 1):
         for name, call in stages:
-            ti.sync()
-            start = time.perf_counter()
-            call()
-            ti.sync()
+            taken = seconds(call)
             if number:
-                times[name].append(time.perf_counter() - start)
+                times[name].append(taken)
     return {name: 1e3 * float(np.median(of)) for name, of in times.items()}
 
 

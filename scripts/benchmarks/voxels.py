@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable
 
 import numpy as np
 
+from benchmarks.timing import seconds
 from fields.map.occupancy import OccupancyVoxels
 from fields.runtime.backend import initialise
 
@@ -27,11 +26,6 @@ def measure_voxels(device: str, threads: int, level: int) -> dict[str, float]:
     size = 0.5**level
     times: dict[str, list[float]] = {"query": [], "update": [], "admit": []}
 
-    def timed(name: str, call: Callable[[], object]) -> None:
-        start = time.perf_counter()
-        call()
-        times[name].append(time.perf_counter() - start)
-
     def compiled() -> OccupancyVoxels:
         voxels = OccupancyVoxels()
         voxels.query(np.zeros((0, 3)), size)
@@ -41,12 +35,12 @@ def measure_voxels(device: str, threads: int, level: int) -> dict[str, float]:
     voxels = compiled()
     before = _resident_mb()
     for batch in points:
-        timed("query", lambda batch=batch: voxels.query(batch, size))
-        timed("update", lambda batch=batch: voxels.update(batch, size))
+        times["query"].append(seconds(lambda batch=batch: voxels.query(batch, size)))
+        times["update"].append(seconds(lambda batch=batch: voxels.update(batch, size)))
     megabytes = _resident_mb() - before
     voxels = compiled()
     for batch in points:
-        timed("admit", lambda batch=batch: voxels.admit(batch, size))
+        times["admit"].append(seconds(lambda batch=batch: voxels.admit(batch, size)))
     return {name: 1e3 * float(np.median(of)) for name, of in times.items()} | {"megabytes": megabytes}
 
 

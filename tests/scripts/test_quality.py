@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from benchmarks import quality, quality_report
 from benchmarks.quality import Point, Program, frontier, points_of, psnr_at, seconds_to
+from experiments import Job
 
 from modp_ti.files.errors import InputError
 
@@ -46,12 +47,11 @@ def test_programs_run_interleaved_and_finished_runs_of_commits_are_kept(
     started: list[str] = []
     speeds = {"new": iter([30.0, 10.0, 20.0]), "old+": iter([60.0, 60.0, 60.0])}
 
-    def run(program: Program, scene: Path, overrides: Mapping[str, str]) -> float:
+    def run(program: Program, job: Job) -> float:
         started.append(program.label)
-        output = Path(json.loads(overrides["output"]))
-        output.mkdir(parents=True)
-        metrics = make_metrics(20.0 + int(overrides["mapping.optimise.steps"]), refined=30.0)
-        (output / "metrics.json").write_text(json.dumps(metrics))
+        job.folder.mkdir(parents=True)
+        metrics = make_metrics(20.0 + int(job.overrides["mapping.optimise.steps"]), refined=30.0)
+        (job.folder / "metrics.json").write_text(json.dumps(metrics))
         return next(speeds[program.label])
 
     monkeypatch.setattr(quality, "_run", run)

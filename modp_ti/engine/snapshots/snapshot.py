@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,6 +27,17 @@ from pipelines.state import MapState
 __all__ = ["Position", "Snapshot", "StreamDigest", "frames_state", "record_state", "version_state"]
 
 UNKNOWN = np.full((3, 4), np.nan)
+# Saved columns of the record's frames and steps. None is saved as NaN.
+FRAME_COLUMNS = {
+    "index": np.int64,
+    "held_out": np.bool_,
+    "is_keyframe": np.bool_,
+    "done": np.float64,
+    "gaussians": np.int64,
+    "psnr": np.float64,
+    "mapped_psnr": np.float64,
+}
+STEP_COLUMNS = {"step": np.int64, "psnr": np.float64}
 
 
 class StreamDigest:
@@ -160,14 +171,12 @@ class Snapshot:
     def record(self, record: RunRecord) -> None:
         """Copy the saved notes into a new record."""
         state = MapState(self.arrays, {})
-        rows = state.group("record")
-        columns = [rows[name].tolist() for name in ("index", "held_out", "is_keyframe", "done", "gaussians")]
-        columns += [
-            [None if np.isnan(value) else float(value) for value in rows[name]] for name in ("psnr", "mapped_psnr")
-        ]
-        record.frames = [FrameNote(*row) for row in zip(*columns, strict=True)]
-        steps = state.group("record_steps")
-        record.steps = [StepNote(*row) for row in zip(steps["step"].tolist(), steps["psnr"].tolist(), strict=True)]
+        frames, steps = state.group("record"), state.group("record_steps")
+        columns = {name: frames[name].tolist() for name in FRAME_COLUMNS}
+        for name in ("psnr", "mapped_psnr"):
+            columns[name] = [None if np.isnan(value) else value for value in columns[name]]
+        record.frames = [FrameNote(*row) for row in zip(*columns.values(), strict=True)]
+        record.steps = [StepNote(*row) for row in zip(*(steps[name].tolist() for name in STEP_COLUMNS), strict=True)]
         record.started = float(self.numbers["started"])
 
 
@@ -202,19 +211,9 @@ def version_state(version: MapVersion | None) -> MapState:
 
 def record_state(record: RunRecord) -> MapState:
     """Inverse of `Snapshot.record`."""
-    notes = record.frames
-    rows = {
-        "index": np.array([note.index for note in notes], dtype=np.int64),
-        "held_out": np.array([note.held_out for note in notes], dtype=bool),
-        "is_keyframe": np.array([note.is_keyframe for note in notes], dtype=bool),
-        "done": np.array([note.done for note in notes], dtype=np.float64),
-        "gaussians": np.array([note.gaussians for note in notes], dtype=np.int64),
-        # None becomes NaN.
-        "psnr": np.array([note.psnr for note in notes], dtype=np.float64),
-        "mapped_psnr": np.array([note.mapped_psnr for note in notes], dtype=np.float64),
-    }
-    steps = {
-        "step": np.array([note.step for note in record.steps], dtype=np.int64),
-        "psnr": np.array([note.psnr for note in record.steps], dtype=np.float64),
-    }
-    return MapState.of({"record": rows, "record_steps": steps}, {})
+
+    def arrays(notes: Sequence[FrameNote | StepNote], columns: Mapping[str, type]) -> dict[str, NDArray]:
+        return {name: np.array([getattr(note, name) for note in notes], dtype=of) for name, of in columns.items()}
+
+    groups = {"record": arrays(record.frames, FRAME_COLUMNS), "record_steps": arrays(record.steps, STEP_COLUMNS)}
+    return MapState.of(groups, {})

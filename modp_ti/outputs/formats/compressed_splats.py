@@ -163,7 +163,8 @@ def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> Non
         )
     fixed = np.round(position * 2.0**fractional).astype("<i4")
     degree = round(state["sh"].shape[1] ** 0.5) - 1
-    q = _unit_quaternions(state)[:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0]
+    largest, others = _smallest_three(_unit_quaternions(state)[:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0])
+    components = [part for value in others.T for part in ((value < 0).astype(np.float64), np.abs(value) * np.sqrt(2.0))]
     rest = state["sh"][:, 1:].astype(np.float64) * TURNED[: state["sh"].shape[1] - 1, None]
     arrays = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3],
@@ -171,21 +172,12 @@ def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> Non
         np.clip(_to_bits(opacities(state), 8), 1, 254).astype(np.uint8),
         _to_bits(0.15 * state["sh"][:, 0].astype(np.float64) + 0.5, 8).astype(np.uint8),
         np.clip(np.round(16.0 * (state["log_scale"].astype(np.float64) + 10.0)), 0, 255).astype(np.uint8),
-        _rotations(q),
+        (largest.astype(np.uint32) << 30 | _packed(components, (1, 9) * 3)).astype("<u4"),
         np.clip(np.round(128.0 * rest) + 128.0, 0, 255).astype(np.uint8),
     )
     header = struct.pack("<3I4B", MAGIC, VERSION, len(position), degree, fractional, ANTIALIASED, 0)
     content = header + b"".join(array.tobytes() for array in arrays)
     replace_file(path, gzip.compress(content, mtime=0))
-
-
-def _rotations(q: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """Pack unit quaternions x, y, z, w (N, 4) into 32 bits each."""
-    largest, others = _smallest_three(q)
-    packed = largest.astype("<u4")
-    for value in others.T:
-        packed = packed << 10 | (value < 0).astype("<u4") << 9 | _to_bits(np.abs(value) * np.sqrt(2.0), 9)
-    return packed.astype("<u4")
 
 
 def opacities(state: Mapping[str, NDArray]) -> NDArray[np.float64]:

@@ -16,14 +16,14 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from modp_ti.files.errors import InputError
 
-__all__ = ["dataset_folder", "rename_images", "write_transforms"]
+__all__ = ["new_folder", "rename_images", "write_transforms"]
 
 # Converts OpenCV camera axes to OpenGL camera axes.
 OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @contextmanager
-def dataset_folder(folder: Path) -> Iterator[Path]:
+def new_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder that becomes `folder` on exit.
 
     Raises:
@@ -110,8 +110,5 @@ def _intrinsics(camera: PinholeCamera) -> dict[str, float]:
         "cy": camera.cy,
         "w": camera.width,
         "h": camera.height,
-        "k1": 0.0,
-        "k2": 0.0,
-        "p1": 0.0,
-        "p2": 0.0,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
     }

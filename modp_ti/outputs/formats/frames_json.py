@@ -36,9 +36,8 @@ def write_frames(
     path: Path, near: float, scene_depth: float, keyframes: Collection[int], held_out: Collection[int]
 ) -> None:
     """Write the record. Numbers are written with enough digits to be read back exactly."""
-    lists = {"keyframes": sorted(keyframes), "held_out": sorted(held_out)}
-    lines = [f'"{name}": {json.dumps(value)}' for name, value in lists.items()]
-    text = ",\n ".join([f'"near": {float(near)!r}', f'"scene_depth": {float(scene_depth)!r}', *lines])
+    record = FramesRecord(float(near), float(scene_depth), sorted(keyframes), sorted(held_out))
+    text = ",\n ".join(f'"{name}": {json.dumps(value)}' for name, value in vars(record).items())
     replace_text(path, f"{{{text}}}\n")
 
 

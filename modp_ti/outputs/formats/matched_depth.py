@@ -101,13 +101,17 @@ def matched_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[i
     if not neighbours or not known.any():
         return view.depth
     inverse = 1.0 / np.where(known, view.depth, np.median(view.depth[known]))
-    warps = [_warp(view, views[other]) for other in neighbours]
+    others = [views[index] for index in neighbours]
+    warps = [
+        plane_warp(view.camera, view.T_camera_world, other.camera, other.T_camera_world).astype(np.float32)
+        for other in others
+    ]
     # One step of inverse depth moves a pixel by about one pixel in the most distant neighbour.
-    step = np.float32(1.0 / max(float(np.linalg.norm(b[:2])) for _, b in warps))
+    step = np.float32(1.0 / max(float(np.linalg.norm(warp[:2, 3])) for warp in warps))
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # for thousands of small pictures, waiting for other threads takes longer than the work
     try:
-        inverse = _swept(view, [views[other] for other in neighbours], warps, inverse, step)
+        inverse = _swept(view, others, warps, inverse, step)
     finally:
         cv2.setNumThreads(threads)
     return np.where(inverse > 0, 1.0 / np.maximum(inverse, 1e-12), 0.0).astype(np.float32)
@@ -139,16 +143,10 @@ def agreed_depth(views: Sequence[DepthView], index: int, neighbours: Sequence[in
     return depth
 
 
-def _warp(view: DepthView, other: DepthView) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return A (3, 3) and b (3,) of `plane_warp`."""
-    warp = plane_warp(view.camera, view.T_camera_world, other.camera, other.T_camera_world).astype(np.float32)
-    return np.ascontiguousarray(warp[:, :3]), np.ascontiguousarray(warp[:, 3])
-
-
 def _swept(
     view: DepthView,
     others: Sequence[DepthView],
-    warps: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    warps: Sequence[Image],
     inverse: NDArray[np.floating],
     step: np.float32,
 ) -> Image:
@@ -168,7 +166,7 @@ def _swept(
 def _matching_cost(
     view: DepthView,
     others: Sequence[DepthView],
-    warps: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    warps: Sequence[Image],
     inverse: Image,
     offsets: NDArray[np.float32],
 ) -> NDArray[np.float32]:
@@ -181,11 +179,11 @@ def _matching_cost(
     window = WINDOW if len(others) >= NEIGHBOURS // 2 else WINDOW_OF_FEW
     mean, variance = _moments(view.grey, window)
     total, count = (np.zeros((len(offsets), height, width), np.float32) for _ in range(2))
-    for other, (A, b) in zip(others, warps, strict=True):
-        u, v, w = (A[r, 0] * x + A[r, 1] * y + A[r, 2] + b[r] * inverse for r in range(3))
+    for other, warp in zip(others, warps, strict=True):
+        u, v, w = (row[0] * x + row[1] * y + row[2] + row[3] * inverse for row in warp)
         for d, offset in enumerate(offsets):
-            over = 1.0 / np.maximum(w + b[2] * offset, 1e-3)
-            columns, rows = (u + b[0] * offset) * over - 0.5, (v + b[1] * offset) * over - 0.5
+            over = 1.0 / np.maximum(w + warp[2, 3] * offset, 1e-3)
+            columns, rows = (u + warp[0, 3] * offset) * over - 0.5, (v + warp[1, 3] * offset) * over - 0.5
             carried = cv2.remap(
                 other.grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-99.0
             )

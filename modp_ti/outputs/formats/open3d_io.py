@@ -30,8 +30,8 @@ def open3d() -> ModuleType:
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """Yield a temporary path with the same suffix, whose file replaces `path` on exit."""
-    partial = path.with_name(f"{path.stem}.partial{path.suffix}")
+    """Yield a temporary path with the same suffix, in small letters, whose file replaces `path` on exit."""
+    partial = path.with_name(f"{path.stem}.partial{path.suffix.lower()}")
     try:
         yield partial
         os.replace(partial, path)

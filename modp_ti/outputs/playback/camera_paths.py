@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import camera_centres
+from fields.geometry.se3 import camera_centres, inverse_poses
 
 __all__ = ["looking_at", "orbit", "smoothed"]
 
@@ -41,7 +41,9 @@ def smoothed(poses: NDArray[np.float64], count: int, deviation: float) -> NDArra
     # Chordal mean: the rotation nearest to the weighted sum of the rotation matrices.
     U, _, Vt = np.linalg.svd((weights @ rotations.reshape(n, 9)).reshape(count, 3, 3))
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return _poses(U @ Vt, weights @ centres)
+    T_world_camera = np.tile(np.eye(4), (count, 1, 1))
+    T_world_camera[:, :3, :3], T_world_camera[:, :3, 3] = U @ Vt, weights @ centres
+    return inverse_poses(T_world_camera)
 
 
 def orbit(poses: NDArray[np.float64], depth: float, count: int) -> NDArray[np.float64]:
@@ -111,11 +113,3 @@ def _unit_across(v: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[n
         least: NDArray[np.float64] = np.eye(3)[np.argmin(np.abs(axis))]
         v = np.cross(axis, least)
     return v / np.linalg.norm(v)
-
-
-def _poses(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return T_camera_world (M, 4, 4) from camera-to-world rotations (M, 3, 3) and centres (M, 3)."""
-    result = np.tile(np.eye(4), (len(centres), 1, 1))
-    result[:, :3, :3] = rotations.transpose(0, 2, 1)
-    result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], centres)
-    return result

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.compressed_splats import write_compressed_ply, write_spz, write_web_splat
-from modp_ti.outputs.formats.datasets import dataset_folder, rename_images, write_transforms
+from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
 from modp_ti.outputs.playback.film import is_video
@@ -118,7 +118,7 @@ def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
 
 def _dataset(run: FinishedRun, target: Path, format: str, line: ProgressLine) -> None:
     names = dataset_names(run)
-    with dataset_folder(target) as folder:
+    with new_folder(target) as folder:
         write_images(run, folder, line)
         if format == "colmap":
             rename_images(run.folder / "colmap", folder / "sparse" / "0", names)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterable
+from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.datasets import new_folder
+from modp_ti.outputs.formats.open3d_io import written_aside
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from pipelines.render.renderer import RenderedView
 
@@ -67,22 +69,15 @@ def write_pictures(folder: Path, views: Iterable[RenderedView], depth: bool) -> 
     """
     import cv2
 
-    partial = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
     try:
-        partial.mkdir()
-        for number, view in enumerate(views):
-            if depth:
-                cv2.imwrite(str(partial / f"{number:06d}.tiff"), view.expected_depth().astype(np.float32))
-            else:
-                cv2.imwrite(str(partial / f"{number:06d}.png"), eight_bits(view.colour)[..., ::-1])
-        if folder.is_dir():
-            folder.rmdir()
-        os.replace(partial, folder)
+        with new_folder(folder) as partial:
+            for number, view in enumerate(views):
+                if depth:
+                    cv2.imwrite(str(partial / f"{number:06d}.tiff"), view.expected_depth().astype(np.float32))
+                else:
+                    cv2.imwrite(str(partial / f"{number:06d}.png"), eight_bits(view.colour)[..., ::-1])
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
@@ -90,7 +85,7 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
 
     Args:
         path: The file, with a suffix of VIDEO_SUFFIXES.
-        pictures: (H, W, 3) uint8 RGB, all of one even size.
+        pictures: (H, W, 3) uint8 RGB, at least one, all of one even size.
         frames_per_second: Frame rate.
 
     Raises:
@@ -98,25 +93,19 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
     """
     import cv2
 
-    partial = path.with_name(f"{path.stem}.partial{path.suffix.lower()}")
-    writer = None
+    pictures = iter(pictures)
+    first = next(pictures)
+    codec = cv2.VideoWriter.fourcc(*VIDEO_SUFFIXES[path.suffix.lower()])
     try:
-        for picture in pictures:
-            if writer is None:
-                codec = cv2.VideoWriter.fourcc(*VIDEO_SUFFIXES[path.suffix.lower()])
-                writer = cv2.VideoWriter(str(partial), codec, frames_per_second, picture.shape[1::-1])
-                if not writer.isOpened():
-                    raise InputError(f"{path}: this OpenCV cannot write such a video; give a folder for pictures")
-            writer.write(np.ascontiguousarray(picture[..., ::-1]))
-        if writer is not None:
-            writer.release()
-            os.replace(partial, path)
+        with written_aside(path) as partial, ExitStack() as held:
+            writer = cv2.VideoWriter(str(partial), codec, frames_per_second, first.shape[1::-1])
+            held.callback(writer.release)
+            if not writer.isOpened():
+                raise InputError(f"{path}: this OpenCV cannot write such a video; give a folder for pictures")
+            for picture in chain([first], pictures):
+                writer.write(np.ascontiguousarray(picture[..., ::-1]))
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        if writer is not None:
-            writer.release()
-        partial.unlink(missing_ok=True)
 
 
 def depth_colours(view: RenderedView, scene_depth: float) -> NDArray[np.uint8]:

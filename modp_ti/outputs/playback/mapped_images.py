@@ -42,7 +42,13 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
     """
     names = dataset_names(run)
     if _kept(run).is_dir():
-        _copy(run, names, folder, line)
+        for name in line.through("copying images", names, len(names)):
+            if not (_kept(run) / name).is_file():
+                raise InputError(f"{_kept(run) / name}: the run's image is missing")
+            for copied in (f"images/{name}", f"masks/{name}.png"):
+                if (run.folder / "colmap" / copied).is_file():
+                    (folder / copied).parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(run.folder / "colmap" / copied, folder / copied)
         return
     config = load_scene(run.folder / "config.yaml")
     if config.is_live:
@@ -55,11 +61,10 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
     try:
         count = 0
         for frame in line.through("reading images", tracker, len(run)):
-            if frame.index >= len(run) or frame.name != run.names[frame.index]:
+            i = frame.index
+            if i >= len(run) or (frame.name, frame.camera) != (run.names[i], run.cameras[i]):
                 raise other
-            if frame.camera != run.cameras[frame.index]:
-                raise other
-            write_image(folder, names[frame.index], frame)
+            write_image(folder, names[i], frame)
             count += 1
         if count < len(run):
             raise other
@@ -95,17 +100,3 @@ def grey_images(run: FinishedRun, positions: Sequence[int], line: ProgressLine) 
 
 def _kept(run: FinishedRun) -> Path:
     return run.folder / "colmap" / "images"
-
-
-def _copy(run: FinishedRun, names: list[str], folder: Path, line: ProgressLine) -> None:
-    masks = run.folder / "colmap" / "masks"
-    for name in line.through("copying images", names, len(names)):
-        source = _kept(run) / name
-        if not source.is_file():
-            raise InputError(f"{source}: the run's image is missing")
-        pairs = [(source, folder / "images" / name)]
-        if (masks / f"{name}.png").is_file():
-            pairs.append((masks / f"{name}.png", folder / "masks" / f"{name}.png"))
-        for old, new in pairs:
-            new.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(old, new)

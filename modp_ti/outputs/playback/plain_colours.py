@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from fields.map.gaussians import SH_C0, GaussianField
+from fields.map.gaussians import SH_C0
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
@@ -48,8 +48,8 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
         picture = maps.picture(camera, T)
         views.append((camera, T, np.dstack([picture, np.full(picture.shape[:2], 255, np.uint8)])))
     gaussians, renderer = maps.renderer.gaussians, maps.renderer
-    constraint, adam, loss = PlainColours(gaussians), Adam(gaussians), photometric_loss(renderer.images)
-    constraint.impose()
+    adam, loss = Adam(gaussians), photometric_loss(renderer.images)
+    make_plain(gaussians.sh, len(gaussians), gaussians.sh_count)
     rates = asdict(replace(RATES, position=RATES.position * run.record.scene_depth))
     rng = np.random.default_rng(0)
     order: list[int] = []
@@ -63,25 +63,14 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
         renderer.backward()
         decayed = DECAY ** (step / STEPS)
         adam.step(LearningRates(**{name: decayed * rate for name, rate in rates.items()}))
-        constraint.impose()
+        make_plain(gaussians.sh, len(gaussians), gaussians.sh_count)
     return gaussians.to_numpy()
 
 
-@ti.data_oriented
-class PlainColours:
-    """The constraint on the colours of `gaussians`."""
-
-    def __init__(self, gaussians: GaussianField) -> None:
-        self.gaussians = gaussians
-
-    def impose(self) -> None:
-        """Clip the constant harmonic to colours in [0, 1], and set the others to 0."""
-        if len(self.gaussians):
-            self._impose(len(self.gaussians))
-
-    @ti.kernel
-    def _impose(self, count: ti.i32):
-        for i in range(count):
-            self.gaussians.sh[i, 0] = ti.min(ti.max(self.gaussians.sh[i, 0], -LARGEST), LARGEST)
-            for k in range(1, self.gaussians.sh_count):
-                self.gaussians.sh[i, k].fill(0.0)
+@ti.kernel
+def make_plain(sh: ti.template(), count: ti.i32, sh_count: ti.template()):
+    """Clip the constant harmonic to colours in [0, 1], and set the others to 0."""
+    for i in range(count):
+        sh[i, 0] = ti.min(ti.max(sh[i, 0], -LARGEST), LARGEST)
+        for k in range(1, sh_count):
+            sh[i, k].fill(0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
@@ -38,7 +38,11 @@ def surface_views(run: FinishedRun, device: str, line: ProgressLine) -> Iterator
     """
     chosen = run.spread(SURFACE_VIEWS)
     cameras = [_within(run.cameras[index], LONGEST_SIDE) for index in chosen]
-    images = _images(run, chosen, line)
+    images: list[NDArray[np.uint8]] | None = None
+    try:
+        images = grey_images(run, chosen, line)
+    except InputError as error:
+        line.note(f"note: matching the map's own pictures, for want of the images: {error}")
     with line.working("loading the map"):
         gaussians = run.gaussians
         start_device(device)
@@ -62,14 +66,6 @@ def surface_views(run: FinishedRun, device: str, line: ProgressLine) -> Iterator
     for index, view in enumerate(line.through("fusing depth", matched, len(matched))):
         depth = without_edges(agreed_depth(matched, index, neighbours[index]))
         yield SurfaceView(view.camera, view.T_camera_world, depth, pictures[index] / np.float32(255.0))
-
-
-def _images(run: FinishedRun, chosen: Sequence[int], line: ProgressLine) -> list[NDArray[np.uint8]] | None:
-    try:
-        return grey_images(run, chosen, line)
-    except InputError as error:
-        line.note(f"note: matching the map's own pictures, for want of the images: {error}")
-        return None
 
 
 def _within(camera: PinholeCamera, longest: int) -> PinholeCamera:

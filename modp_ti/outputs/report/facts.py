@@ -7,7 +7,6 @@ import os
 import platform
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,6 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.version import __version__
 
 __all__ = [
-    "Change",
-    "Figure",
-    "Stage",
     "changed_settings",
     "headline",
     "last_stage",
@@ -57,63 +53,27 @@ OTHERS = {
 }
 
 
-@dataclass(frozen=True)
-class Change:
-    """A setting that differs from its default.
-
-    Attributes:
-        key: Dotted key.
-        value: Value as YAML text.
-        default: Default as YAML text, None if there is no default.
-    """
-
-    key: str
-    value: str
-    default: str | None
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A formatted number and its label."""
-
-    label: str
-    value: str
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Time of a stage of the run.
-
-    Attributes:
-        name: Key in metrics.json.
-        meaning: Description for readers.
-        seconds: Time [s].
-        share: Share of the total time [%].
-    """
-
-    name: str
-    meaning: str
-    seconds: float
-    share: float
-
-
 def without_credentials(text: str) -> str:
     """Remove user names and passwords from URLs in the text, since reports are shared."""
     return re.sub(r"(?<=://)[^/@\s\"']+@", "", text)
 
 
-def changed_settings(config: SceneConfig) -> list[Change]:
-    """Return the settings that differ from their defaults, in the order of the settings reference."""
+def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
+    """Return the settings that differ from their defaults, in the order of the settings reference.
+
+    Returns:
+        Dotted key, value as YAML text and default as YAML text of each setting. The default is None if there is none.
+    """
     changes = []
     for entry, value in documented_values(config):
         text = "" if value is None else as_yaml(value)
         if text != entry.default:
-            changes.append(Change(entry.key, without_credentials(text), entry.default))
+            changes.append((entry.key, without_credentials(text), entry.default))
     return changes
 
 
-def machine(device: str) -> list[Figure]:
-    """Return versions and hardware.
+def machine(device: str) -> dict[str, str]:
+    """Return versions and hardware by label.
 
     Args:
         device: Description of the backend that the run used.
@@ -125,13 +85,13 @@ def machine(device: str) -> list[Figure]:
         except PackageNotFoundError:  # installed by another distribution package
             continue
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return [
-        Figure("MODP-Ti", __version__),
-        Figure("backend", device),
-        Figure("processor", f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"),
-        Figure("system", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"),
-        Figure("libraries", ", ".join(packages)),
-    ]
+    return {
+        "MODP-Ti": __version__,
+        "backend": device,
+        "processor": f"{_processor()}, {cores} core{'s' if cores > 1 else ''}",
+        "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        "libraries": ", ".join(packages),
+    }
 
 
 def _processor() -> str:
@@ -148,51 +108,45 @@ def last_stage(metrics: Mapping[str, Any]) -> str:
     return next(stage for stage in ("refined", "online", "offline") if metrics[stage] is not None)
 
 
-def headline(metrics: Mapping[str, Any]) -> list[Figure]:
-    """Return the main figures."""
+def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Return the main figures by label."""
     scores = metrics[last_stage(metrics)]
-    which = "held_out" if scores["held_out"]["count"] else "all"
-    of = "held-out" if which == "held_out" else "all frames"
-    figures = [Figure(f"PSNR, {of}", f"{shown(scores[which]['psnr'], '.2f')} dB")]
-    figures.append(Figure(f"SSIM, {of}", shown(scores[which]["ssim"], ".3f")))
-    if scores[which]["lpips"] is not None:
-        figures.append(Figure(f"LPIPS, {of}", shown(scores[which]["lpips"], ".3f")))
-    return [
-        *figures,
-        Figure("Gaussians", f"{metrics['gaussians']:,}"),
-        Figure("frames", f"{metrics['frames']:,}"),
-        Figure("keyframes", f"{metrics['keyframes']:,}"),
-        Figure("time", duration(metrics["seconds"]["total"])),
-    ]
+    of, means = ("held-out", scores["held_out"]) if scores["held_out"]["count"] else ("all frames", scores["all"])
+    figures = {f"PSNR, {of}": f"{shown(means['psnr'], '.2f')} dB", f"SSIM, {of}": shown(means["ssim"], ".3f")}
+    if means["lpips"] is not None:
+        figures[f"LPIPS, {of}"] = shown(means["lpips"], ".3f")
+    return figures | {
+        "Gaussians": f"{metrics['gaussians']:,}",
+        "frames": f"{metrics['frames']:,}",
+        "keyframes": f"{metrics['keyframes']:,}",
+        "time": duration(metrics["seconds"]["total"]),
+    }
 
 
-def other_figures(metrics: Mapping[str, Any]) -> list[Figure]:
-    """Return the figures of metrics.json that have no table of their own, as far as the run has them."""
-    figures = [
-        Figure(label, shown(metrics[name], form) + unit)
+def other_figures(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Return the figures of metrics.json that have no table of their own by label, as far as the run has them."""
+    figures = {
+        label: shown(metrics[name], form) + unit
         for name, (label, form, unit) in OTHERS.items()
         if metrics.get(name) is not None
-    ]
+    }
     corrections = metrics.get("corrections") or {"received": 0}
     if corrections["received"]:
-        text = f"{corrections['received']}, of which {corrections['moved']} moved the map"
-        figures.append(Figure("corrections from the tracker", text))
+        moved = f"{corrections['received']}, of which {corrections['moved']} moved the map"
+        figures["corrections from the tracker"] = moved
     kept = (metrics.get("retention") or {}).get(last_stage(metrics))
     if kept is not None:
         text = f"{kept['mean']:+.2f} dB in the mean, {kept['worst']:+.2f} dB in the worst 20 in a row"
-        figures.append(Figure("keyframes at the end, against just mapped", text))
+        figures["keyframes at the end, against just mapped"] = text
     return figures
 
 
-def stages(metrics: Mapping[str, Any]) -> list[Stage]:
-    """Return the time of each stage, without stages that took none."""
+def stages(metrics: Mapping[str, Any]) -> list[tuple[str, str, float, float]]:
+    """Return name, description, time [s] and share of the total time [%] of each stage that took some."""
     seconds = metrics["seconds"]
     total = max(seconds["total"], 1e-9)
-    return [
-        Stage(name, meaning, seconds[name], 100.0 * seconds[name] / total)
-        for name, meaning in STAGES.items()
-        if seconds[name] > 0
-    ]
+    taken = [(name, meaning, seconds[name]) for name, meaning in STAGES.items() if seconds[name] > 0]
+    return [(*stage, 100.0 * stage[2] / total) for stage in taken]
 
 
 def shown(value: float | None, form: str) -> str:

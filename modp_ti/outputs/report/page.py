@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3
+from fields.geometry.se3 import camera_centres
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, umeyama
 from modp_ti.outputs.report import facts, plots
-from modp_ti.outputs.report.pictures import FULL_SCALE, Comparison, error_colours
+from modp_ti.outputs.report.pictures import FULL_SCALE, Comparison, as_uri, error_colours
 from modp_ti.outputs.report.plan import floor_plan, plan_of
 from modp_ti.outputs.report.record import RunRecord
 
@@ -73,7 +72,7 @@ def write_report(path: Path, run: ReportedRun) -> None:
         stage=facts.last_stage(run.metrics),
         maps=[stage for stage in ("online", "refined", "offline") if run.metrics[stage] is not None],
         remarks=facts.remarks(run.metrics, run.record.notes),
-        drawings={name: _svg_uri(svg) for name, svg in _drawings(run).items()},
+        drawings={name: as_uri("svg+xml", svg.encode("utf-8")) for name, svg in _drawings(run).items()},
         scale=_scale(),
         full_scale=FULL_SCALE,
     )
@@ -84,7 +83,7 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
     """Return the SVG of every drawing that the run has data for."""
     last = list(run.versions.values())[-1]
     plan = plan_of(last.trajectory)
-    floor = floor_plan(plan, last.gaussians, _centres(last.trajectory))
+    floor = floor_plan(plan, last.gaussians, camera_centres(last.trajectory))
     drawings = {"psnr": plots.psnr_of_frames(run.scores, run.record.frames)}
     if run.record.frames and run.config.mode == "online":
         drawings["growth"] = plots.growth(run.record.frames)
@@ -104,22 +103,14 @@ def _aligned(
     """Align the true camera centres (N, 3) to the estimate by the best similarity. None without ground truth."""
     if len(truth) != len(estimate) or len(truth) < 3:
         return None
-    there = _centres(truth)
+    there = camera_centres(truth)
     known = np.isfinite(there).all(axis=1)
-    s, R, t = umeyama(there[known], _centres(estimate)[known])
+    s, R, t = umeyama(there[known], camera_centres(estimate)[known])
     return s * there @ R.T + t
-
-
-def _centres(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    return np.array([inverse_se3(T)[:3, 3] for T in poses])
-
-
-def _svg_uri(svg: str) -> str:
-    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode("utf-8")).decode("ascii")
 
 
 def _scale() -> str:
     """Return the colour scale of the error maps, from 0 to FULL_SCALE, as a data URI."""
     strip = error_colours(np.linspace(0.0, FULL_SCALE, 128, dtype=np.float32)[None])
     _, data = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))
-    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return as_uri("png", data.tobytes())

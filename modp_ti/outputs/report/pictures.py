@@ -15,7 +15,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.outputs.evaluation import FrameScore
 from modp_ti.outputs.playback.map_renderer import eight_bits
 
-__all__ = ["FULL_SCALE", "Album", "Comparison", "data_uri", "error_colours", "error_map", "picked"]
+__all__ = ["FULL_SCALE", "Album", "Comparison", "as_uri", "data_uri", "error_colours", "error_map", "picked"]
 
 # Error at which the colour scale ends.
 FULL_SCALE = 0.2
@@ -87,11 +87,12 @@ class Album:
         """
         scores = list(scores)
         held_out = [score for score in scores if score.held_out]
-        chosen = picked(held_out or [score for score in scores if score.index in self.kept])
-        return [
-            _comparison(score, rank, *(self.kept.get(score.index) or _read_pair(renders / f"{score.index:06d}.png")))
-            for score, rank in chosen
-        ]
+        comparisons = []
+        for score, rank in picked(held_out or [score for score in scores if score.index in self.kept]):
+            image, render = self.kept.get(score.index) or _read_pair(renders / f"{score.index:06d}.png")
+            error = error_colours(error_map(image, render))
+            comparisons.append(Comparison(score, rank, data_uri(image), data_uri(render), data_uri(error)))
+        return comparisons
 
 
 def picked(scores: Sequence[FrameScore]) -> list[tuple[FrameScore, str]]:
@@ -131,12 +132,12 @@ def data_uri(picture: NDArray[np.uint8], longest: int = LONGEST) -> str:
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return as_uri("jpeg", data.tobytes())
 
 
-def _comparison(score: FrameScore, rank: str, image: NDArray[np.uint8], render: NDArray[np.uint8]) -> Comparison:
-    error = error_colours(error_map(image, render))
-    return Comparison(score, rank, *(data_uri(picture) for picture in (image, render, error)))
+def as_uri(kind: str, data: bytes) -> str:
+    """Return an image file of this kind as a data URI."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def _read_pair(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

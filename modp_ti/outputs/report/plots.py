@@ -63,11 +63,12 @@ def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:
     return svg
 
 
-def _figure(height: float) -> Figure:
-    """Return an empty figure of this height [inches]."""
+def _panels(height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels of this height [inches]. Panels above each other share their x axis."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(WIDTH, height))
+    figure = Figure(figsize=(WIDTH, rows * height))
+    return figure, figure.subplots(rows, columns, sharex=rows > 1, squeeze=False).ravel().tolist()
 
 
 @_drawn
@@ -78,15 +79,13 @@ def psnr_of_frames(scores: Sequence[FrameScore], frames: Sequence[FrameNote] = (
         scores: Scores of all frames in all versions.
         frames: The run's frames; the PSNR of keyframes soon after they were mapped is drawn below the versions'.
     """
-    figure = _figure(3.0)
-    axes = figure.add_subplot()
-    mapped = [(note.index, note.mapped_psnr) for note in frames if note.mapped_psnr is not None]
-    if mapped:
-        x, y = np.array(mapped, float).T
+    figure, (axes,) = _panels(3.0)
+    if mapped := [note for note in frames if note.mapped_psnr is not None]:
+        x, y = _xy(mapped, "index", "mapped_psnr")
         _line(axes, x, y, "psnr-mapped", color=GREY, lw=1.0, label="keyframes, just mapped")
     for stage in dict.fromkeys(score.stage for score in scores):
         of = [score for score in scores if score.stage == stage]
-        x, y = (np.array([getattr(score, name) for score in of], float) for name in ("index", "psnr"))
+        x, y = _xy(of, "index", "psnr")
         _line(axes, x, y, f"psnr-{stage}", color=OF_STAGE[stage], label=stage)
         held_out = np.array([score.held_out for score in of])
         if held_out.any():
@@ -100,27 +99,19 @@ def psnr_of_frames(scores: Sequence[FrameScore], frames: Sequence[FrameNote] = (
 def growth(frames: Sequence[FrameNote]) -> Figure:
     """Plot the number of Gaussians, frames per second and the PSNR of the optimised views over the frames."""
     mapped = [note for note in frames if note.psnr is not None]
-    panels = 3 if mapped else 2
     window = max(5, len(frames) // 20)
-    x = np.array([note.index for note in frames], float)
-    figure = _figure(1.75 * panels)
-    axes = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
-    count = np.array([note.gaussians for note in frames], float)
-    _line(axes[0], x, count, "gaussians", color=BLUE)
-    axes[0].set_ylim(bottom=0)
-    axes[0].yaxis.set_major_formatter("{x:,.0f}")
-    _label(axes[0], "", "Gaussians")
+    figure, axes = _panels(1.75, 3 if mapped else 2)
+    x, count = _xy(frames, "index", "gaussians")
+    _gaussians(axes[0], x, count, "gaussians")
     keyframes = [note for note in frames if note.is_keyframe]
     if len(keyframes) < len(frames):
-        places = [note.index for note in keyframes], [note.gaussians for note in keyframes]
-        axes[0].plot(*places, ".", ms=4, color=BLUE, label="keyframes")
+        axes[0].plot(*_xy(keyframes, "index", "gaussians"), ".", ms=4, color=BLUE, label="keyframes")
         axes[0].legend(loc="upper left")
     _line(axes[1], x, frame_rate(frames, window), "frame-rate", color=GREEN)
     axes[1].set_yscale("log")  # frames that are not keyframes are a hundred times faster
     _label(axes[1], "" if mapped else "frame", f"frames per second\n(last {window})")
     if mapped:
-        y = np.array([note.psnr for note in mapped], float)
-        _line(axes[2], np.array([note.index for note in mapped], float), y, "view-psnr", color=ORANGE)
+        _line(axes[2], *_xy(mapped, "index", "psnr"), "view-psnr", color=ORANGE)
         _label(axes[2], "frame", "PSNR of the views\nbeing optimised [dB]")
     return figure
 
@@ -128,18 +119,12 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
 @_drawn
 def steps(notes: Sequence[StepNote]) -> Figure:
     """Plot the smoothed PSNR over the steps of refinement or offline optimisation, and the Gaussians if recorded."""
-    x = np.array([note.step for note in notes], float)
-    gaussians = [note.gaussians for note in notes if note.gaussians is not None]
-    panels = 2 if gaussians else 1
-    figure = _figure(2.1 * panels)
-    axes = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
-    _line(axes[-1], *binned(x, np.array([note.psnr for note in notes], float), 100), "step-psnr", color=ORANGE)
+    counted = notes[0].gaussians is not None
+    figure, axes = _panels(2.1, 2 if counted else 1)
+    _line(axes[-1], *binned(*_xy(notes, "step", "psnr"), 100), "step-psnr", color=ORANGE)
     _label(axes[-1], "step", "PSNR of the views\nbeing optimised [dB]")
-    if gaussians:
-        _line(axes[0], *binned(x, np.array(gaussians, float)), "step-gaussians", color=BLUE)
-        axes[0].set_ylim(bottom=0)
-        axes[0].yaxis.set_major_formatter("{x:,.0f}")
-        _label(axes[0], "", "Gaussians")
+    if counted:
+        _gaussians(axes[0], *binned(*_xy(notes, "step", "gaussians")), "step-gaussians")
     return figure
 
 
@@ -166,8 +151,7 @@ def trajectory(
     if truth is not None:
         ways["truth"] = plan.on_page(truth)
     around = np.concatenate(list(ways.values()))
-    figure = _figure(4.4)
-    whole, close = figure.subplots(1, 2)
+    figure, (whole, close) = _panels(4.4, columns=2)
     if len(floor[0]):
         size = float(np.clip(30_000 / len(floor[0]), 1.0, 14.0))
         whole.scatter(*floor[0].T, s=size, c=floor[1], alpha=0.6, linewidths=0, rasterized=True)
@@ -207,13 +191,11 @@ def pose_changes(
         versions: T_camera_world (4, 4) of every frame, by version.
         scene_depth: The scene's depth [scene units].
     """
-    figure = _figure(3.4)
-    above, below = figure.subplots(2, 1, sharex=True)
+    figure, (above, below) = _panels(1.7, 2)
     x = np.arange(len(tracked), dtype=float)
     for stage, poses in versions.items():
         shifts, turns = shifts_and_turns(tracked, poses)
-        percent = 100 * shifts / scene_depth
-        _line(above, x, percent, f"shift-{stage}", color=OF_STAGE[stage], label=stage)
+        _line(above, x, 100 * shifts / scene_depth, f"shift-{stage}", color=OF_STAGE[stage], label=stage)
         _line(below, x, turns, f"turn-{stage}", color=OF_STAGE[stage])
     _label(above, "", "shift\n[% of scene depth]")
     _label(below, "frame", "turn [degrees]")
@@ -221,6 +203,18 @@ def pose_changes(
         axes.set_ylim(bottom=0)
     above.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1))
     return figure
+
+
+def _xy(notes: Sequence[FrameNote | StepNote | FrameScore], x: str, y: str) -> tuple[NDArray, NDArray]:
+    """Return two attributes of the notes as arrays. None becomes NaN."""
+    return np.array([getattr(note, x) for note in notes], float), np.array([getattr(note, y) for note in notes], float)
+
+
+def _gaussians(axes: Axes, x: NDArray, count: NDArray, name: str) -> None:
+    _line(axes, x, count, name, color=BLUE)
+    axes.set_ylim(bottom=0)
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    _label(axes, "", "Gaussians")
 
 
 def _line(axes: Axes, x: NDArray, y: NDArray, name: str, **style: Any) -> None:

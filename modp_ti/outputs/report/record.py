@@ -91,11 +91,3 @@ class RunRecord:
         else:
             note = FrameNote(index, False, report.is_keyframe, done, report.gaussians, report.psnr, mapped_psnr)
             self.frames.append(note)
-
-    def refined(self, step: int, psnr: float) -> None:
-        """Record a refinement step. Steps count from 1."""
-        self.steps.append(StepNote(step, psnr))
-
-    def optimised(self, step: int, gaussians: int, psnr: float) -> None:
-        """Record a step of the offline optimisation. Steps count from 1."""
-        self.steps.append(StepNote(step, psnr, gaussians))

@@ -19,7 +19,7 @@ from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
-from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, nearest_photograph, painter, pinhole_of
+from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from modp_ti.outputs.viewer.splats import splats_of
 
@@ -90,17 +90,17 @@ class FinishedViewer:
         self.page.show_frame(ShownFrame(self.run.poses[index], self.run.cameras[index], picture))
 
     def _render(self, browser: BrowserCamera, mode: str) -> None:
-        images = self._renderer.renderer.images
-        seen_from = pinhole_of(browser, self.page.units, images.max_width, images.max_height)
-        if seen_from is None:
-            return
-        scene_depth = self.run.record.scene_depth
-
-        def photograph() -> Photograph:
-            mapped = np.array(self.run.mapped)
-            return self._photograph(int(mapped[nearest_photograph(self.run.poses[mapped], seen_from[1], scene_depth)]))
-
-        paint = painter(mode, *seen_from, scene_depth, self._renderer.view, photograph)
+        record, mapped = self.run.record, self.run.mapped
+        paint = painter(
+            mode,
+            browser,
+            self.page.units,
+            self._renderer.renderer,
+            record.near,
+            record.scene_depth,
+            self.run.poses[mapped],
+            lambda index: self._photograph(mapped[index]),
+        )
         if paint is not None:
             self.page.show_picture(browser.client, paint())
 

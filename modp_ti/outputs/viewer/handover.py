@@ -26,12 +26,15 @@ class Latest(Generic[T]):
 
     Args:
         merge: Combines (newer value, waiting value) into the value that waits next.
+
+    Attributes:
+        closed: Whether `close` has been called.
     """
 
     def __init__(self, merge: Callable[[T, T], T] = lambda newer, waiting: newer) -> None:
         self._merge = merge
         self._value: T | None = None
-        self._closed = False
+        self.closed = False
         self._changed = threading.Condition()
 
     @property
@@ -48,18 +51,14 @@ class Latest(Generic[T]):
     def take(self, timeout: float | None = None) -> T | None:
         """Wait for a value and fetch it; None after `timeout` seconds (None for no limit) and after `close`."""
         with self._changed:
-            self._changed.wait_for(lambda: self._value is not None or self._closed, timeout)
+            self._changed.wait_for(lambda: self._value is not None or self.closed, timeout)
             value, self._value = self._value, None
-            return None if self._closed else value
-
-    @property
-    def closed(self) -> bool:
-        return self._closed
+            return None if self.closed else value
 
     def close(self) -> None:
         """Release all waiting readers. From here on, `take` returns None."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
 
 
@@ -67,27 +66,26 @@ class Gate:
     """Controls whether the mapping thread proceeds. While paused, it lets one frame or step through per request.
 
     Requests for a step do not add up while one is pending, so repeated clicks have no delayed effect.
+
+    Attributes:
+        paused: Whether the gate is closed, except for one frame or step.
     """
 
     def __init__(self) -> None:
-        self._paused = False
+        self.paused = False
         self._step = False
         self._changed = threading.Condition()
 
-    @property
-    def paused(self) -> bool:
-        return self._paused
-
     def pause(self, paused: bool) -> None:
         with self._changed:
-            self._paused = paused
+            self.paused = paused
             self._step = False
             self._changed.notify_all()
 
     def step(self) -> None:
         """Let one frame or step through, then pause."""
         with self._changed:
-            self._paused = self._step = True
+            self.paused = self._step = True
             self._changed.notify_all()
 
     def wake(self) -> None:
@@ -100,12 +98,12 @@ class Gate:
         started = time.perf_counter()
         while True:
             with self._changed:
-                if not self._paused or self._step:
+                if not self.paused or self._step:
                     self._step = False
                     return time.perf_counter() - started
             meanwhile()
             with self._changed:
-                if self._paused and not self._step:
+                if self.paused and not self._step:
                     self._changed.wait(every)
 
 
@@ -138,17 +136,16 @@ class Requests:
 
     Args:
         mode: The first mode.
+
+    Attributes:
+        mode: The current mode.
     """
 
     def __init__(self, mode: str) -> None:
-        self._mode = mode
+        self.mode = mode
         self._cameras: dict[int, BrowserCamera] = {}
         self._due: list[int] = []  # ids of browsers with an outdated picture, longest waiting first
         self._changed = threading.Condition()
-
-    @property
-    def mode(self) -> str:
-        return self._mode
 
     def __len__(self) -> int:
         """Number of connected browsers."""
@@ -174,7 +171,7 @@ class Requests:
     def show(self, mode: str) -> None:
         """Change the mode for all browsers."""
         with self._changed:
-            self._mode = mode
+            self.mode = mode
         self.outdate()
 
     def outdate(self) -> None:

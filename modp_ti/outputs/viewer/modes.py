@@ -13,7 +13,7 @@ from fields.geometry.se3 import camera_centres, inverse_se3, matrix_from_quatern
 from modp_ti.outputs.playback.film import depth_colours
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.viewer.handover import BrowserCamera
-from pipelines.render.renderer import RenderedView
+from pipelines.render.renderer import RenderedView, Renderer
 
 __all__ = ["MODES", "SPLATS", "Photograph", "image_error", "nearest_photograph", "painter", "picture_of", "pinhole_of"]
 
@@ -81,32 +81,40 @@ def pinhole_of(
 
 def painter(
     mode: str,
-    camera: PinholeCamera,
-    T_camera_world: NDArray[np.float64],
+    browser: BrowserCamera,
+    units: float,
+    renderer: Renderer,
+    near: float,
     scene_depth: float,
-    render: Callable[[PinholeCamera, NDArray[np.float64]], RenderedView],
-    photograph: Callable[[], Photograph],
+    poses: NDArray[np.float64],
+    photograph: Callable[[int], Photograph],
 ) -> Callable[[], NDArray[np.uint8]] | None:
     """Render what a display mode needs.
 
     Args:
         mode: One of MODES, except for SPLATS.
-        camera: The camera to show the map from.
-        T_camera_world: (4, 4) its pose.
+        browser: The camera to show the map from.
+        units: Page units per world unit.
+        renderer: Holds the map.
+        near: Depth below which nothing is drawn [scene units].
         scene_depth: The scene's depth [scene units].
-        render: Renders the map from a camera and pose. It may raise ValueError.
-        photograph: Returns the nearest photograph, for the error mode.
+        poses: (N, 4, 4) T_camera_world of the photographs, for the error mode.
+        photograph: Returns the photograph with this index among `poses`.
 
     Returns:
-        A function that computes the picture (H, W, 3) and does not use the map any more; None if the renderer's
-        capacity does not suffice, as can happen inside large Gaussians.
+        A function that computes the picture (H, W, 3) and does not use the map any more; None if the browser's camera
+        is invalid or the renderer's capacity does not suffice, as can happen inside large Gaussians.
     """
+    seen_from = pinhole_of(browser, units, renderer.images.max_width, renderer.images.max_height)
+    if seen_from is None:
+        return None
+    camera, T_camera_world = seen_from
     try:
-        view = render(camera, T_camera_world)
+        view = renderer.render(camera, T_camera_world, near)
         if mode != "error":
             return lambda: picture_of(view, mode, scene_depth)
-        taken = photograph()
-        seen = render(taken.camera, taken.T_camera_world)
+        taken = photograph(nearest_photograph(poses, T_camera_world, scene_depth))
+        seen = renderer.render(taken.camera, taken.T_camera_world, near)
     except ValueError:
         return None
     return lambda: error_picture(image_error(view, camera, T_camera_world, taken, seen))

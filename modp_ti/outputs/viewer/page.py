@@ -228,22 +228,19 @@ class Page:
         gui = self._server.gui
         self._pause = gui.add_button("Pause", hint="pause the mapping after the current frame or step")
         step = gui.add_button("Step", hint="map one frame or take one step, then pause")
-        self.show_paused(gate.paused)
+        self.show_paused()
 
-        def pause(paused: bool) -> None:
-            gate.pause(paused)
-            self.show_paused(paused)
+        def press(act: Callable[[], None]) -> None:
+            act()
+            self.show_paused()
 
-        def take_step() -> None:
-            gate.step()
-            self.show_paused(True)
+        self._pause.on_click(lambda _: press(lambda: gate.pause(not gate.paused)))
+        step.on_click(lambda _: press(gate.step))
 
-        self._pause.on_click(lambda _: pause(not gate.paused))
-        step.on_click(lambda _: take_step())
-
-    def show_paused(self, paused: bool) -> None:
-        """Set the label of the pause button."""
-        self._pause.label = "Resume" if paused else "Pause"
+    def show_paused(self) -> None:
+        """Set the label of the pause button, if there is one."""
+        if self._gate is not None:
+            self._pause.label = "Resume" if self._gate.paused else "Pause"
 
     def _set_mode(self, mode: str) -> None:
         with self._lock:

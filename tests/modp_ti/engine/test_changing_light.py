@@ -52,14 +52,12 @@ def held_out_psnr(frames: list[TrackedFrame], **exposure: object) -> float:
         if not frame.held_out:
             mapper.process(frame)
     mapper.finish()
-    store, near = mapper.keyframes, settings.near * mapper.keyframes.scene_depth
+    store = mapper.keyframes
     scores = [
         score_frame(
-            mapper.renderer,
-            mapper.optimiser.loss,
+            mapper,
             frame,
             store.corrected(frame.index, frame.T_camera_world),
-            near,
             "online",
             exposure=store.exposure_at(frame.index),
         )[0].psnr

@@ -22,7 +22,7 @@ from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion
 from modp_ti.outputs.report.page import ReportedRun
 from modp_ti.outputs.report.pictures import Album
-from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import retention
 from pipelines.pipeline import FrameReport
 
@@ -82,9 +82,9 @@ def run_record(frames: int, holdout: int, mode: str, refine: int, keyframe_every
         record.frame(index, FrameReport(index, is_keyframe, keyframes, count, psnr), mapped)
     for step in range(1, refine + 1):
         if mode == "offline":
-            record.optimised(step, 50 * step, 20 + 5 * step / refine)
+            record.steps.append(StepNote(step, 20 + 5 * step / refine, 50 * step))
         else:
-            record.refined(step, 24 + 2 * step / refine)
+            record.steps.append(StepNote(step, 24 + 2 * step / refine))
     return record
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
+from modp_ti.outputs.report.record import FrameNote, RunRecord
 from pipelines.pipeline import FrameReport
 
 
@@ -18,10 +18,3 @@ def test_frames_are_noted_with_the_time_since_the_first_began() -> None:
         FrameNote(1, True, False, 2.0, 250, None),  # held out: the map is as it was
         FrameNote(2, False, False, 2.25, 260, None),
     ]
-
-
-def test_steps_are_noted_with_gaussians_where_those_change() -> None:
-    record = RunRecord()
-    record.refined(1, 30.5)
-    record.optimised(2, 500, 12.5)
-    assert record.steps == [StepNote(1, 30.5, None), StepNote(2, 12.5, 500)]
