@@ -24,7 +24,7 @@ def refine(
 ) -> None:
     """Optimise a finished map on error-weighted draws from all keyframes.
 
-    The rates of positions, scales and poses decay. Before the first step, Gaussians that cover fewer than
+    All rates decay. Before the first step, Gaussians that cover fewer than
     `settings.min_contribution` pixels in every keyframe are removed.
 
     Args:
@@ -55,6 +55,7 @@ def refine(
                 store.scene_depth,
                 position_factor=slower,
                 scale_factor=decay(step, settings.steps, settings.scale_decay),
+                other_factor=decay(step, settings.steps, settings.rate_decay),
             )
             psnr = mapper.optimiser.step(store, batch, rates, pose_rate * slower)
         if progress is not None:

@@ -91,21 +91,23 @@ class DepthSettings(StrictModel):
         "keyframes (epipolar); the render of the map (map)",
     )
     max_points: int = Field(
-        default=500, ge=10, description="tracked points that condition the process, drawn at random beyond"
+        default=250, ge=10, description="tracked points that condition the process, drawn at random beyond"
     )
     max_deviation: float = Field(
-        default=0.045, gt=0, description="standard deviation of log depth above which a pixel gets no Gaussian"
+        default=0.045,
+        gt=0,
+        description="standard deviation of log depth below which a pixel gets its Gaussian in any case",
     )
     max_misplacement: float = Field(
-        default=0.0,
+        default=2.0,
         ge=0,
-        description="a pixel gets its Gaussian all the same if a depth wrong by its deviation moves it by less than "
-        "this in other keyframes [px]; 0 for never",
+        description="a pixel of uncertain depth gets its Gaussian if a depth wrong by its deviation moves it by less "
+        "than this in other keyframes [px]; 0 for never",
     )
     hole_deviation: float = Field(
         default=0.15,
         gt=0,
-        description="the same where the map shows next to nothing: a wrong depth is better than a hole",
+        description="as max_deviation, where the map shows next to nothing: a wrong depth is better than a hole",
     )
     checkpoint: Path | None = Field(
         default=None,
@@ -255,16 +257,16 @@ class OptimiseSettings(StrictModel):
         default=1, ge=1, description="views whose gradients make one Adam step; the views of a step are shared out"
     )
 
-    steps: int = Field(default=25, ge=0, description="steps per keyframe")
-    last_steps: int = Field(default=40, ge=0, description="steps after the last frame")
+    steps: int = Field(default=12, ge=0, description="steps per keyframe")
+    last_steps: int = Field(default=20, ge=0, description="steps after the last frame")
     ssim_weight: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
     aspect_weight: float = Field(default=1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
-    position_rate: float = Field(default=2.4e-5, ge=0, description="Adam step of positions [scene depths]")
-    scale_rate: float = Field(default=2e-2, ge=0, description="Adam step of log-scales")
-    rotation_rate: float = Field(default=1e-3, ge=0, description="Adam step of quaternions")
+    position_rate: float = Field(default=2e-4, ge=0, description="Adam step of positions [scene depths]")
+    scale_rate: float = Field(default=4e-2, ge=0, description="Adam step of log-scales")
+    rotation_rate: float = Field(default=4e-3, ge=0, description="Adam step of quaternions")
     opacity_rate: float = Field(default=0.05, ge=0, description="Adam step of opacity logits")
     colour_rate: float = Field(
-        default=2.5e-3, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
+        default=1e-2, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
     )
 
 
@@ -322,6 +324,12 @@ class RefineSettings(StrictModel):
     )
     scale_decay: float = Field(
         default=1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay"
+    )
+    rate_decay: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="factor of the rates of rotation, opacity and colour at the end of the decay",
     )
     min_contribution: float = Field(
         default=0.5,

@@ -43,21 +43,24 @@ class MapOptimiser:
         self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
 
-    def rates(self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0) -> LearningRates:
+    def rates(
+        self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0, other_factor: float = 1.0
+    ) -> LearningRates:
         """Return the learning rates of the settings, with positions in scene units.
 
         Args:
             scene_depth: Depth of the scene [scene units].
             position_factor: Factor on the position rate.
             scale_factor: Factor on the scale rate.
+            other_factor: Factor on the rates of rotation, opacity and colour.
         """
         o = self.settings.optimise
         return LearningRates(
             position=o.position_rate * scene_depth * position_factor,
             log_scale=o.scale_rate * scale_factor,
-            quaternion=o.rotation_rate,
-            opacity_logit=o.opacity_rate,
-            colour=o.colour_rate,
+            quaternion=o.rotation_rate * other_factor,
+            opacity_logit=o.opacity_rate * other_factor,
+            colour=o.colour_rate * other_factor,
         )
 
     def compare(self, view: Keyframe, scene_depth: float, level: int = 0, exact: bool = True) -> LossValues:
