@@ -322,11 +322,9 @@ class RefineSettings(StrictModel):
     position_decay: float = Field(
         default=0.01, gt=0, le=1, description="factor of the position rate at the end of the decay"
     )
-    scale_decay: float = Field(
-        default=1 / 3, gt=0, le=1, description="factor of the scale rate at the end of the decay"
-    )
+    scale_decay: float = Field(default=0.1, gt=0, le=1, description="factor of the scale rate at the end of the decay")
     rate_decay: float = Field(
-        default=1.0,
+        default=0.1,
         gt=0,
         le=1,
         description="factor of the rates of rotation, opacity and colour at the end of the decay",
