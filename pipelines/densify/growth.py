@@ -14,16 +14,15 @@ from fields.map.gaussians import NO_ANCHOR, SH_C0, GaussianField
 from fields.map.keyframes import Keyframe
 from fields.map.occupancy import OccupancyVoxels
 from pipelines.densify.depth import DepthEstimator
+from pipelines.densify.depth.misplacement import misplacement
 from pipelines.memory_budget import MemoryBudget
 from pipelines.optimise.exposure import scene_colours
 from pipelines.settings import DensifySettings
 
-__all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "misplacement", "tracked_seeds"]
+__all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "tracked_seeds"]
 
-# Deviation of log depth from which a depth says nothing.
+# Deviation of log depth from which a depth contains no information.
 UNKNOWN = 0.5
-# Views that tell by how many pixels a wrong depth would be seen.
-JUDGES = 16
 
 
 @dataclass(frozen=True)
@@ -135,50 +134,13 @@ def pixel_seeds(
     estimate = estimator.estimate(view, neighbours, pixels)
     sure = estimate.deviation < max_deviation
     if max_misplacement > 0:
-        open_ = np.flatnonzero(~sure & (estimate.deviation < UNKNOWN))
-        seen = misplacement(view, neighbours, pixels[open_], estimate.depth[open_], estimate.deviation[open_])
-        sure[open_[seen < max_misplacement]] = True
+        unsure = np.flatnonzero(~sure & (estimate.deviation < UNKNOWN))
+        moved = misplacement(view, neighbours, pixels[unsure], estimate.depth[unsure], estimate.deviation[unsure])
+        sure[unsure[moved < max_misplacement]] = True
     camera_points = view.camera.unproject(pixels[sure], estimate.depth[sure])
     T_world_camera = inverse_se3(view.T_camera_world)
     xyz = camera_points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     return _at_pixels(view, pixels[sure], xyz, estimate.depth[sure])
-
-
-def misplacement(
-    view: Keyframe,
-    neighbours: Sequence[Keyframe],
-    pixels: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    deviation: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """How far a depth that is wrong by its deviation moves a pixel's point in other views.
-
-    Args:
-        view: The view of the pixels.
-        neighbours: The other views, of which at most `JUDGES` are asked, spread evenly over the list.
-        pixels: Pixels (N, 2) as (x, y).
-        depth: Depth (N,) of the pixels.
-        deviation: Standard deviation (N,) of log depth.
-
-    Returns:
-        Root mean square (N,) over the views that see the point [px]; inf where none does.
-    """
-    T_world_camera = inverse_se3(view.T_camera_world)
-    square, count = np.zeros(len(depth)), np.zeros(len(depth))
-    places = [
-        view.camera.unproject(pixels, z) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        for z in (depth, depth * np.exp(deviation))
-    ]
-    some = np.unique(np.linspace(0, len(neighbours) - 1, min(JUDGES, len(neighbours))).round().astype(int))
-    for other in (neighbours[j] for j in some):
-        a, b = (xyz @ other.T_camera_world[:3, :3].T + other.T_camera_world[:3, 3] for xyz in places)
-        near = 0.01 * other.median_depth
-        front = np.flatnonzero((a[:, 2] > near) & (b[:, 2] > near))
-        a, b = other.camera.project(a[front]), other.camera.project(b[front])
-        seen = other.camera.contains(a)
-        square[front[seen]] += ((a - b)[seen] ** 2).sum(axis=1)
-        count[front[seen]] += 1
-    return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.inf)
 
 
 def grow(
