@@ -101,7 +101,11 @@ def test_what_follows_the_last_frame_is_estimated_from_the_views_so_far() -> Non
 
 def test_views_that_become_slower_count_as_the_recent_ones() -> None:
     made = MadeUpMap()
-    later = after_mapping(made, refine={"steps": 100, "views": 1, "min_contribution": 0.0})
+    later = after_mapping(
+        made,
+        mapping={"optimise": {"steps": 25, "last_steps": 40}},
+        refine={"steps": 100, "views": 1, "min_contribution": 0.0},
+    )
     for done, seconds in enumerate([0.01] * 30 + [0.03] * 30, 1):
         made.keyframe(10, seconds)
         found = later.seconds(done, 60)
