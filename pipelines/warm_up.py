@@ -51,4 +51,5 @@ def warm_up(mapper: OnlineMap) -> None:
             if voxels is not None:
                 voxels.clear()
         renderer.view_renders = 0
+        gaussians.remove(np.arange(len(gaussians)) > 0)  # the last one moves to the first one's place
         gaussians.remove(np.zeros(len(gaussians), dtype=bool))
