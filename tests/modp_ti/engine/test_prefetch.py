@@ -84,13 +84,16 @@ def test_an_error_comes_at_its_frame(ahead: int) -> None:
 
 @pytest.mark.parametrize("frames_taken", [0, 1, 5])
 def test_the_thread_ends_with_the_block_whatever_happens_in_it(frames_taken: int) -> None:
-    before = threading.active_count()
+    def reading() -> list[threading.Thread]:  # by name: threads of other tests may end meanwhile
+        return [thread for thread in threading.enumerate() if thread.name == "frames ahead"]
+
+    assert not reading()
     with pytest.raises(KeyError), FramesAhead(Source(1000), 4) as frames:
-        assert threading.active_count() == before + 1
+        assert len(reading()) == 1
         for _ in range(frames_taken):
             next(frames)
         raise KeyError("the mapper failed")
-    assert threading.active_count() == before
+    assert not reading()
 
 
 RUNS = """
