@@ -6,12 +6,11 @@ ambiguity between the transforms and the colours of the map. The others are regu
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.keyframes import Keyframe, KeyframeStore
-from pipelines.optimise.light import DARK, SATURATED, light_changes
+from pipelines.optimise.light import DARK, SATURATED, light_changes, resized_vignette
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
@@ -41,20 +40,12 @@ def scene_colours(view: Keyframe, pixels: NDArray[np.int64]) -> NDArray[np.float
     column, row = pixels.T
     colours = view.rgba[row, column, :3] / 255.0
     if view.vignette is not None:
-        colours = colours / _resized(view.vignette, view.rgba)[row, column]
+        colours = colours / resized_vignette(view.vignette, view.rgba)[row, column]
     if view.exposure is not None:
         colours = (colours - view.exposure[:, 3]) @ np.linalg.pinv(view.exposure[:, :3]).T
     if view.vignette is None and view.exposure is None:
         return colours
     return np.clip(colours, 0.0, BRIGHTEST)
-
-
-def _resized(vignette: NDArray[np.float32], rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The vignette (H, W, 3) at the size of an image, which may be a level of its pyramid."""
-    height, width = rgba.shape[:2]
-    if vignette.shape[:2] == (height, width):
-        return vignette
-    return np.asarray(cv2.resize(vignette, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def fitted_gains(
@@ -125,7 +116,7 @@ class ExposureRefinement:
             return
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:
-            image = image / _resized(view.vignette, small.rgba)[known]
+            image = image / resized_vignette(view.vignette, small.rgba)[known]
         gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(before))
         view.exposure = np.column_stack([np.diag(gains), np.zeros(3)])
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fields.map.keyframes import Keyframe, KeyframeStore
 
-__all__ = ["DARK", "SATURATED", "light_changes"]
+__all__ = ["DARK", "SATURATED", "light_changes", "resized_vignette"]
 
 # Darker values are mostly noise, brighter ones may be saturated: neither says how bright the image is.
 DARK, SATURATED = 0.04, 0.96
@@ -22,6 +22,14 @@ CHANGED = 0.05
 SIGNIFICANT = 3.0
 # Standard deviation of the blur before points are compared [px of the coarsest level].
 BLUR = 1.0
+
+
+def resized_vignette(vignette: NDArray[np.float32], rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The vignette (H, W, 3) at the size of an image, which may be a level of its pyramid."""
+    height, width = rgba.shape[:2]
+    if vignette.shape[:2] == (height, width):
+        return vignette
+    return np.asarray(cv2.resize(vignette, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def light_changes(store: KeyframeStore) -> bool:
@@ -57,9 +65,10 @@ def light_changes(store: KeyframeStore) -> bool:
 
 def _colours(view: Keyframe, levels: int) -> NDArray[np.float32]:
     """Blurred colours (h, w, 3) of the coarsest of `levels` pyramid levels, without the vignette."""
-    image = view.image(levels).rgba[..., :3].astype(np.float32) / 255.0
+    rgba = view.image(levels).rgba
+    image = rgba[..., :3].astype(np.float32) / 255.0
     if view.vignette is not None:
-        image /= cv2.resize(view.vignette, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA)
+        image /= resized_vignette(view.vignette, rgba)
     return np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR), dtype=np.float32)
 
 
