@@ -10,7 +10,6 @@ import numpy as np
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import inverse_se3
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe, KeyframeStore
 from fields.map.trajectory import Trajectory
@@ -111,7 +110,7 @@ def scene_extent(store: KeyframeStore) -> float:
     """
     if len(store) == 0:
         raise ValueError("there is no frame to map")
-    centres = np.array([inverse_se3(view.T_camera_world)[:3, 3] for view in store])
+    centres = np.array([view.centre for view in store])
     radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     return max(1.1 * radius, LEAST_EXTENT * store.scene_depth)
 

@@ -80,6 +80,11 @@ class Keyframe:
     pending_motion: NDArray[np.float64] = field(default_factory=lambda: NO_MOTION)
 
     @property
+    def centre(self) -> NDArray[np.float64]:
+        """Centre (3,) of the camera in the world frame, by the refined pose."""
+        return inverse_se3(self.T_camera_world)[:3, 3]
+
+    @property
     def view_scale(self) -> float:
         """Width of a pixel at the median depth, median_depth / focal [scene units] (Section 3.2.1)."""
         return self.median_depth / self.camera.focal

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3
 from fields.map.keyframes import Keyframe, KeyframeStore
 from fields.map.occupancy import OccupancyVoxels
 from pipelines.densify.depth import DepthEstimator
@@ -80,7 +79,8 @@ class Densifier:
     def add_tracked_points(self, view: Keyframe) -> None:
         """Add Gaussians at the tracked points of a view, which becomes an anchor."""
         self.anchors.append(Anchor(self.keyframes[-1], self.settings.voxels.target * view.view_scale))
-        self._grow(tracked_seeds(view), view)
+        seeds = tracked_seeds(view)
+        self._grow(seeds, view)
 
     def add_error_pixels(self, view: Keyframe, warming_up: bool) -> None:
         """Add Gaussians at pixels of high error of the latest keyframe. Call `add_tracked_points` first.
@@ -107,8 +107,7 @@ class Densifier:
         """Add Gaussians at the seeds that the voxels admit. The first seeds settle the voxels around the camera."""
         with self._stopwatch.measure("occupancy"):
             if self.voxels is not None and len(self.gaussians) == 0:
-                centre = inverse_se3(view.T_camera_world)[:3, 3]
-                self.voxels.settle(self.settings.voxels.coarsest * view.view_scale, centre)
+                self.voxels.settle(self.settings.voxels.coarsest * view.view_scale, view.centre)
             spacing, anchor = self.anchors[-1].spacing, len(self.anchors) - 1
             grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, anchor)
 
