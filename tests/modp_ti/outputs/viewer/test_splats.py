@@ -27,7 +27,7 @@ def test_splats_are_the_gaussians_in_the_units_of_the_page():
     for i in range(50):
         R = Rotation.from_quat(state["quaternion"][i], scalar_first=True).as_matrix()
         expected = 9.0 * R @ np.diag(np.exp(2.0 * state["log_scale"][i])) @ R.T
-        np.testing.assert_allclose(splats.covariances[i], expected, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(splats.covariances[i], expected, rtol=3e-4, atol=3e-6)
     np.testing.assert_allclose(splats.opacities[:, 0] / 255, 1 / (1 + np.exp(-state["opacity_logit"])), atol=0.002)
     # Of the harmonics only the constant one, 1 / (2 sqrt(pi)), is drawn.
     colour = np.clip(0.5 + state["sh"][:, 0] / (2 * np.sqrt(np.pi)), 0, 1)

@@ -93,7 +93,8 @@ def test_points_behind_the_camera_or_outside_the_image_have_no_say(grid: np.ndar
 
 
 def test_no_more_points_than_allowed_condition_it(grid: np.ndarray) -> None:
-    estimate = estimator(max_points=20).estimate(view(grid, surface(grid)), [], grid)
+    # Over twelve draws, the deviation is below the bound at 85 to 126 of the 165 points.
+    estimate = estimator(max_points=12).estimate(view(grid, surface(grid)), [], grid)
     assert np.count_nonzero(estimate.deviation < 0.02) < len(grid)
     assert np.median(np.abs(np.log(estimate.depth / surface(grid)))) < 0.05
 
