@@ -24,6 +24,9 @@ __all__ = ["ALPHA_MIN", "BLUR", "Projection"]
 BLUR = 0.3
 # Contributions below this are not drawn, as in other splatting renderers.
 ALPHA_MIN = 1.0 / 255.0
+MIN_LOGIT = float(np.log(ALPHA_MIN / (1.0 - ALPHA_MIN)))
+# Distance from the centre of an opaque Gaussian at which its contribution falls to ALPHA_MIN [standard deviations].
+MAX_REACH = float(np.sqrt(-2.0 * np.log(ALPHA_MIN)))
 # Lower bound of the compensation's determinant ratio. Below it, a Gaussian is far thinner than a pixel, and the
 # gradient would be infinite.
 MIN_DETERMINANT_RATIO = 1e-6
@@ -149,15 +152,15 @@ class Projection:
         position = self.gaussians.position[i]
         p = camera @ ti.Vector([position[0], position[1], position[2], ti.cast(1.0, self.projected.real)])
         visible = 0
-        if p.z > self.view.near[None]:
-            opacity = 1.0 / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
-            if opacity > ALPHA_MIN:
-                sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch / p.z
-                radius = ti.sqrt(2.0 * ti.log(opacity / ALPHA_MIN) * (sigma * sigma + BLUR))
-                x = focal[0] * p.x / p.z + centre[0]
-                y = focal[1] * p.y / p.z + centre[1]
-                if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
-                    visible = 1
+        if p.z > self.view.near[None] and self.gaussians.opacity_logit[i] > MIN_LOGIT:
+            inv_z = 1.0 / p.z
+            sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch * inv_z
+            # The reach of an opaque Gaussian: the exact one would cost an exponential and a logarithm more.
+            radius = MAX_REACH * ti.sqrt(sigma * sigma + BLUR)
+            x = focal[0] * p.x * inv_z + centre[0]
+            y = focal[1] * p.y * inv_z + centre[1]
+            if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
+                visible = 1
         return ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
 
     @ti.kernel
