@@ -109,6 +109,7 @@ def test_a_mean_over_scenes_needs_every_scene() -> None:
     assert mean == {"psnr": 21.5, "lpips": None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", ["ablate", "compare"])
 def test_the_scripts_explain_themselves_and_end_with_one_line_for_bad_input(script: str, tmp_path: Path) -> None:
     file = Path(__file__).parents[2] / "scripts" / f"{script}.py"

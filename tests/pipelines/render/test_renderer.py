@@ -70,7 +70,7 @@ def test_float64_picture_is_that_of_the_reference(renderers: Callable[..., Rende
     assert_same_picture(render(renderers(degree, ti.f64), state), picture, 1e-6)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("degree", [0, 3])
 def test_float32_picture_is_that_of_the_reference(renderers: Callable[..., Renderer], degree: int, seed: int) -> None:
     state, picture = without_near_thresholds(40, 10 * seed + degree, degree)
@@ -104,7 +104,14 @@ def test_a_tile_stops_behind_opaque_layers(renderers: Callable[..., Renderer], o
     assert (reached < count).all()
 
 
-@pytest.mark.parametrize("size", [(1, 1), (5, 17), (16, 16), (17, 16), (31, 33), (48, 32), (64, 64)])
+@pytest.mark.parametrize(
+    "size",
+    [
+        (1, 1),
+        (31, 33),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in [(5, 17), (16, 16), (17, 16), (48, 32), (64, 64)]),
+    ],
+)
 def test_any_image_size_is_rendered_whole(renderers: Callable[..., Renderer], size: tuple[int, int]) -> None:
     camera = PinholeCamera(40.0, 40.0, 0.45 * size[0], 0.55 * size[1], *size)
     state = random_gaussians(30, seed=8, camera=camera)
