@@ -162,11 +162,13 @@ class VoxelSettings(StrictModel):
 class ViewSettings(StrictModel):
     """Selection of the keyframes of an optimisation step (Section 3.3.2)."""
 
-    local_views: int = Field(default=1, ge=0, description="views from the local bank per step")
+    # The paper takes one local and four global views. With few steps, five global views are better on every recording
+    # at hand: the current view is one of six, and is itself local.
+    local_views: int = Field(default=0, ge=0, description="views from the local bank per step")
     bank: int = Field(default=10, ge=1, description="keyframes in the local bank")
-    global_views: int = Field(default=4, ge=0, description="views from all keyframes per step")
+    global_views: int = Field(default=5, ge=0, description="views from all keyframes per step")
     error_weight: float = Field(
-        default=50.0, ge=0, description="sigma of the mean absolute error in the draw of global views"
+        default=20.0, ge=0, description="sigma of the mean absolute error in the draw of global views"
     )
     recency_weight: float = Field(default=0.001, ge=0, description="sigma of the age in keyframes in that draw")
 

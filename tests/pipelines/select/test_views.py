@@ -37,7 +37,7 @@ def test_global_probabilities_stand_errors_of_any_size() -> None:
 
 
 def test_a_step_looks_at_one_current_one_local_and_four_global_views() -> None:
-    views = LocalGlobalViews(ViewSettings(), np.random.default_rng(0))
+    views = LocalGlobalViews(ViewSettings(local_views=1, global_views=4), np.random.default_rng(0))
     keyframes = store([0.1] * 30)
     views.begin(keyframes)
     draws = np.array([views.select(keyframes) for _ in range(300)])
@@ -53,11 +53,11 @@ def test_global_views_follow_their_probabilities() -> None:
     keyframes = store([0.00, 0.02, 0.04])
     views.begin(keyframes)
     drawn = np.bincount([views.select(keyframes)[1] for _ in range(4000)], minlength=3) / 4000
-    np.testing.assert_allclose(drawn, global_probabilities(keyframes, 50.0, 0.001), atol=0.03)
+    np.testing.assert_allclose(drawn, global_probabilities(keyframes, settings.error_weight, 0.001), atol=0.03)
 
 
 def test_local_views_are_drawn_by_covisibility() -> None:
-    views = LocalGlobalViews(ViewSettings(global_views=0), np.random.default_rng(2))
+    views = LocalGlobalViews(ViewSettings(local_views=1, global_views=0), np.random.default_rng(2))
     keyframes = store([0.1] * 4, far=(0, 1))
     views.begin(keyframes)
     assert {views.select(keyframes)[1] for _ in range(100)} == {2}
