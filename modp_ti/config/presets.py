@@ -27,7 +27,7 @@ class Preset:
 PRESETS: Mapping[str, Preset] = {
     "fast": Preset(
         "a first look, in a fraction of the time",
-        {"mapping.optimise.steps": 4, "mapping.optimise.last_steps": 4, "refine.steps": 200},
+        {"mapping.optimise.steps": 4, "mapping.optimise.last_steps": 12, "refine.steps": 200},
     ),
     "best": Preset(
         "a map to keep, where time does not matter",
