@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from modp_ti.commands import check, export, render, run, view, warmup
+from modp_ti.commands import cameras, check, export, render, run, view, warmup
 from modp_ti.commands.shared import examples
 from modp_ti.version import __version__
 
@@ -15,6 +15,7 @@ __all__ = ["app"]
 OVERVIEW = examples(
     "modp-ti check scene.yaml   (is the input as it should be?)",
     "modp-ti run scene.yaml   (the map, its poses, figures and report.html)",
+    "modp-ti run room.mp4   (the same without a scene file)",
     "modp-ti render OUT --path orbit   (OUT: the output folder of a run)",
     "modp-ti export OUT --format mesh",
 )
@@ -48,6 +49,7 @@ def _options(
 
 
 app.command("run", epilog=run.EXAMPLES)(run.run)
+app.command("cameras", epilog=cameras.EXAMPLES)(cameras.cameras)
 app.command("check", epilog=check.EXAMPLES)(check.check)
 app.command("render", epilog=render.EXAMPLES)(render.render)
 app.command("export", epilog=export.EXAMPLES)(export.export)

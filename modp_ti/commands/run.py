@@ -1,10 +1,10 @@
-"""`modp-ti run scene.yaml [--set key=value ...]`: maps a scene, as `python -m modp_ti.run` does."""
+"""`modp-ti run`: maps a scene file, a recording or a stream, as `python -m modp_ti.run` does."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,12 +12,17 @@ from modp_ti.commands.shared import AsJson, Overrides, Quiet, examples, outcome,
 from modp_ti.config.presets import PRESETS
 from modp_ti.files.errors import InputError
 
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SceneConfig
+
 __all__ = ["EXAMPLES", "run"]
 
 EXAMPLES = examples(
     "modp-ti run scene.yaml",
     "modp-ti run scene.yaml --fast   (a first look; --best for a map to keep)",
     "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
+    "modp-ti run room.mp4 --fast   (or a folder of images; the map is in out/room)",
+    "modp-ti run --stream 0 --view   (a camera; modp-ti cameras lists them)",
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
@@ -27,13 +32,24 @@ EXAMPLES = examples(
 
 def run(
     scene: Annotated[
-        Path | None, typer.Argument(help="scene file (YAML); its paths are relative to it; not needed with --resume")
+        Path | None,
+        typer.Argument(
+            metavar="SCENE",
+            help="scene file (YAML), whose paths are relative to it; or a video or a folder of images, which is mapped "
+            "to out/NAME; not needed with --stream or --resume",
+        ),
     ] = None,
     set_: Overrides = None,
     resume: Annotated[
         Path | None,
         typer.Option(
             "--resume", metavar="OUT", help="go on with the run whose output folder this is, from its snapshot"
+        ),
+    ] = None,
+    stream: Annotated[
+        str | None,
+        typer.Option(
+            "--stream", metavar="CAMERA", help="instead of SCENE: map a camera (number or device) or a URL to out/NAME"
         ),
     ] = None,
     fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
@@ -43,43 +59,64 @@ def run(
     as_json: AsJson = False,
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
-    """Map a posed sequence while its frames arrive, and write splats, poses, metrics, pictures and a report."""
-    if scene is None and resume is None:
-        raise typer.BadParameter("name a scene file, or the output folder of a run to go on with (--resume OUT)")
+    """Map a recording or a stream while its frames arrive, and write splats, poses, metrics, pictures and a report."""
+    if scene is not None and "=" in scene.name and not scene.exists():  # `--stream 0 --set seed=1 source.stop=600`
+        scene, more = None, [str(scene), *(more or [])]
+    if scene is None and resume is None and stream is None:
+        raise typer.BadParameter(
+            "name a scene file, a video or a folder of images, a camera (--stream 0), or the output folder of a run to "
+            "go on with (--resume OUT)"
+        )
     with outcome(as_json) as result:
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
-        folder = _run(scene, resume, overrides, _preset(scene, fast, best), quiet)
+        preset = _preset(resume, scene, fast, best)
+        if stream is not None and (scene is not None or resume is not None):
+            raise InputError("--stream is instead of a scene file and of --resume: give one of them")
+        folder = _run(scene, stream, resume, overrides, preset, quiet)
         result.text = f"written to {folder}"
         if as_json:
             metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
             result.data = {"output": str(folder), "metrics": metrics}
 
 
-def _preset(scene: Path | None, fast: bool, best: bool) -> str | None:
+def _preset(resume: Path | None, scene: Path | None, fast: bool, best: bool) -> str | None:
     """Return the name of the preset that was asked for. Raises InputError if it is not clear or has no effect."""
     if fast and best:
         raise InputError("--fast and --best are two presets: give one of them")
     preset = "fast" if fast else "best" if best else None
-    if preset is not None and scene is None:
+    if preset is not None and scene is None and resume is not None:
         raise InputError(f"--{preset} is for a scene file: a run that goes on has its settings already")
     return preset
 
 
-def _run(scene: Path | None, resume: Path | None, overrides: list[str], preset: str | None, quiet: bool) -> Path:
-    # Imported here, so that `--help` does not wait for Taichi and the readers to load.
-    from modp_ti.config.scene_file import load_scene
-
+def _run(
+    scene: Path | None, stream: str | None, resume: Path | None, overrides: list[str], preset: str | None, quiet: bool
+) -> Path:
     snapshot = None
     if resume is not None:
+        # Imported here, so that `--help` does not wait for Taichi and the readers to load.
+        from modp_ti.commands.bare_recording import is_recording
         from modp_ti.engine.snapshots import load_resumed
 
+        if scene is not None and is_recording(scene):
+            raise InputError(f"{scene}: --resume has the recording already; leave it out")
         config, snapshot = load_resumed(resume, scene, overrides, preset)
     else:
-        assert scene is not None, "run() asks for one of them"
-        config = load_scene(scene, overrides, preset)
+        config = _new_scene(scene, stream, overrides, preset)
     if config.output.exists() and not config.output.is_dir():
         raise InputError(f"{config.output}: output must be a folder, this is a file")
 
     from modp_ti.engine.session import run_scene
 
     return run_scene(config, progress_console(quiet), snapshot)
+
+
+def _new_scene(scene: Path | None, stream: str | None, overrides: list[str], preset: str | None) -> SceneConfig:
+    """Return the settings of a scene file, of a recording, or of a stream."""
+    from modp_ti.commands.bare_recording import is_recording, recorded_scene, streamed_scene
+    from modp_ti.config.scene_file import load_scene
+
+    if stream is not None:
+        return streamed_scene(stream, overrides, preset)
+    assert scene is not None, "run() asks for one of them"
+    return recorded_scene(scene, overrides, preset) if is_recording(scene) else load_scene(scene, overrides, preset)

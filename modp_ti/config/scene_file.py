@@ -73,13 +73,15 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
     return _with_absolute_paths(_resolved(data, where, str(file), overrides, preset), file.resolve().parent)
 
 
-def scene_from_data(data: dict[str, Any], name: str, overrides: Iterable[str] = ()) -> SceneConfig:
-    """Build the settings from the plain data that a run has stored in the file `name`.
+def scene_from_data(
+    data: dict[str, Any], name: str, overrides: Iterable[str] = (), preset: str | None = None
+) -> SceneConfig:
+    """Build the settings from plain data, such as a run has stored in the file `name`.
 
-    Overrides and errors are as for `load_scene`. Relative paths are resolved against the working directory.
+    Overrides, preset and errors are as for `load_scene`. Relative paths are resolved against the working directory.
     """
     data = json.loads(json.dumps(data))
-    return _with_absolute_paths(_resolved(data, {}, name, overrides), Path.cwd())
+    return _with_absolute_paths(_resolved(data, {}, name, overrides, preset), Path.cwd())
 
 
 def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:

@@ -279,7 +279,7 @@ def test_wrong_options_end_with_two(arguments):
     assert "Usage:" in result.stderr
 
 
-COMMANDS = ["run", "check", "render", "export", "view", "warmup"]
+COMMANDS = ["run", "cameras", "check", "render", "export", "view", "warmup"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -288,7 +288,7 @@ def test_help_teaches_by_examples_and_commands_can_be_quiet_and_speak_json(comma
     assert "--quiet" in text
     assert ("--json" in text) == (command != "view")  # which has no end to report
     lines = [line.strip() for line in text.partition("Examples:")[2].splitlines() if line.strip()]
-    assert len(lines) > 1 and all(line.startswith(f"modp-ti {command} ") for line in lines)
+    assert len(lines) > 1 and all(f"{line} ".startswith(f"modp-ti {command} ") for line in lines)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

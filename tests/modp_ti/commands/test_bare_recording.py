@@ -1,0 +1,165 @@
+"""`modp-ti run` without a scene file: what is mapped, where the map goes, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+import pytest
+from typer.testing import CliRunner
+
+from modp_ti.commands import app as cli
+from modp_ti.commands.bare_recording import recorded_scene, streamed_scene
+from modp_ti.config.presets import PRESETS
+from modp_ti.config.scene_file import dump_scene, load_scene
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """The working directory, with a folder of images and two videos whose content nobody looks at."""
+    monkeypatch.chdir(tmp_path)
+    for file in ("hall/a.png", "room.mp4", "other/room.mp4"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    return tmp_path
+
+
+@pytest.fixture
+def session(monkeypatch):
+    """Stands in for the mapping session: keeps its configurations, and writes what tells a run's recording."""
+    configs = []
+
+    def run_scene(config, console, resumed=None):
+        configs.append(config)
+        config.output.mkdir(parents=True, exist_ok=True)
+        dump_scene(config, config.output / "config.yaml")
+        return config.output
+
+    module = types.ModuleType("modp_ti.engine.session")
+    module.__dict__["run_scene"] = run_scene
+    monkeypatch.setitem(sys.modules, "modp_ti.engine.session", module)
+    return configs
+
+
+def invoke(*arguments: str):
+    return CliRunner().invoke(cli.app, ["run", *arguments])
+
+
+def mapped(session: list, *arguments: str):
+    """The settings of a run that succeeds."""
+    result = invoke(*arguments)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"written to {session[-1].output}\n"
+    return session[-1]
+
+
+def refusal(*arguments: str) -> str:
+    result = invoke(*arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+    return result.stderr
+
+
+@pytest.mark.parametrize(("recording", "name"), [("room.mp4", "room"), ("hall", "hall"), ("hall/", "hall")])
+def test_a_recording_is_mapped_with_defaults_to_a_folder_of_its_name(folder, session, recording, name):
+    (folder / "scene.yaml").write_text(f"source: {{path: {recording}}}\ntracker: {{kind: klt}}\noutput: out/{name}\n")
+    assert mapped(session, recording) == load_scene(folder / "scene.yaml")
+
+
+def test_the_folder_one_is_in_has_its_own_name(folder, session, monkeypatch):
+    monkeypatch.chdir(folder / "hall")
+    assert mapped(session, ".").output == folder / "hall/out/hall"
+
+
+@pytest.mark.parametrize(
+    ("stream", "meant", "name"),
+    [
+        ("0", 0, "camera-0"),
+        ("/dev/video2", "/dev/video2", "video2"),
+        ("rtsp://user:secret@192.168.0.20:554/live/1?key=secret", None, "192.168.0.20-live-1"),
+        ("http://[", None, "stream"),
+    ],
+)
+def test_a_stream_is_mapped_to_a_folder_named_without_its_secrets(folder, session, stream, meant, name):
+    config = mapped(session, "--stream", stream)
+    assert (config.source.stream, config.source.path) == (stream if meant is None else meant, None)
+    assert config.tracker.kind == "klt"
+    assert config.output == folder / "out" / name
+
+
+@pytest.mark.parametrize("recording", [["room.mp4"], ["--stream", "0"]])
+def test_presets_and_settings_combine(folder, session, recording):
+    settings = ["--set", "refine.steps=9", "--set", "output=there", "source.stop=5"]
+    config = mapped(session, *recording, "--fast", *settings)
+    assert config.mapping.optimise.steps == PRESETS["fast"].settings["mapping.optimise.steps"]
+    assert (config.refine.steps, config.source.stop, config.output) == (9, 5, folder / "there")
+
+
+def test_another_tracker_may_be_set(session):
+    assert (
+        mapped(session, "hall", "--set", "tracker.kind=colmap", "--set", "tracker.path=sparse").tracker.kind == "colmap"
+    )
+
+
+def test_a_second_run_replaces_the_map_of_the_same_recording_only(folder, session):
+    first = mapped(session, "room.mp4").output
+    assert mapped(session, "room.mp4").output == first
+    assert mapped(session, "other/room.mp4").output == folder / "out/room-2"
+    assert mapped(session, "other/room.mp4").output == folder / "out/room-2"
+    (first / "config.yaml").write_text("nothing: of this version\n")
+    assert mapped(session, "room.mp4").output == folder / "out/room-3"
+
+
+def test_every_recording_of_a_camera_gets_a_folder_of_its_own(folder, session):
+    names = [mapped(session, "--stream", "0").output.name for _ in range(3)]
+    assert names == ["camera-0", "camera-0-2", "camera-0-3"]
+
+
+def test_a_name_that_no_folder_can_have_is_shortened(folder):
+    (folder / f"{'ü' * 120}.mp4").touch()
+    output = recorded_scene(folder / f"{'ü' * 120}.mp4").output
+    (folder / f"{output.name}-2.partial").mkdir()
+    assert output.name == "ü" * 60
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["gone.yaml"], "gone.yaml: no such scene file"),
+        (["gone"], "gone: no such scene file"),
+        (["room.mp4", "--stream", "0"], "--stream is instead of a scene file and of --resume: give one of them"),
+        (["--resume", "out", "--stream", "0"], "--stream is instead of a scene file and of --resume: give one of them"),
+        (["room.mp4", "--resume", "out"], "room.mp4: --resume has the recording already; leave it out"),
+        (["--stream", "0", "--set", "tracker.kind=colmap"], "colmap cannot use source.stream"),
+        (["room.mp4", "--set", "source.scal=1"], "unknown key `source.scal`; did you mean `source.scale`?"),
+        (["room.mp4", "--set", "output=room.mp4"], "output must be a folder, this is a file"),
+        (["room.mp4", "--fast", "--best"], "--fast and --best are two presets: give one of them"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_in_one_line(session, arguments, said):
+    assert said in refusal(*arguments)
+    assert session == []
+
+
+def test_a_folder_with_a_scene_file_is_not_taken_for_its_images(folder, session):
+    (folder / "hall" / "scene.yaml").touch()
+    assert "hall has a scene.yaml: name that file, or the folder of the images" in refusal("hall")
+
+
+def test_an_empty_command_line_says_what_can_be_named():
+    result = invoke()
+    assert result.exit_code == 2
+    assert "--stream" in result.stderr and "--resume" in result.stderr
+
+
+def test_a_missing_video_is_named_by_the_real_session():
+    assert "gone.mp4: no such video file (source.path)" in refusal("gone.mp4", "--quiet")
+
+
+def test_a_missing_camera_is_named_by_the_real_session():
+    assert "camera 99: no such camera, or it is in use (source.stream)" in refusal("--stream", "99", "--quiet")
+
+
+def test_settings_of_a_stream_are_those_of_its_scene_file(folder):
+    (folder / "scene.yaml").write_text("source: {stream: 3}\ntracker: {kind: klt}\noutput: out/camera-3\n")
+    assert streamed_scene("3") == load_scene(folder / "scene.yaml")
