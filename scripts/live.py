@@ -164,7 +164,8 @@ def row(session: Session, folder: Path, code: int) -> dict[str, Any]:
     # Runs that do not keep pace have no `live`, and rows of `figures` stay empty then.
     live = metrics.get("live") or {}
     gap = None
-    if (output / "trajectory.txt").is_file():
+    # Time stamps of a peer are its own, not those of arrival.
+    if not session.from_scene and (output / "trajectory.txt").is_file():
         arrivals, _ = read_trajectory(output / "trajectory.txt")
         gap = max((float(after - before) for before, after in pairwise(arrivals)), default=None)
     seconds = metrics.get("seconds", {})
