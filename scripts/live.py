@@ -9,27 +9,28 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
 import socket
 import subprocess
 import sys
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import yaml
 from ending import documented_ending
 from experiments import markdown_table, write_report
-from live_camera import Show, add_show_options, playing, read_log, show_of
+from live_camera import Show, add_show_options, environment, playing, read_log, show_of
 
-from modp_ti.config.scene_file import scene_from_data
+from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
+from modp_ti.config.settings import SceneConfig, SourceSettings
 from modp_ti.files import readable
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import open_source
 from modp_ti.outputs.formats.trajectory import read_trajectory
 
 SCALE, HOLDOUT = 0.5, 8
@@ -97,13 +98,13 @@ class Session:
 
 
 @contextmanager
-def sending(scene: Path, rate: float | None, address: str, log: Path) -> Iterator[None]:
+def sending(show: Show, address: str, log: Path) -> Iterator[None]:
     """Send the frames of a scene to the socket from another process, with scripts/send_frames.py."""
     program = Path(__file__).with_name("send_frames.py")
-    command = [sys.executable, str(program), str(scene), "--to", address, "--wait", "600"]
-    command += [] if rate is None else ["--rate", str(rate)]
+    arguments = [sys.executable, str(program), str(show.path), "--to", address, "--wait", "600"]
+    arguments += [] if show.rate is None else ["--rate", str(show.rate)]
     with log.open("w", encoding="utf-8") as said:
-        process = subprocess.Popen(command, stdout=said, stderr=said, env=environment())
+        process = subprocess.Popen(arguments, stdout=said, stderr=said, env=environment())
         try:
             yield
         finally:
@@ -111,9 +112,10 @@ def sending(scene: Path, rate: float | None, address: str, log: Path) -> Iterato
             process.wait()
 
 
-def environment() -> dict[str, str]:
-    """Return the environment of the processes that are started: they import what this one imports."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+def command(*arguments: str, output: TextIO | None = None) -> int:
+    """Run `modp-ti` with these arguments, and return its exit code. It prints to `output`, or to standard error."""
+    line, to = [sys.executable, "-m", "modp_ti.commands.app", *arguments], output or sys.stderr
+    return subprocess.run(line, stdout=to, stderr=to, check=False, env=environment()).returncode
 
 
 def free_address() -> str:
@@ -122,29 +124,57 @@ def free_address() -> str:
         return f"127.0.0.1:{server.getsockname()[1]}"
 
 
-def play_and_map(session: Session, folder: Path) -> dict[str, Any]:
-    """Run a session in the folder, which gets the scene, the logs and the map, and return its row."""
-    folder.mkdir(parents=True, exist_ok=True)
-    scene, output, log = folder / "scene.yaml", folder / "map", folder / "camera.json"
-    (output / "metrics.json").unlink(missing_ok=True)  # of an earlier call
-    (output / "splats.ply").unlink(missing_ok=True)
+def mapped_size(session: Session, config: SceneConfig) -> tuple[int, int]:
+    """Return the size (width, height) [px] at which the session's images are mapped.
+
+    Args:
+        session: The session.
+        config: Settings of its run.
+    """
     show = session.show
-    # What is wrong with the settings is said before anything is started.
-    scene_from_data(session.scene(ANYWHERE, output), str(scene), session.overrides)
     if session.from_scene:
-        address = free_address()
-        other: Any = sending(show.path, show.rate, address, folder / "sender.log")
+        source = load_scene(show.path).source
     else:
-        address, other = "", playing(show, log)
-    with other as url:
-        text = yaml.safe_dump(session.scene(url or address, output), sort_keys=False, allow_unicode=True)
-        scene.write_text(text, encoding="utf-8")
-        command = [sys.executable, "-m", "modp_ti.run", str(scene)]
-        for setting in session.overrides:
-            command += ["--set", setting]
+        source = SourceSettings(path=show.path, start=show.start, stop=show.start + 1, scale=1.0)
+    images = open_source(source)
+    try:
+        width, height = images.size(images.selected(source.start, source.stop, source.step)[0])
+    finally:
+        images.close()
+    scale = images.scale if session.from_scene else config.source.scale_for(width, height)
+    return round(width * scale), round(height * scale)
+
+
+def play_and_map(session: Session, folder: Path, cold: bool = False) -> dict[str, Any]:
+    """Run a session in the folder, which gets the scene, the logs and the map, and return its row.
+
+    Args:
+        session: The session.
+        folder: The folder, which is created.
+        cold: Do not compile the kernels before the camera plays.
+    """
+    output, scene = folder / "map", folder / "scene.yaml"
+    # What is wrong with the settings or the images is said before anything is started.
+    config = scene_from_data(session.scene(ANYWHERE, output), str(scene), session.overrides)
+    width, height = mapped_size(session, config)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("metrics.json", "splats.ply", "trajectory.txt"):  # of an earlier call
+        (output / name).unlink(missing_ok=True)
+    if not cold:
+        dump_scene(config, scene)
+        if command("warmup", str(scene), "--size", f"{width}x{height}", "--quiet"):
+            raise InputError(f"{session.label}: the kernels cannot be compiled, see above")
+    with ExitStack() as sender:
+        if session.from_scene:
+            address = free_address()
+            sender.enter_context(sending(session.show, address, folder / "sender.log"))
+        else:
+            address = sender.enter_context(playing(session.show, folder / "camera.json"))
+        scene.write_text(yaml.safe_dump(session.scene(address, output), sort_keys=False), encoding="utf-8")
+        settings = [word for setting in session.overrides for word in ("--set", setting)]
         print(f"{session.label}: mapping; see {folder / 'run.log'}", file=sys.stderr, flush=True)
         with (folder / "run.log").open("w", encoding="utf-8") as said:
-            code = subprocess.run(command, stdout=said, stderr=said, check=False, env=environment()).returncode
+            code = command("run", str(scene), *settings, output=said)
     return row(session, folder, code)
 
 
@@ -282,6 +312,7 @@ def main() -> None:
     parser.add_argument("--transforms", type=Path, metavar="FILE", help="transforms.json with the camera")
     parser.add_argument("--seconds", type=float, default=60.0, help="refinement after the end; 0: none (default 60)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the run")
+    parser.add_argument("--cold", action="store_true", help="do not compile the kernels before the camera plays")
     arguments = parser.parse_args()
     if not arguments.path.exists():
         raise InputError(f"{arguments.path}: no such video, folder of images or scene file")
@@ -291,7 +322,7 @@ def main() -> None:
         raise InputError("a scene file has its own camera and frames: only --rate goes with it")
     folder = arguments.output.resolve()
     place = folder / folder_name(session.label)
-    new = play_and_map(session, place)
+    new = play_and_map(session, place, arguments.cold)
     rows = update(folder, new)
     write_report(folder, "live", table(rows), rows)
     if new["exit_code"]:

@@ -27,7 +27,7 @@ from modp_ti.files import read_bytes
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
 
-__all__ = ["Show", "playing", "send_on_time"]
+__all__ = ["Show", "add_show_options", "environment", "playing", "read_log", "send_on_time", "show_of"]
 
 # Images that wait for the reader, as many as a driver usually has buffers.
 BUFFERS = 4
@@ -254,6 +254,11 @@ def serve(show: Show, port: int, log: Path | None) -> None:
     print(", ".join([*words, *(["the reader went away"] if sent.gone else [])]), file=sys.stderr)
 
 
+def environment() -> dict[str, str]:
+    """Return the environment of a process that is started: it imports what this one imports."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
 @contextmanager
 def playing(show: Show, log: Path) -> Iterator[str]:
     """Play a show in a process of its own, and yield its URL. At the end the process is stopped.
@@ -266,9 +271,8 @@ def playing(show: Show, log: Path) -> Iterator[str]:
         InputError: If the images cannot be read.
     """
     command = [sys.executable, str(Path(__file__).resolve()), *show.arguments(), "--log", str(log)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     log.unlink(missing_ok=True)
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
     try:
         assert process.stdout is not None
         url = process.stdout.readline().strip()
