@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import socket
 import subprocess
@@ -35,6 +36,8 @@ from modp_ti.outputs.formats.trajectory import read_trajectory
 
 SCALE, HOLDOUT = 0.5, 8
 MAX_NAME = 80
+# Time between two looks at the memory of a run [s].
+SAMPLED = 5.0
 # Stands for an address that is not known yet.
 ANYWHERE = "127.0.0.1:1"
 # transforms.json's names of the intrinsics, by those of `source.intrinsics`.
@@ -112,10 +115,34 @@ def sending(show: Show, address: str, log: Path) -> Iterator[None]:
             process.wait()
 
 
-def command(*arguments: str, output: TextIO | None = None) -> int:
-    """Run `modp-ti` with these arguments, and return its exit code. It prints to `output`, or to standard error."""
+def command(*arguments: str, output: TextIO | None = None) -> tuple[int, list[float]]:
+    """Run `modp-ti` with these arguments. It prints to `output`, or to standard error.
+
+    Returns:
+        Its exit code, and the memory [MB] of its processes every `SAMPLED` seconds.
+    """
     line, to = [sys.executable, "-m", "modp_ti.commands.app", *arguments], output or sys.stderr
-    return subprocess.run(line, stdout=to, stderr=to, check=False, env=environment()).returncode
+    process, memory = subprocess.Popen(line, stdout=to, stderr=to, env=environment()), []
+    try:
+        while True:
+            try:
+                return process.wait(SAMPLED), memory
+            except subprocess.TimeoutExpired:
+                memory.append(round(memory_of(process.pid), 1))
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def memory_of(process: int) -> float:
+    """Return the resident memory of a process and its descendants [MB], as Linux tells it; 0 if it does not."""
+    place = Path("/proc") / str(process)
+    try:
+        pages = int((place / "statm").read_text().split()[1])
+        children = [int(word) for file in place.glob("task/*/children") for word in file.read_text().split()]
+    except OSError:  # it has ended, or this is no Linux
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20) + sum(map(memory_of, children))
 
 
 def free_address() -> str:
@@ -162,7 +189,7 @@ def play_and_map(session: Session, folder: Path, cold: bool = False) -> dict[str
         (output / name).unlink(missing_ok=True)
     if not cold:
         dump_scene(config, scene)
-        if command("warmup", str(scene), "--size", f"{width}x{height}", "--quiet"):
+        if command("warmup", str(scene), "--size", f"{width}x{height}", "--quiet")[0]:
             raise InputError(f"{session.label}: the kernels cannot be compiled, see above")
     with ExitStack() as sender:
         if session.from_scene:
@@ -174,8 +201,8 @@ def play_and_map(session: Session, folder: Path, cold: bool = False) -> dict[str
         settings = [word for setting in session.overrides for word in ("--set", setting)]
         print(f"{session.label}: mapping; see {folder / 'run.log'}", file=sys.stderr, flush=True)
         with (folder / "run.log").open("w", encoding="utf-8") as said:
-            code = command("run", str(scene), *settings, output=said)
-    return row(session, folder, code)
+            code, memory = command("run", str(scene), *settings, output=said)
+    return {**row(session, folder, code), "memory_mb": memory}
 
 
 def row(session: Session, folder: Path, code: int) -> dict[str, Any]:

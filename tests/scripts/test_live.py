@@ -181,6 +181,17 @@ def test_labels_tell_sessions_apart() -> None:
     assert long[0] != long[1] and len(long[0]) < 100
 
 
+def test_the_memory_is_that_of_the_process_and_its_children() -> None:
+    code = "import subprocess, sys; b = bytearray(1 << 26); print(1, flush=True); input()"
+    parent = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {code!r}], check=True)"
+    process = subprocess.Popen([sys.executable, "-c", parent], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "1\n"
+    assert live.memory_of(process.pid) > 64
+    process.communicate("\n")
+    assert live.memory_of(process.pid) == 0.0
+
+
 @pytest.fixture
 def folder(tmp_path: Path, make_metrics: Callable[..., dict]) -> Path:
     """The folder of a session whose run has ended, without `live` in its metrics."""
@@ -297,5 +308,6 @@ def test_a_session_whose_camera_fails_saves_its_map(faults: list[str], tmp_path:
     (row,) = json.loads((tmp_path / "live.json").read_text())
     assert (row["exit_code"], row["map_saved"]) == (0, True)
     assert row["figures"]["sent"] + row["dropped_by_camera"] == 40
+    assert row["memory_mb"] and max(row["memory_mb"]) > 50
     assert 2 <= row["figures"]["tracked"] <= 40 and row["figures"]["psnr"] > 15
     assert (tmp_path / "live.md").read_text() == result.stdout
