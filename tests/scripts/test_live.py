@@ -300,7 +300,7 @@ def test_wrong_options_are_said_in_one_line(
 @pytest.mark.slow
 @pytest.mark.parametrize("faults", [["--stall", "30", "2", "--cut", "40"], ["--unplug", "40"]])
 def test_a_session_whose_camera_fails_saves_its_map(faults: list[str], tmp_path: Path) -> None:
-    options = ["--frames", "50", "--rate", "20", "--intrinsics", "fx=512", "--seconds", "0", "--cold", *faults]
+    options = ["--frames", "50", "--rate", "10", "--intrinsics", "fx=512", "--seconds", "0", "--cold", *faults]
     settings = ["--set", "source.scale=0.25", "--set", "mapping.optimise.steps=1", "--set", "export.report=false"]
     command = [sys.executable, str(SCRIPT), str(DEMO), "-o", str(tmp_path), *options, *settings]
     result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
