@@ -195,6 +195,8 @@ class SourceSettings(StrictModel):
             raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; remove one of them")
         if self.stream is not None and self.path is not None:
             raise ValueError("source.path and source.stream cannot both be set; remove one of them")
+        if self.stream is not None and self.realtime:
+            raise ValueError("source.realtime is for source.path, a stream always sets the pace; remove it")
         return self
 
     @model_validator(mode="after")
@@ -328,10 +330,20 @@ class SceneConfig(StrictModel):
     @property
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
-        return self.mode == "online" and not self.is_live
+        return self.mode == "online" and not self.is_live and not self.source.realtime
+
+    def without_clock(self) -> SceneConfig:
+        """Return these settings for all images of a file or folder, however long their processing takes."""
+        mapping = self.mapping.model_copy(update={"pace": "complete"})
+        source = self.source.model_copy(update={"realtime": False})
+        return self.model_copy(update={"source": source, "mapping": mapping})
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
+        if self.snapshot_every and self.source.realtime:
+            raise ValueError(
+                "snapshot_every: a run at the pace of source.realtime cannot be resumed; remove one of them"
+            )
         if self.snapshot_every and not self.can_be_resumed:
             if self.mode != "online":
                 raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
@@ -345,6 +357,11 @@ class SceneConfig(StrictModel):
             raise ValueError(NO_PATH)
         if source.intrinsics.given and tracker.brings_cameras:
             raise ValueError(f"tracker.kind: {tracker.kind} provides the cameras; remove source.intrinsics")
+        if source.realtime and not tracker.follows_streams:
+            raise ValueError(
+                f"tracker.kind: {tracker.kind} does not follow the images as they arrive; remove source.realtime, or "
+                "take tracker.kind: klt"
+            )
         if source.stream is not None and not tracker.follows_streams:
             raise ValueError(
                 f"tracker.kind: {tracker.kind} cannot use source.stream, it needs recorded images; set source.path"
