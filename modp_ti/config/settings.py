@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -161,6 +162,11 @@ class SourceSettings(StrictModel):
         "trajectory errors (`ate_rmse`) in `metrics.json` and the report; empty for none",
     )
 
+    @property
+    def follows_clock(self) -> bool:
+        """Whether the images arrive by the clock instead of when they are asked for."""
+        return self.realtime or self.stream is not None
+
     def scale_for(self, width: int, height: int) -> float:
         """Return the scale of images of this size: `scale` if it is a number, otherwise what `auto` chooses.
 
@@ -301,7 +307,12 @@ class SceneConfig(StrictModel):
         description="number of frames between snapshots of the run in `snapshot.npz`, for `modp-ti run --resume` after "
         "a crash; empty or 0: none. Ctrl-C always writes a snapshot",
     )
-    threads: int | None = Field(default=None, ge=1, description="number of CPU threads; empty: one per core")
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        description="number of CPU threads; empty: one per core, and one less where `klt` follows a clock beside the "
+        "mapper",
+    )
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
@@ -326,6 +337,19 @@ class SceneConfig(StrictModel):
         if self.mode != "online" or self.mapping.pace != "auto":
             return self.mode == "online" and self.mapping.pace == "realtime"
         return self.source.realtime or self.is_live
+
+    @property
+    def tracks_beside_mapping(self) -> bool:
+        """Whether the tracker runs in a process of its own."""
+        return self.is_realtime and self.source.follows_clock and self.tracker.kind == "klt"
+
+    @property
+    def mapper_threads(self) -> int | None:
+        """Number of CPU threads of the mapper; None for one per core. A tracker beside it gets one core."""
+        if self.threads is not None or not self.tracks_beside_mapping:
+            return self.threads
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores - 1)
 
     @property
     def can_be_resumed(self) -> bool:

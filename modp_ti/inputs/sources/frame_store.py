@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.listed_images import decoded
+from modp_ti.inputs.sources.protocol import ImageSource
 
-__all__ = ["FrameStore"]
+__all__ = ["FrameStore", "StoredFrames"]
 
 
 class FrameStore:
@@ -23,6 +25,11 @@ class FrameStore:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+
+    @staticmethod
+    def name(number: int) -> str:
+        """Name of the n-th delivered frame."""
+        return f"live_{number:06d}"
 
     def file(self, number: int) -> Path:
         return self.folder / f"{number:06d}.png"
@@ -57,13 +64,13 @@ class FrameStore:
         except OSError as error:
             raise self._unwritable(error) from None
 
-    def read(self, number: int) -> NDArray[np.uint8]:
-        """Read a frame (H, W, 3) uint8 RGB.
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Read a delivered frame (H, W, 3) uint8 RGB.
 
         Raises:
             InputError: If the file is missing or damaged.
         """
-        file = self.file(number)
+        file = self.file(int(name.rpartition("_")[2]))
         try:
             image = decoded(file.read_bytes())
         except OSError:
@@ -77,3 +84,20 @@ class FrameStore:
             f"{self.folder}: frames of the live source cannot be kept there: {error.strerror}; "
             "make room, or set TMPDIR to a folder that has some"
         )
+
+
+class StoredFrames(ImageSource):
+    """The stored frames of a recording that has ended, for a process that did not record it.
+
+    Args:
+        folder: The folder of a `FrameStore`.
+        names: Names of the frames, in order.
+        times: Time of each [s].
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str], times: Sequence[float]) -> None:
+        super().__init__(folder, names, times)
+        self._store = FrameStore(folder)
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        return self._store.read(name)

@@ -147,7 +147,7 @@ class LiveSource(ImageSource):
         last = self._last
         if last is not None and last[0] == name:
             return np.asarray(cv2.cvtColor(last[1], cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        return self._store.read(self._position[name])
+        return self._store.read(name)
 
     def finish(self) -> None:
         """End the recording. Frames that have arrived are still delivered."""
@@ -248,7 +248,7 @@ class LiveSource(ImageSource):
     def _keep(self, arrived: float, captured: _Captured) -> None:
         """Store a frame under its number. Raises InputError if the disk is full."""
         number = len(self._names)
-        name = f"live_{number:06d}"
+        name = self._store.name(number)
         if captured.image is None:
             self._store.deliver(captured.file, number)
         else:

@@ -1,7 +1,4 @@
-"""A live source delivers frames as they come, can be read again, keeps what nobody takes, and lets go at its end.
-
-The stream is MJPEG over HTTP from a server in a thread of this process, which sends a frame when the test says so.
-"""
+"""A live source delivers frames as they come, can be read again, keeps what nobody takes, and lets go at its end."""
 
 from __future__ import annotations
 
@@ -11,9 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -23,6 +18,7 @@ from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import live, open_source
 from modp_ti.inputs.sources.live import LiveSource
+from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
@@ -38,49 +34,14 @@ def interruptible():
 
 def jpeg(number: int) -> bytes:
     """A flat picture whose grey value tells its number."""
-    _, data = cv2.imencode(".jpg", np.full((48, 64, 3), 5 * number, np.uint8))
-    return data.tobytes()
+    return encoded(np.full((48, 64, 3), 5 * number, np.uint8))
 
 
-class Camera:
-    """send: a frame of this number; end: of the stream."""
-
-    def __init__(self) -> None:
-        self._frames: SimpleQueue[int | None] = SimpleQueue()
-        camera = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                self.send_response(200)
-                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-                self.end_headers()
-                while (number := camera._frames.get()) is not None:
-                    data = jpeg(number)
-                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                    try:
-                        self.wfile.write(head.encode() + data + b"\r\n")
-                    except OSError:
-                        return  # the client is gone
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = True
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-        self.url = f"http://user:secret@127.0.0.1:{self._server.server_address[1]}/stream.mjpg?quality=90"
+class Camera(MjpegCamera):
+    """send: frames of these numbers."""
 
     def send(self, *numbers: int) -> None:
-        for number in numbers:
-            self._frames.put(number)
-
-    def end(self) -> None:
-        self._frames.put(None)
-
-    def shut_down(self) -> None:
-        self.end()
-        self._server.shutdown()
-        self._server.server_close()
+        self.send_jpeg(*map(jpeg, numbers))
 
 
 @pytest.fixture
