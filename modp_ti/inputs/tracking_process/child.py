@@ -30,6 +30,7 @@ def main() -> None:
     """Serve the parent process, whose descriptors of pipe, ring and board are the arguments."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent decides what it means
     cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the end of a stream is told in a note
     pipe, ring, board = (int(argument) for argument in sys.argv[1:4])
     connection = Connection(pipe)
     try:

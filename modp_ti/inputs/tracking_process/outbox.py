@@ -35,12 +35,13 @@ class Outbox:
         """Append an event; wait while the queue is full."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._events) < LIMIT)
-            if isinstance(event, TrackedFrame):
-                if self._with_picture < self._pictures:
-                    self._with_picture += 1
-                else:
-                    event = FrameRecord.of(event)
-            self._events.append(event)
+            if not isinstance(event, TrackedFrame):
+                self._events.append(event)
+            elif self._with_picture < self._pictures:
+                self._with_picture += 1
+                self._events.append(event)
+            else:
+                self._events.append(FrameRecord.of(event))
             self._changed.notify_all()
 
     def get(self) -> TrackedFrame | FrameRecord | PoseCorrection | Ended:

@@ -70,10 +70,8 @@ class TrackingProcess(Tracker):
         theirs.close()
         os.close(board)
         self._interrupt = None
-        if (
-            threading.current_thread() is threading.main_thread()
-            and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
-        ):
+        ours = threading.current_thread() is threading.main_thread()
+        if ours and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
             self._interrupt = signal.signal(signal.SIGINT, self._interrupted)
         try:
             self._connection.send(Job(config, None if self._kept is None else Path(self._kept.name)))

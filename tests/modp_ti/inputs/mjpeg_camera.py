@@ -1,4 +1,4 @@
-"""A camera on the loopback: MJPEG over HTTP from a thread of this process, which sends a frame when the test says so."""
+"""A camera on the loopback: MJPEG over HTTP from a thread of this process, which sends what the test tells it to."""
 
 from __future__ import annotations
 
