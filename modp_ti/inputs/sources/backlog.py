@@ -47,7 +47,8 @@ class Backlog(Generic[Item]):
         self._waiting: deque[tuple[float, Item]] = deque()
         self._arrived = self._thinned = 0
         self._newest = 0.0
-        self._taken: float | None = None  # when the last frame was taken
+        self._takes = 0
+        self._taken = 0.0  # when the last frame was taken
         self._to_skip: int | None = None  # frames to leave out before the next one; None until that is decided
 
     def __len__(self) -> int:
@@ -71,24 +72,23 @@ class Backlog(Generic[Item]):
     def take(self, now: float) -> tuple[float, Item] | None:
         """Return the next frame to be tracked with its time of arrival, or None if it has not arrived.
 
-        The time since the last frame was taken counts as the tracker's.
+        The time since the last frame was taken counts as the tracker's, except after the first frame, when the tracker
+        is still being opened.
 
         Args:
             now: The time [s].
         """
         if self._to_skip is None:
-            if self._taken is None:
-                self._to_skip = 0
-            else:
+            if self._takes > 1:
                 self._thinning.tracked(now - self._taken)
-                lag = max(0.0, now - self._waiting[0][0]) if self._waiting else 0.0
-                self._to_skip = self._thinning.stride(lag) - 1
+            lag = max(0.0, now - self._waiting[0][0]) if self._waiting else 0.0
+            self._to_skip = self._thinning.stride(lag) - 1
         while self._waiting and self._to_skip:
             self._leave_out(self._waiting.popleft()[1])
             self._to_skip -= 1
         if not self._waiting:
             return None
-        self._taken, self._to_skip = now, None
+        self._takes, self._taken, self._to_skip = self._takes + 1, now, None
         return self._waiting.popleft()
 
     def clear(self) -> None:

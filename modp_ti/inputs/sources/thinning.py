@@ -16,7 +16,7 @@ ROOM = 1.1
 # Numbers of intervals between frames, and of tracked frames, over which the means are taken.
 INTERVALS, COSTS = 256, 32
 # Nothing is thinned before so many frames were tracked.
-FEWEST_COSTS = 4
+FEWEST_COSTS = 6
 # A value counts at most this multiple of the mean: one pause of the stream or the tracker hardly changes the rates.
 CLIP = 5.0
 

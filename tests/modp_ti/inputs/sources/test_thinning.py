@@ -90,6 +90,11 @@ def test_the_backlog_of_a_long_pause_is_worked_off_with_fewer_frames_evenly():
     assert set(gaps[caught_up:]) == {1}
 
 
+def test_the_time_in_which_the_tracker_is_opened_thins_nothing():
+    numbers, _, _ = played(at(10, 30), lambda i: 1.0 if i == 0 else 0.06)
+    assert numbers == list(range(300))
+
+
 def test_a_pause_of_the_stream_changes_nothing():
     arrivals = [t if t < 20 else t + 5.0 for t in at(30, 40)]
     gaps = np.diff(played(arrivals, lambda _: 0.06)[0])
