@@ -326,17 +326,11 @@ class SceneConfig(StrictModel):
             return self
         return self.model_copy(update={"source": self.source.model_copy(update={"scale": scale})})
 
-    @property
-    def is_live(self) -> bool:
-        """Whether the frames come from a live source and cannot be read again after the run."""
-        return self.source.stream is not None or self.tracker.is_live
-
-    @property
-    def is_realtime(self) -> bool:
-        """Whether the mapper keeps pace with the frames instead of giving each all its work."""
-        if self.mode != "online" or self.mapping.pace != "auto":
-            return self.mode == "online" and self.mapping.pace == "realtime"
-        return self.source.realtime or self.is_live
+    def without_clock(self) -> SceneConfig:
+        """Return these settings for all images of a file or folder, however long their processing takes."""
+        mapping = self.mapping.model_copy(update={"pace": "complete"})
+        source = self.source.model_copy(update={"realtime": False})
+        return self.model_copy(update={"source": source, "mapping": mapping})
 
     @property
     def tracks_beside_mapping(self) -> bool:
@@ -352,25 +346,29 @@ class SceneConfig(StrictModel):
         return max(1, cores - 1)
 
     @property
+    def is_live(self) -> bool:
+        """Whether the frames come from a live source and cannot be read again after the run."""
+        return self.source.stream is not None or self.tracker.is_live
+
+    @property
+    def is_realtime(self) -> bool:
+        """Whether the mapper keeps pace with the frames instead of giving each all its work."""
+        if self.mode != "online" or self.mapping.pace != "auto":
+            return self.mode == "online" and self.mapping.pace == "realtime"
+        return self.source.realtime or self.is_live
+
+    @property
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
-        return self.mode == "online" and not self.is_live and not self.source.realtime
-
-    def without_clock(self) -> SceneConfig:
-        """Return these settings for all images of a file or folder, however long their processing takes."""
-        mapping = self.mapping.model_copy(update={"pace": "complete"})
-        source = self.source.model_copy(update={"realtime": False})
-        return self.model_copy(update={"source": source, "mapping": mapping})
+        return self.mode == "online" and not self.is_live and not self.is_realtime
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
-        if self.snapshot_every and self.source.realtime:
-            raise ValueError(
-                "snapshot_every: a run at the pace of source.realtime cannot be resumed; remove one of them"
-            )
         if self.snapshot_every and not self.can_be_resumed:
             if self.mode != "online":
                 raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
+            if not self.is_live:
+                raise ValueError("snapshot_every is for `mapping.pace: complete`; remove one of them")
             raise ValueError("snapshot_every: live frames cannot be read again; record them, or remove the key")
         return self
 

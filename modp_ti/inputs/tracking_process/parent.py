@@ -21,7 +21,7 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.sources import FrameReader, ImageSource, open_source
+from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.inputs.sources.frame_store import StoredFrames
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
@@ -81,7 +81,7 @@ class TrackingProcess(Tracker):
             raise
         self._notes = [*opened.notes, _shared_cores(config)]
         self._scale = opened.scale
-        self._intrinsics = opened.intrinsics
+        self._undistorter = opened.intrinsics.undistorter(opened.scale)
 
     def _wait_for_opening(self, progress: Progress | None) -> Opened:
         while True:
@@ -100,6 +100,10 @@ class TrackingProcess(Tracker):
     @property
     def scale(self) -> float:
         return self._scale
+
+    @property
+    def undistorter(self) -> Undistorter:
+        return self._undistorter
 
     @property
     def frame_count(self) -> int | None:
@@ -138,9 +142,8 @@ class TrackingProcess(Tracker):
             pass
         if self._again is None:
             self._again = FrameReader(self._images_again(), self._config.source)
-        undistorter = self._intrinsics.undistorter(self._scale)
         for record in self._log:
-            yield record.with_picture(self._again.read(record.name, undistorter))
+            yield record.with_picture(self._again.read(record.name, self._undistorter))
 
     def close(self) -> None:
         """End the recording and the process, and remove what was stored."""
