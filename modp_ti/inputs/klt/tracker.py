@@ -210,12 +210,12 @@ class KltTracker(Tracker):
         return self._reader.images.scale
 
     @property
-    def undistorter(self) -> Undistorter:
-        return self._delivered
-
-    @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
         return self._unreadable
+
+    @property
+    def undistorter(self) -> Undistorter:
+        return self._delivered
 
     def close(self) -> None:
         self._reader.images.close()
