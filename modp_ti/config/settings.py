@@ -326,12 +326,6 @@ class SceneConfig(StrictModel):
             return self
         return self.model_copy(update={"source": self.source.model_copy(update={"scale": scale})})
 
-    def without_clock(self) -> SceneConfig:
-        """Return these settings for all images of a file or folder, however long their processing takes."""
-        mapping = self.mapping.model_copy(update={"pace": "complete"})
-        source = self.source.model_copy(update={"realtime": False})
-        return self.model_copy(update={"source": source, "mapping": mapping})
-
     @property
     def tracks_beside_mapping(self) -> bool:
         """Whether the tracker runs in a process of its own."""
@@ -360,7 +354,13 @@ class SceneConfig(StrictModel):
     @property
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
-        return self.mode == "online" and not self.is_live and not self.is_realtime
+        return self.mode == "online" and not (self.is_live or self.is_realtime or self.source.realtime)
+
+    def without_clock(self) -> SceneConfig:
+        """Return these settings for all images of a file or folder, however long their processing takes."""
+        mapping = self.mapping.model_copy(update={"pace": "complete"})
+        source = self.source.model_copy(update={"realtime": False})
+        return self.model_copy(update={"source": source, "mapping": mapping})
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
