@@ -37,6 +37,7 @@ class FrameReport:
         keyframes: Number of keyframes.
         gaussians: Number of Gaussians.
         psnr: Mean PSNR of the last step's views [dB]; None if nothing was optimised.
+        steps: Number of optimisation steps that it got.
     """
 
     index: int
@@ -44,6 +45,7 @@ class FrameReport:
     keyframes: int
     gaussians: int
     psnr: float | None
+    steps: int = 0
 
 
 class Pipeline(ABC):
@@ -112,7 +114,11 @@ class Pipeline(ABC):
         """Set the bytes that are kept outside the map and count towards its memory budget."""
 
     def refine(
-        self, settings: RefineSettings, progress: Callable[[int, float], None] | None = None, done: int = 0
+        self,
+        settings: RefineSettings,
+        progress: Callable[[int, float], None] | None = None,
+        done: int = 0,
+        schedule: Callable[[int], float | None] | None = None,
     ) -> None:
         """Optimise the finished map on all keyframes, see `pipelines.refinement.refine`.
 

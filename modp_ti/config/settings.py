@@ -108,6 +108,9 @@ class SourceSettings(StrictModel):
     stream: int | str | None = Field(
         default=None, description="instead of `path`: number of a camera or URL of a stream, for live frames"
     )
+    realtime: bool = Field(
+        default=False, description="deliver the images of a file or folder at the times of their time stamps"
+    )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
     scale: Literal["auto"] | Annotated[float, Field(gt=0, le=1)] = Field(
@@ -314,6 +317,13 @@ class SceneConfig(StrictModel):
     def is_live(self) -> bool:
         """Whether the frames come from a live source and cannot be read again after the run."""
         return self.source.stream is not None or self.tracker.is_live
+
+    @property
+    def is_realtime(self) -> bool:
+        """Whether the mapper keeps pace with the frames instead of giving each all its work."""
+        if self.mode != "online" or self.mapping.pace != "auto":
+            return self.mode == "online" and self.mapping.pace == "realtime"
+        return self.source.realtime or self.is_live
 
     @property
     def can_be_resumed(self) -> bool:
