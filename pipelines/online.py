@@ -151,7 +151,7 @@ class OnlineMapper(OnlineMap):
             return None
         return self._optimise_evenly(np.arange(len(self.keyframes)), 1, self.settings.views.global_views)
 
-    def correct(self, correction: PoseCorrection) -> CorrectionReport:
+    def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
         """Apply poses and points that the tracker has revised, see `MapCorrector`.
 
         If Gaussians move, optimisation steps on the keyframes that moved remove the seams.
@@ -159,7 +159,7 @@ class OnlineMapper(OnlineMap):
         settings = self.settings.corrections
         with self.stopwatch.measure("correct"):
             self.optimiser.settle()
-            around, moved = self.corrector.correct(correction, settings)
+            around, moved = self.corrector.correct(correction, settings, more)
         if len(moved):
             self._optimise_evenly(moved, self.pace.steps_after_correction(), settings.views)
         return CorrectionReport(around, moved=len(moved) > 0)

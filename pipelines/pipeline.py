@@ -83,8 +83,13 @@ class Pipeline(ABC):
         """
 
     @abstractmethod
-    def correct(self, correction: PoseCorrection) -> CorrectionReport:
-        """Apply poses and points that the tracker has revised."""
+    def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
+        """Apply poses and points that the tracker has revised.
+
+        Args:
+            correction: The revised poses and points.
+            more: Whether another correction follows at once, with which the Gaussians then move.
+        """
 
     @abstractmethod
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> object:

@@ -328,13 +328,15 @@ class SceneConfig(StrictModel):
     @property
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
-        return self.mode == "online" and not self.is_live
+        return self.mode == "online" and not self.is_live and not self.is_realtime
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
         if self.snapshot_every and not self.can_be_resumed:
             if self.mode != "online":
                 raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
+            if not self.is_live:
+                raise ValueError("snapshot_every is for `mapping.pace: complete`; remove one of them")
             raise ValueError("snapshot_every: live frames cannot be read again; record them, or remove the key")
         return self
 

@@ -99,8 +99,20 @@ class Mapper:
         self.finished = False
         return report
 
-    def correct(self, correction: PoseCorrection) -> None:
+    def optimise_further(self) -> bool:
+        """Make one optimisation step on the whole map, for time in which no frame waits.
+
+        Returns:
+            Whether there was something to optimise. False for an offline map.
+        """
+        return isinstance(self.pipeline, OnlineMapper) and self.pipeline.optimise_further() is not None
+
+    def correct(self, correction: PoseCorrection, more: bool = False) -> None:
         """Apply poses and points that the tracker has revised, for example after a loop closure.
+
+        Args:
+            correction: The revised poses and points.
+            more: Whether another correction follows at once, with which the Gaussians then move.
 
         Raises:
             InputError: If the correction refers to a frame that has not been added yet.
@@ -110,7 +122,7 @@ class Mapper:
                 f"the tracker corrects frame {correction.index[-1]} after frame {self.frames.index[-1]}, "
                 "before it has come"
             )
-        report = self.pipeline.correct(correction)
+        report = self.pipeline.correct(correction, more)
         self.frames.correct(correction, report.around, report.moved)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> None:
@@ -143,7 +155,7 @@ class Mapper:
         """Call `finish`, then optimise the map on all keyframes equally. More frames may follow.
 
         Args:
-            steps: Number of refinement steps. It replaces `settings.steps`.
+            steps: Number of refinement steps. It replaces `settings.steps` and `settings.seconds`.
             settings: The other settings of the refinement, None for the defaults.
             progress: Callback, see `pipelines.refinement.refine`.
             done: Steps that were done before, see `pipelines.refinement.refine`.
@@ -156,7 +168,7 @@ class Mapper:
             raise ValueError("an offline map is not refined: give its settings more steps")
         self.finish()
         settings = RefineSettings() if settings is None else settings
-        self.pipeline.refine(settings.model_copy(update={"steps": steps}), progress, done, schedule)
+        self.pipeline.refine(settings.model_copy(update={"steps": steps, "seconds": None}), progress, done, schedule)
 
     def restore(self, state: MapState, frames: DeliveredFrames, again: Iterable[TrackedFrame], finished: bool) -> None:
         """Restore the state of another mapper with the same settings.

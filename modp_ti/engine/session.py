@@ -6,7 +6,6 @@ import resource
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.engine.realtime import RealtimeRun
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
@@ -34,7 +34,10 @@ from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import retention
 from modp_ti.outputs.time_left import TimeAfterMapping
+from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport
+from pipelines.refinement import in_seconds
+from pipelines.settings import RefineSettings
 from pipelines.stopwatch import Stopwatch, breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
@@ -90,6 +93,7 @@ class _Session:
         self.line.note(f"device: {self.record.device}")
         # Set once the first frame has arrived.
         self.tracker: Tracker
+        self.realtime: RealtimeRun | None = None
         self.mapper: Mapper
         self.after_mapping: TimeAfterMapping
         self.checkpointer: Checkpointer
@@ -115,6 +119,9 @@ class _Session:
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
+        if self.config.is_realtime:
+            self.realtime = RealtimeRun(self.config.mapping, self.tracker)
+            self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             first = next(arriving, None)
             if first is None:
@@ -126,17 +133,17 @@ class _Session:
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes)
-            self.mapper = build_mapper(self.config, first.camera)
+            self.mapper = build_mapper(self.config, first.camera, self.realtime and self.realtime.pace)
             self.mapper.pipeline.stopwatch.seconds["track"] = prepared
             with self.line.working("compiling kernels (the first time on this machine takes longest)"):
                 self.mapper.pipeline.compile()
-            rest: Iterator[Event] = chain([first], arriving)
-            self._open_keeper(resumed, rest)
+            arriving.put_back(first)
+            self._open_keeper(resumed, arriving)
             self.observer.begin(self.mapper, self.tracker.frame_count)
             self.held.enter_context(self.stop)
             self.clock.begin_mapping()
             try:
-                self._map(rest)
+                self._map(arriving)
             except RunStopped:
                 raise self._stopped() from None
             scoring = self.mapper.pipeline.stopwatch.seconds.get("evaluate", 0.0)
@@ -154,7 +161,7 @@ class _Session:
         elif checkpointer.path.exists():
             self._say(f"{checkpointer.path} is of an earlier run: the first one of this run takes its place")
 
-    def _map(self, arriving: Iterator[Event]) -> None:
+    def _map(self, arriving: FramesAhead[Event]) -> None:
         """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
         mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
         after = self.after_mapping = TimeAfterMapping(self.config, mapper.pipeline)
@@ -167,10 +174,10 @@ class _Session:
         size = None
         self.record.begin()
         try:
-            for frame in _timed(arriving, mapper.pipeline.stopwatch, self.stop):
+            for frame in self._events(arriving):
                 self.checkpointer.digest.add(frame)
                 if isinstance(frame, PoseCorrection):
-                    mapper.correct(frame)
+                    self._correct(frame)
                     continue
                 this = f"{frame.camera.width}x{frame.camera.height}"
                 size = size or this
@@ -178,10 +185,7 @@ class _Session:
                     raise InputError(
                         f"{frame.name} is {this}, the first frame {size}: all images of a scene must have one size"
                     )
-                report = mapper.add(frame)
-                line.frame(report, self.tracker.frame_count)
-                self.record.frame(frame.index, report, self._mapped_psnr(report))
-                self.observer.on_frame(frame, report)
+                self._add(frame)
                 self.checkpointer.after_frame()
             if offline:
                 line.start("optimising", self.config.offline.steps)
@@ -191,6 +195,33 @@ class _Session:
             self.stop.check()
         finally:
             line.stop()
+
+    def _events(self, arriving: FramesAhead[Event]) -> Iterator[Event]:
+        """Yield the frames and corrections as the mapper is to take them."""
+        if self.realtime is None:
+            return _timed(arriving, self.mapper.pipeline.stopwatch, self.stop)
+        return self.realtime.events(arriving, self.mapper, self.stop, self.observer.on_further_step)
+
+    def _add(self, frame: TrackedFrame) -> None:
+        """Map a frame, record it, and show it."""
+        index, frames, realtime = frame.index, self.tracker.frame_count, self.realtime
+        if realtime is None:
+            report = self.mapper.add(frame)
+            self.line.frame(report, frames)
+            self.record.frame(index, report, self._mapped_psnr(report))
+            self.observer.on_frame(frame, report)
+            return
+        report = realtime.add(self.mapper, frame)
+        status = realtime.status()
+        self.line.frame(report, frames, status)
+        self.record.frame(index, report, lag=realtime.lag[-1], waiting=realtime.waiting[-1])
+        self.observer.on_frame(frame, report, status)
+
+    def _correct(self, correction: PoseCorrection) -> None:
+        if self.realtime is None:
+            self.mapper.correct(correction)
+        else:
+            self.realtime.correct(self.mapper, correction)
 
     def _mapped_psnr(self, report: FrameReport | None) -> float | None:
         """Return the PSNR of a keyframe that was just mapped, for `retention`. None for other frames."""
@@ -218,24 +249,30 @@ class _Session:
                 "give a tracker with points or lower mapping.keyframes.min_points"
             )
         versions = {config.mode: checkpointer.online or self.mapper.version()}
-        if config.refine.steps and config.mode != "offline":
+        if config.refine.wanted and config.mode != "offline":
             checkpointer.after_mapping()
             checkpointer.online = versions[config.mode]
-            scores = self.after_mapping.scores(len(self.mapper.frames)) / config.refine.views  # in steps
-            self.line.start("refining", config.refine.steps, checkpointer.refined, lambda step: step * scores)
             try:
-                try:
-                    self.mapper.refine(config.refine.steps, config.refine, self._refined, checkpointer.refined)
-                finally:
-                    self.line.stop()
+                self._refine(config.refine)
             except RunStopped:
                 raise self._stopped() from None
             versions["refined"] = self.mapper.version()
         return versions
 
+    def _refine(self, settings: RefineSettings) -> None:
+        """Refine the map for the settings' steps or time. Raises RunStopped between two steps."""
+        done, steps = self.checkpointer.refined, settings.steps if settings.seconds is None else None
+        scores = self.after_mapping.scores(len(self.mapper.frames)) / settings.views  # in steps
+        self.line.start("refining", steps, done, lambda step: step * scores)
+        schedule = None if settings.seconds is None else in_seconds(settings.seconds)
+        try:
+            self.mapper.refine(settings.steps, settings, self._refined, done, schedule)
+        finally:
+            self.line.stop()
+
     def _refined(self, step: int, psnr: float) -> None:
         """Callback after a step of refinement."""
-        steps = self.config.refine.steps
+        steps = self.config.refine.steps if self.config.refine.seconds is None else None
         self.line.step(step, psnr)
         self.record.steps.append(StepNote(step, psnr))
         self.observer.on_step("refining", step, steps, psnr)
@@ -251,6 +288,8 @@ class _Session:
             with results.writing():
                 with self.line.working("writing the map"):
                     versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
+                if self.realtime is not None:
+                    self.realtime.saved()
                 scores = self._score(versions, results)
                 metrics = None if scores is None else self._write_figures(scores, versions, results)
         except InputError as error:
@@ -311,6 +350,7 @@ class _Session:
             "breakdown_percent": self.breakdown,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
             "retention": retention(self.record.frames, scores),
+            **({} if self.realtime is None else {"live": self.realtime.metrics()}),
             **trajectory_errors(frames.T_tracked, list(versions.values())[-1].trajectory, truth),
         }
         results.write_scores(scores, metrics)
@@ -358,15 +398,20 @@ class _Session:
             self.record.notes.append(note)
 
 
-def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
+def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None = None) -> Mapper:
     """Create the mapper for the scene's mode and for images of this camera.
+
+    Args:
+        config: The scene's settings.
+        camera: The camera.
+        pace: Pace of the online loop, None for all the work of the settings.
 
     Raises:
         InputError: If the settings do not fit the images.
     """
     settings = config.offline if config.mode == "offline" else config.mapping
     try:
-        return Mapper(camera.width, camera.height, settings, config.seed)
+        return Mapper(camera.width, camera.height, settings, config.seed, pace)
     except ValueError as error:
         raise InputError(str(error)) from None
 

@@ -67,6 +67,7 @@ class RealtimePace:
         self.decisions: list[Plan | None] = []
         self.merged = self.skipped = 0
         self._arrived = 0.0
+        self._planned: tuple[Plan, int] | None = None  # plan and level of the current frame's keyframe
         self._interval = 0.5 * settings.max_lag
         self._last_keyframe: float | None = None  # arrival of the last frame that should have become a keyframe
         self._aside = 0.0  # time of other work since then
@@ -83,23 +84,30 @@ class RealtimePace:
             now: The time on the same clock [s].
         """
         self._arrived = arrived
+        self._planned = None
         self.lag = max(0.0, now - arrived)
 
-    def learn(self, kind: str, seconds: float) -> None:
-        """Learn what a unit of work has cost [s].
+    def end_frame(self, seconds: float, depth: float = 0.0, optimise: float = 0.0, steps: int = 0) -> None:
+        """Called after each frame with the times that it took.
 
         Args:
-            kind: `keyframe` (without depth and steps) or `step LEVEL`.
-            seconds: Its time [s].
+            seconds: Time of the whole frame [s].
+            depth: Time of the depth at high-error pixels [s].
+            optimise: Time of the optimisation steps [s].
+            steps: Their number.
         """
-        self.costs.learn(kind, seconds)
-
-    def learn_depth(self, pixels: float, seconds: float) -> None:
-        """Learn what the depth of a share of the pixels has cost [s]."""
-        self.costs.learn("depth", seconds / _share_of_depth(pixels))
+        if self._planned is None:
+            self._aside += seconds
+            return
+        plan, level = self._planned
+        if plan.pixels > 0 and depth > 0:
+            self.costs.learn("depth", depth / _share_of_depth(plan.pixels))
+        if steps:
+            self.costs.learn(f"step {level}", optimise / steps)
+        self.costs.learn("keyframe", seconds - depth - (optimise if steps else 0.0))
 
     def spend_aside(self, seconds: float) -> None:
-        """Count time that a frame without a keyframe or a correction took [s]."""
+        """Count time that something other than frames took, such as a correction [s]."""
         self._aside += seconds
 
     def spend_idle(self, seconds: float) -> None:
@@ -123,6 +131,7 @@ class RealtimePace:
 
     def plan(self, level: int) -> Plan:
         plan = self._plan(self._time(), self._step(level))
+        self._planned = plan, level
         if plan.steps == 0 and self.most_steps > 0:
             self.skipped += 1
             self._saved += self._each()

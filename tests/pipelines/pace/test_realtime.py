@@ -47,37 +47,28 @@ class SimulatedMapper:
                 now += cost
             pace.begin_frame(arrived, now)
             session.waiting.append(int(np.searchsorted(arrivals, now, side="right")) - n)
-            cost = self.hiccups.get(n, 0.0)
-            if n % self.every == 0 and pace.takes_keyframe():
-                level = int(rng.choice(len(LEVELS), p=LEVELS))
-                plan = pace.plan(level)
+            plan = None
+            depth = optimise = 0.0
+            seconds = self.points * rng.uniform(0.7, 1.3)
+            if n % self.every == 0:
+                if pace.takes_keyframe():
+                    level = int(rng.choice(len(LEVELS), p=LEVELS))
+                    plan = pace.plan(level)
+                    seconds, depth, optimise = self.costs_of(plan, level, rng)
                 session.plans.append(plan)
-                cost += self.spent_on(plan, level, pace, rng)
-            else:
-                if n % self.every == 0:
-                    session.plans.append(None)
-                points = self.points * rng.uniform(0.7, 1.3)
-                pace.spend_aside(points)
-                cost += points
-            now += cost
+            seconds += depth + optimise
+            pace.end_frame(seconds, depth, optimise, plan.steps if plan else 0)
+            now += seconds + self.hiccups.get(n, 0.0)
             session.lag.append(now - arrived)
         session.end = now
         return session
 
-    def spent_on(self, plan: Plan, level: int, pace: RealtimePace, rng: np.random.Generator) -> float:
+    def costs_of(self, plan: Plan, level: int, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Times of the keyframe itself, of its depth and of its steps [s]."""
         keyframe, depth, step = (mean * rng.uniform(0.7, 1.3) for mean in (self.keyframe, self.depth, self.step))
-        step *= 0.5**level
-        pace.learn("keyframe", keyframe)
-        cost = keyframe
-        if plan.pixels:
-            # Not the pace's own model of the cost: half of it is fixed here.
-            depth *= 0.5 + 0.5 * plan.pixels
-            pace.learn_depth(plan.pixels, depth)
-            cost += depth
-        if plan.steps:
-            pace.learn(f"step {level}", step)
-            cost += plan.steps * step
-        return cost
+        # Half of the cost of depth is fixed, which is not the pace's own model of it.
+        depth *= 0.5 + 0.5 * plan.pixels if plan.pixels else 0.0
+        return keyframe, depth, plan.steps * step * 0.5**level
 
 
 @dataclass
