@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.engine.conductor import Conductor, Event
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
@@ -22,13 +24,11 @@ from pipelines.settings import MappingSettings
 
 __all__ = ["RealtimeRun"]
 
-Event = TrackedFrame | PoseCorrection
-
 # Time over which the shown rates are taken [s], and number of keyframes over which the shown steps are.
 RECENT, KEYFRAMES = 5.0, 10
 
 
-class RealtimeRun:
+class RealtimeRun(Conductor):
     """Keeps the mapper in step with the arriving frames.
 
     This object reads the clock. It tells the pace when frames arrive and what their work costs, and spends the time in
@@ -40,7 +40,6 @@ class RealtimeRun:
         clock: Returns the time on the clock of `TrackedFrame.arrived` [s].
 
     Attributes:
-        pace: The pace, for the mapper.
         lag: Time from each frame's arrival to the map that holds it [s].
         waiting: Number of frames that waited when each frame's work began.
         steps: Number of optimisation steps of each frame that should have become a keyframe.
@@ -50,7 +49,7 @@ class RealtimeRun:
     def __init__(
         self, settings: MappingSettings, tracker: Tracker, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.pace = RealtimePace(settings)
+        self._pace = RealtimePace(settings)
         self.lag: list[float] = []
         self.waiting: list[int] = []
         self.steps: list[int] = []
@@ -64,8 +63,12 @@ class RealtimeRun:
         self._saved: float | None = None
         self._recent: deque[tuple[float, int, int]] = deque()  # newest arrival, frames arrived, frames tracked
 
+    @property
+    def pace(self) -> RealtimePace:
+        return self._pace
+
     def events(
-        self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, idle: Callable[[], None]
+        self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]
     ) -> Iterator[Event]:
         """Yield frames and corrections as they arrive, and optimise the map further while none waits.
 
@@ -73,7 +76,7 @@ class RealtimeRun:
             ahead: The frames and corrections.
             mapper: The mapper that they are for.
             stop: Ends the iteration after Ctrl-C.
-            idle: Called after each further step.
+            further: Called after each further step.
         """
         self._ahead = ahead
         watch = mapper.pipeline.stopwatch
@@ -83,7 +86,7 @@ class RealtimeRun:
                 stop.check()
                 if not self._step_further(mapper):
                     break  # there is no map yet
-                idle()
+                further()
             with watch.measure("read"), stop.waiting():
                 event = next(ahead, None)
             if event is None:
@@ -106,7 +109,7 @@ class RealtimeRun:
         return True
 
     def add(self, mapper: Mapper, frame: TrackedFrame) -> FrameReport | None:
-        """Map a frame by the pace, and learn what it cost. Returns its report as `Mapper.add` does."""
+        """Map a frame by the pace, and learn what it cost."""
         began = self._clock()
         arrived = began if frame.arrived is None else frame.arrived
         self._first = arrived if self._first is None else self._first
@@ -151,15 +154,17 @@ class RealtimeRun:
         )
 
     def saved(self) -> None:
-        """Note that the map is saved."""
         self._saved = self._clock()
 
-    def metrics(self) -> dict:
+    def note(self) -> dict[str, Any]:
+        return {"lag": self.lag[-1], "waiting": self.waiting[-1]}
+
+    def metrics(self) -> dict[str, Any]:
         """Return the entry `live` of `metrics.json`."""
         counts = self._counts()
         seconds = max(counts.newest - (self._first or 0.0), 1e-9)
         lag = np.array(self.lag)
-        return {
+        live = {
             "arrived": counts.arrived,
             "tracked": counts.tracked,
             "thinned": counts.thinned,
@@ -177,6 +182,7 @@ class RealtimeRun:
             "rate_arrived": round((counts.arrived - 1) / seconds, 2),
             "rate_tracked": round((counts.tracked - 1) / seconds, 2),
         }
+        return {"live": live}
 
     def _waiting(self) -> int:
         live = self._tracker.live

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.conductor import Conductor, Event
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
@@ -36,13 +36,10 @@ from modp_ti.outputs.retention import retention
 from modp_ti.outputs.time_left import TimeAfterMapping
 from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport
-from pipelines.refinement import in_seconds
 from pipelines.settings import RefineSettings
-from pipelines.stopwatch import Stopwatch, breakdown_percent
+from pipelines.stopwatch import breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
-
-Event = TrackedFrame | PoseCorrection
 
 
 def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
@@ -93,7 +90,7 @@ class _Session:
         self.line.note(f"device: {self.record.device}")
         # Set once the first frame has arrived.
         self.tracker: Tracker
-        self.realtime: RealtimeRun | None = None
+        self.conductor: Conductor
         self.mapper: Mapper
         self.after_mapping: TimeAfterMapping
         self.checkpointer: Checkpointer
@@ -119,8 +116,9 @@ class _Session:
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
+        self.conductor = Conductor()
         if self.config.is_realtime:
-            self.realtime = RealtimeRun(self.config.mapping, self.tracker)
+            self.conductor = RealtimeRun(self.config.mapping, self.tracker)
             self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             first = next(arriving, None)
@@ -133,7 +131,7 @@ class _Session:
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes)
-            self.mapper = build_mapper(self.config, first.camera, self.realtime and self.realtime.pace)
+            self.mapper = build_mapper(self.config, first.camera, self.conductor.pace)
             self.mapper.pipeline.stopwatch.seconds["track"] = prepared
             with self.line.working("compiling kernels (the first time on this machine takes longest)"):
                 self.mapper.pipeline.compile()
@@ -151,7 +149,7 @@ class _Session:
         # A live tracker adds notes at its end.
         self._say(*(note for note in self.tracker.notes if note not in notes))
 
-    def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[Event]) -> None:
+    def _open_keeper(self, resumed: Snapshot | None, arriving: FramesAhead[Event]) -> None:
         """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""
         self.checkpointer = checkpointer = Checkpointer(self.config, self.mapper, self.record, self.clock, self._say)
         if resumed is not None:
@@ -174,10 +172,10 @@ class _Session:
         size = None
         self.record.begin()
         try:
-            for frame in self._events(arriving):
+            for frame in self.conductor.events(arriving, mapper, self.stop, self.observer.on_further_step):
                 self.checkpointer.digest.add(frame)
                 if isinstance(frame, PoseCorrection):
-                    self._correct(frame)
+                    self.conductor.correct(mapper, frame)
                     continue
                 this = f"{frame.camera.width}x{frame.camera.height}"
                 size = size or this
@@ -196,37 +194,21 @@ class _Session:
         finally:
             line.stop()
 
-    def _events(self, arriving: FramesAhead[Event]) -> Iterator[Event]:
-        """Yield the frames and corrections as the mapper is to take them."""
-        if self.realtime is None:
-            return _timed(arriving, self.mapper.pipeline.stopwatch, self.stop)
-        return self.realtime.events(arriving, self.mapper, self.stop, self.observer.on_further_step)
-
     def _add(self, frame: TrackedFrame) -> None:
         """Map a frame, record it, and show it."""
-        index, frames, realtime = frame.index, self.tracker.frame_count, self.realtime
-        if realtime is None:
-            report = self.mapper.add(frame)
-            self.line.frame(report, frames)
-            self.record.frame(index, report, self._mapped_psnr(report))
-            self.observer.on_frame(frame, report)
-            return
-        report = realtime.add(self.mapper, frame)
-        status = realtime.status()
-        self.line.frame(report, frames, status)
-        self.record.frame(index, report, lag=realtime.lag[-1], waiting=realtime.waiting[-1])
+        report = self.conductor.add(self.mapper, frame)
+        status = self.conductor.status()
+        self.line.frame(report, self.tracker.frame_count, status)
+        self.record.frame(frame.index, report, self._mapped_psnr(report), **self.conductor.note())
         self.observer.on_frame(frame, report, status)
 
-    def _correct(self, correction: PoseCorrection) -> None:
-        if self.realtime is None:
-            self.mapper.correct(correction)
-        else:
-            self.realtime.correct(self.mapper, correction)
-
     def _mapped_psnr(self, report: FrameReport | None) -> float | None:
-        """Return the PSNR of a keyframe that was just mapped, for `retention`. None for other frames."""
+        """Return the PSNR of a keyframe that was just mapped, for `retention`. None for other frames.
+
+        In a realtime run, there is no time for it.
+        """
         pipeline = self.mapper.pipeline
-        if report is None or not report.is_keyframe or report.psnr is None:
+        if self.conductor.pace is not None or report is None or not report.is_keyframe or report.psnr is None:
             return None
         with pipeline.stopwatch.measure("evaluate"):
             return keyframe_psnr(pipeline, pipeline.keyframes[-1])
@@ -264,7 +246,7 @@ class _Session:
         done, steps = self.checkpointer.refined, settings.steps if settings.seconds is None else None
         scores = self.after_mapping.scores(len(self.mapper.frames)) / settings.views  # in steps
         self.line.start("refining", steps, done, lambda step: step * scores)
-        schedule = None if settings.seconds is None else in_seconds(settings.seconds)
+        schedule = self.conductor.schedule(settings)
         try:
             self.mapper.refine(settings.steps, settings, self._refined, done, schedule)
         finally:
@@ -288,8 +270,7 @@ class _Session:
             with results.writing():
                 with self.line.working("writing the map"):
                     versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
-                if self.realtime is not None:
-                    self.realtime.saved()
+                self.conductor.saved()
                 scores = self._score(versions, results)
                 metrics = None if scores is None else self._write_figures(scores, versions, results)
         except InputError as error:
@@ -350,7 +331,7 @@ class _Session:
             "breakdown_percent": self.breakdown,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
             "retention": retention(self.record.frames, scores),
-            **({} if self.realtime is None else {"live": self.realtime.metrics()}),
+            **self.conductor.metrics(),
             **trajectory_errors(frames.T_tracked, list(versions.values())[-1].trajectory, truth),
         }
         results.write_scores(scores, metrics)
@@ -414,13 +395,3 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None =
         return Mapper(camera.width, camera.height, settings, config.seed, pace)
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def _timed(frames: Iterator[Event], watch: Stopwatch, stop: Interruption) -> Iterator[Event]:
-    """Yield the frames and corrections, counting the time that the mapper waits for each of them as `read`."""
-    while True:
-        with watch.measure("read"), stop.waiting():
-            frame = next(frames, None)
-        if frame is None:
-            return
-        yield frame

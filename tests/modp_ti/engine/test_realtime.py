@@ -88,7 +88,7 @@ def test_lag_and_rates_are_those_of_the_frames_times() -> None:
     realtime = RealtimeRun(SETTINGS, tracker, clock)
     clock.tick = 0.01
     mapped(realtime, tracker)
-    live = realtime.metrics()
+    live = realtime.metrics()["live"]
     assert {name: live[name] for name in ("arrived", "tracked", "thinned", "lost")} == {
         "arrived": 50,
         "tracked": 41,
@@ -102,7 +102,7 @@ def test_lag_and_rates_are_those_of_the_frames_times() -> None:
     assert live["seconds_to_map"] is None
     clock.now = 110.0
     realtime.saved()
-    assert realtime.metrics()["seconds_to_map"] == pytest.approx(5.6, abs=0.02)
+    assert realtime.metrics()["live"]["seconds_to_map"] == pytest.approx(5.6, abs=0.02)
     status = realtime.status()
     assert status.lag == realtime.lag[-1] and status.waiting == 3
 
