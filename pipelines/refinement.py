@@ -74,12 +74,12 @@ def refine(
         return
     if schedule is None:
         schedule = in_steps(settings.steps) if settings.seconds is None else in_seconds(settings.seconds)
-    if not done and settings.min_contribution > 0 and schedule(0) is not None:
+    step, share = done, schedule(done)
+    if not done and settings.min_contribution > 0 and share is not None:
         with mapper.stopwatch.measure("refine"):
             shown = mapper.contribution.measure(store, mapper.near)
             mapper.gaussians.remove(shown >= settings.min_contribution)
-    step = done
-    while (share := schedule(step)) is not None:
+    while share is not None:
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0)
             batch = [int(j) for j in mapper.rng.choice(len(store), settings.views, p=p)]
@@ -94,6 +94,7 @@ def refine(
         step += 1
         if progress is not None:
             progress(step, psnr)
+        share = schedule(step)
     with mapper.stopwatch.measure("refine"):
         mapper.optimiser.settle()
     mapper.prune()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
@@ -69,6 +71,14 @@ class Conductor:
 
     def saved(self) -> None:
         """Called when the map has been written."""
+
+    def write_session(self, folder: Path, config: SceneConfig) -> None:
+        """Write what is needed to repeat a run that followed a clock. Raises OSError if that fails.
+
+        Args:
+            folder: The output folder.
+            config: The run's settings.
+        """
 
     def metrics(self) -> dict[str, Any]:
         """Return the entries of `metrics.json` about a realtime run."""

@@ -5,22 +5,26 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.conductor import Conductor, Event
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.engine.recording import FILE, SessionRecorder
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.outputs.live_status import LiveStatus
 from pipelines.pace import RealtimePace
 from pipelines.pipeline import FrameReport
-from pipelines.settings import MappingSettings
+from pipelines.refinement import Schedule
+from pipelines.settings import MappingSettings, RefineSettings
 
 __all__ = ["RealtimeRun"]
 
@@ -37,6 +41,7 @@ class RealtimeRun(Conductor):
     Args:
         settings: Settings of the mapping.
         tracker: The tracker, whose counts are shown and reported.
+        recorder: Records the session, None for no recording.
         clock: Returns the time on the clock of `TrackedFrame.arrived` [s].
 
     Attributes:
@@ -47,7 +52,11 @@ class RealtimeRun(Conductor):
     """
 
     def __init__(
-        self, settings: MappingSettings, tracker: Tracker, clock: Callable[[], float] = time.monotonic
+        self,
+        settings: MappingSettings,
+        tracker: Tracker,
+        recorder: SessionRecorder | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._pace = RealtimePace(settings)
         self.lag: list[float] = []
@@ -55,6 +64,7 @@ class RealtimeRun(Conductor):
         self.steps: list[int] = []
         self.further = 0
         self._tracker = tracker
+        self._recorder = recorder
         self._clock = clock
         self._ahead: FramesAhead[Event]
         self._done: float | None = None  # end of the previous event's work
@@ -105,11 +115,15 @@ class RealtimeRun(Conductor):
         if not mapper.optimise_further():
             return False
         self.further += 1
+        if self._recorder is not None:
+            self._recorder.add_further_step()
         self.pace.spend_idle(self._clock() - began)
         return True
 
     def add(self, mapper: Mapper, frame: TrackedFrame) -> FrameReport | None:
         """Map a frame by the pace, and learn what it cost."""
+        if self._recorder is not None:
+            self._recorder.add_frame(frame)
         began = self._clock()
         arrived = began if frame.arrived is None else frame.arrived
         self._first = arrived if self._first is None else self._first
@@ -131,9 +145,23 @@ class RealtimeRun(Conductor):
 
     def correct(self, mapper: Mapper, correction: PoseCorrection) -> None:
         """Apply a correction, and count its time. If another one waits behind it, the Gaussians move with that one."""
-        mapper.correct(correction, more=isinstance(self._ahead.peek(), PoseCorrection))
+        more = isinstance(self._ahead.peek(), PoseCorrection)
+        if self._recorder is not None:
+            self._recorder.add_correction(correction, more)
+        mapper.correct(correction, more)
         self._count_aside()
         self._done = self._clock()
+
+    def schedule(self, settings: RefineSettings) -> Schedule | None:
+        schedule = super().schedule(settings)
+        return schedule if schedule is None or self._recorder is None else self._recorder.recorded(schedule)
+
+    def write_session(self, folder: Path, config: SceneConfig) -> None:
+        """Write the recorded session to a folder, if it was recorded. Raises OSError if that fails."""
+        if self._recorder is not None:
+            costs = {kind: round(seconds, 5) for kind, seconds in self.pace.costs.known().items()}
+            about = {"settings": config.model_dump(mode="json"), "lag": self.lag, "costs": costs}
+            self._recorder.write(folder / FILE, self.pace.decisions, about)
 
     def status(self) -> LiveStatus:
         """Return the recent figures."""

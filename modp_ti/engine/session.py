@@ -22,6 +22,7 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.realtime import RealtimeRun
+from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
@@ -42,7 +43,12 @@ from pipelines.stopwatch import breakdown_percent
 __all__ = ["build_mapper", "run_scene"]
 
 
-def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
+def run_scene(
+    config: SceneConfig,
+    console: Console | None = None,
+    resumed: Snapshot | None = None,
+    replayed: RecordedSession | None = None,
+) -> Path:
     """Map a scene and write its output folder.
 
     All files except snapshots are written after the map is finished, and appear together.
@@ -51,6 +57,7 @@ def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snap
         config: The scene's settings.
         console: Receives progress and notes, None for no output.
         resumed: Snapshot to continue from, None to start from the first frame.
+        replayed: Recorded session to repeat instead of opening the tracker, None for none.
 
     Returns:
         The output folder.
@@ -67,14 +74,17 @@ def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snap
             print((output / "metrics.json").read_text())
     """
     with ExitStack() as held:
-        return _Session(config, console or Console(quiet=True), held).run(resumed)
+        return _Session(config, console or Console(quiet=True), held, replayed).run(resumed)
 
 
 class _Session:
     """A run in progress, with the state that its stages share. `held` closes the run's resources when it ends."""
 
-    def __init__(self, config: SceneConfig, console: Console, held: ExitStack) -> None:
+    def __init__(
+        self, config: SceneConfig, console: Console, held: ExitStack, replayed: RecordedSession | None
+    ) -> None:
         self.config = config
+        self.replayed = replayed
         self.held = held
         self.clock = RunClock()
         self.record = RunRecord()
@@ -112,14 +122,11 @@ class _Session:
     def _map_the_stream(self, resumed: Snapshot | None) -> None:
         """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
-        self.tracker = open_tracker(self.config, self.line.prepare)
+        self.tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
-        self.conductor = Conductor()
-        if self.config.is_realtime:
-            self.conductor = RealtimeRun(self.config.mapping, self.tracker)
-            self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
+        self.conductor = self._open_conductor()
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             first = next(arriving, None)
             if first is None:
@@ -148,6 +155,17 @@ class _Session:
             self.clock.end_mapping(self.observer.waited + scoring)
         # A live tracker adds notes at its end.
         self._say(*(note for note in self.tracker.notes if note not in notes))
+
+    def _open_conductor(self) -> Conductor:
+        if self.replayed is not None:
+            return ReplayedRun(self.replayed)
+        if not self.config.is_realtime:
+            return Conductor()
+        self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
+        recorder = SessionRecorder() if self.config.export.session else None
+        if recorder is not None:
+            self.held.callback(recorder.close)
+        return RealtimeRun(self.config.mapping, self.tracker, recorder)
 
     def _open_keeper(self, resumed: Snapshot | None, arriving: FramesAhead[Event]) -> None:
         """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""
@@ -270,6 +288,7 @@ class _Session:
             with results.writing():
                 with self.line.working("writing the map"):
                     versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
+                    self.conductor.write_session(results.folder, self.config)
                 self.conductor.saved()
                 scores = self._score(versions, results)
                 metrics = None if scores is None else self._write_figures(scores, versions, results)

@@ -85,7 +85,7 @@ def test_lag_and_rates_are_those_of_the_frames_times() -> None:
     clock = Clock()
     frames = [replace(frame(i), arrived=99.5 + 0.1 * i) for i in range(4)]
     tracker = WallTracker(list(frames), LiveCounts(50, 41, 7, 2, 3, newest=104.4))
-    realtime = RealtimeRun(SETTINGS, tracker, clock)
+    realtime = RealtimeRun(SETTINGS, tracker, clock=clock)
     clock.tick = 0.01
     mapped(realtime, tracker)
     live = realtime.metrics()["live"]
@@ -110,7 +110,7 @@ def test_lag_and_rates_are_those_of_the_frames_times() -> None:
 def test_late_frames_get_no_steps_but_their_points() -> None:
     def late(seconds: float) -> tuple[RealtimeRun, Mapper]:
         tracker = WallTracker([replace(frame(i), arrived=100.0 - seconds) for i in range(5)])
-        realtime = RealtimeRun(SETTINGS, tracker, Clock())
+        realtime = RealtimeRun(SETTINGS, tracker, clock=Clock())
         return realtime, mapped(realtime, tracker)
 
     in_time, mapper = late(0.0)
@@ -160,7 +160,7 @@ def test_corrections_behind_each_other_move_the_map_once() -> None:
         return PoseCorrection(np.arange(3), T)
 
     tracker = WallTracker([*frames, shifted(0.5), shifted(1.0)])
-    realtime = RealtimeRun(SETTINGS, tracker, Clock())
+    realtime = RealtimeRun(SETTINGS, tracker, clock=Clock())
     mapper = new_mapper(realtime)
     with FramesAhead(tracker.events(), 8) as ahead:
         assert ahead._thread is not None
