@@ -128,6 +128,9 @@ class _Session:
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
         self.conductor = self._open_conductor()
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
+            undistorter = self.tracker.undistorter if self.config.is_realtime else None
+            if undistorter is not None:  # the kernels are compiled while the first frames are tracked
+                self._make_mapper(undistorter.camera)
             first = next(arriving, None)
             if first is None:
                 raise InputError("the tracker delivered no frame: nothing to map")
@@ -138,10 +141,10 @@ class _Session:
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes)
-            self.mapper = build_mapper(self.config, first.camera, self.conductor.pace)
-            self.mapper.pipeline.stopwatch.seconds["track"] = prepared
-            with self.line.working("compiling kernels (the first time on this machine takes longest)"):
-                self.mapper.pipeline.compile()
+            if undistorter is None:
+                self._make_mapper(first.camera)
+            seconds = self.mapper.pipeline.stopwatch.seconds
+            seconds["track"] = prepared - (0.0 if undistorter is None else seconds["compile"])
             arriving.put_back(first)
             self._open_keeper(resumed, arriving)
             self.observer.begin(self.mapper, self.tracker.frame_count)
@@ -155,6 +158,11 @@ class _Session:
             self.clock.end_mapping(self.observer.waited + scoring)
         # A live tracker adds notes at its end.
         self._say(*(note for note in self.tracker.notes if note not in notes))
+
+    def _make_mapper(self, camera: PinholeCamera) -> None:
+        self.mapper = build_mapper(self.config, camera, self.conductor.pace)
+        with self.line.working("compiling kernels (the first time on this machine takes longest)"):
+            self.mapper.pipeline.compile()
 
     def _open_conductor(self) -> Conductor:
         if self.replayed is not None:

@@ -20,7 +20,7 @@ from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import PosedImage, Unreadable, readable_sizes, tracked_frame
-from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, Undistorter, open_source, require_intrinsics
 from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 __all__ = ["KltTracker", "open_klt"]
@@ -195,6 +195,10 @@ class KltTracker(Tracker):
     @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
         return self._unreadable
+
+    @property
+    def undistorter(self) -> Undistorter:
+        return self._delivered
 
     def close(self) -> None:
         self._reader.images.close()
