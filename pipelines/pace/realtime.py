@@ -16,8 +16,8 @@ GAIN = 0.5
 LEAST_STEPS = 2
 # Smallest share of the pixels that is worth the fixed costs of their depth.
 LEAST_PIXELS = 0.2
-# Share of the cost of depth that does not depend on the number of pixels.
-FIXED_DEPTH = 0.35
+# Share of the cost of depth that does not depend on the number of pixels: 0.39 at 320x240, more on coarser levels.
+FIXED_DEPTH = 0.4
 # Assumed costs before the first measurement [s].
 KEYFRAME, DEPTH, STEP = 0.03, 0.2, 0.1
 # Share of the time that keyframes without work may take beyond `max_lag`; the rest reduces the lag. Some are kept,
@@ -101,7 +101,7 @@ class RealtimePace:
             return
         plan, level = self._planned
         if plan.pixels > 0 and depth > 0:
-            self.costs.learn("depth", depth / _share_of_depth(plan.pixels))
+            self.costs.learn(f"depth {level}", depth / _share_of_depth(plan.pixels))
         if steps:
             self.costs.learn(f"step {level}", optimise / steps)
         self.costs.learn("keyframe", seconds - depth - (optimise if steps else 0.0))
@@ -130,7 +130,7 @@ class RealtimePace:
         return taken
 
     def plan(self, level: int) -> Plan:
-        plan = self._plan(self._time(), self._step(level))
+        plan = self._plan(self._time(), self._cost("depth", level, DEPTH), self._cost("step", level, STEP))
         self._planned = plan, level
         if plan.steps == 0 and self.most_steps > 0:
             self.skipped += 1
@@ -161,16 +161,15 @@ class RealtimePace:
         time = self._each() + self._saved + GAIN * (GOAL * self.max_lag - self.lag)
         return min(time, self.max_lag - self.lag) - self.costs.of("keyframe", KEYFRAME)
 
-    def _step(self, level: int) -> float:
-        """Return the expected cost of a step on this level [s]. Coarser levels cost no more than finer ones."""
-        finer = [self.costs.of(f"step {finer}", float("inf")) for finer in range(level + 1)]
-        return min(finer) if min(finer) < float("inf") else STEP
+    def _cost(self, kind: str, level: int, unknown: float) -> float:
+        """Return the expected cost of work on this level [s]. Coarser levels cost no more than finer ones."""
+        known = [self.costs.of(f"{kind} {finer}", float("inf")) for finer in range(level + 1)]
+        return min(known) if min(known) < float("inf") else unknown
 
-    def _plan(self, time: float, step: float) -> Plan:
+    def _plan(self, time: float, depth: float, step: float) -> Plan:
         least = min(LEAST_STEPS, self.most_steps)
         if time < least * step or time <= 0.0:
             return Plan(0.0, 0)
-        depth = self.costs.of("depth", DEPTH)
         pixels = _pixels_for((time - least * step) / depth)
         time -= depth * _share_of_depth(pixels) if pixels else 0.0
         return Plan(pixels, int(min(max(time / step, least), self.most_steps)))
