@@ -21,7 +21,7 @@ EXAMPLES = examples(
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
-    "modp-ti run --replay OUT   (repeat a realtime run that was recorded with export.session)",
+    "modp-ti run --replay OUT   (repeat a recorded realtime run)",
     "modp-ti run scene.yaml --quiet --json > result.json",
 )
 
