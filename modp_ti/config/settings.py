@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -161,6 +162,11 @@ class SourceSettings(StrictModel):
         "trajectory errors (`ate_rmse`) in `metrics.json` and the report; empty for none",
     )
 
+    @property
+    def follows_clock(self) -> bool:
+        """Whether the images arrive by the clock instead of when they are asked for."""
+        return self.realtime or self.stream is not None
+
     def scale_for(self, width: int, height: int) -> float:
         """Return the scale of images of this size: `scale` if it is a number, otherwise what `auto` chooses.
 
@@ -195,6 +201,8 @@ class SourceSettings(StrictModel):
             raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; remove one of them")
         if self.stream is not None and self.path is not None:
             raise ValueError("source.path and source.stream cannot both be set; remove one of them")
+        if self.stream is not None and self.realtime:
+            raise ValueError("source.realtime is for source.path, a stream always sets the pace; remove it")
         return self
 
     @model_validator(mode="after")
@@ -304,7 +312,12 @@ class SceneConfig(StrictModel):
         description="number of frames between snapshots of the run in `snapshot.npz`, for `modp-ti run --resume` after "
         "a crash; empty or 0: none. Ctrl-C always writes a snapshot",
     )
-    threads: int | None = Field(default=None, ge=1, description="number of CPU threads; empty: one per core")
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        description="number of CPU threads; empty: one per core, and one less where `klt` follows a clock beside the "
+        "mapper",
+    )
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
@@ -331,12 +344,35 @@ class SceneConfig(StrictModel):
         return self.source.realtime or self.is_live
 
     @property
+    def tracks_beside_mapping(self) -> bool:
+        """Whether the tracker runs in a process of its own."""
+        return self.is_realtime and self.source.follows_clock and self.tracker.kind == "klt"
+
+    @property
+    def mapper_threads(self) -> int | None:
+        """Number of CPU threads of the mapper; None for one per core. A tracker beside it gets one core."""
+        if self.threads is not None or not self.tracks_beside_mapping:
+            return self.threads
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores - 1)
+
+    @property
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
-        return self.mode == "online" and not self.is_live and not self.is_realtime
+        return self.mode == "online" and not (self.is_live or self.is_realtime or self.source.realtime)
+
+    def without_clock(self) -> SceneConfig:
+        """Return these settings for all images of a file or folder, however long their processing takes."""
+        mapping = self.mapping.model_copy(update={"pace": "complete"})
+        source = self.source.model_copy(update={"realtime": False})
+        return self.model_copy(update={"source": source, "mapping": mapping})
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
+        if self.snapshot_every and self.source.realtime:
+            raise ValueError(
+                "snapshot_every: a run at the pace of source.realtime cannot be resumed; remove one of them"
+            )
         if self.snapshot_every and not self.can_be_resumed:
             if self.mode != "online":
                 raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
@@ -352,6 +388,11 @@ class SceneConfig(StrictModel):
             raise ValueError(NO_PATH)
         if source.intrinsics.given and tracker.brings_cameras:
             raise ValueError(f"tracker.kind: {tracker.kind} provides the cameras; remove source.intrinsics")
+        if source.realtime and not tracker.follows_streams:
+            raise ValueError(
+                f"tracker.kind: {tracker.kind} does not follow the images as they arrive; remove source.realtime, or "
+                "take tracker.kind: klt"
+            )
         if source.stream is not None and not tracker.follows_streams:
             raise ValueError(
                 f"tracker.kind: {tracker.kind} cannot use source.stream, it needs recorded images; set source.path"

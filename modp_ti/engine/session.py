@@ -93,7 +93,7 @@ class _Session:
         self.observer = self._open_observer()  # opened first, as what follows may take minutes
         self.stop = Interruption(lambda: self.line.note("stopping after this step; Ctrl-C again stops at once"))
         try:
-            self.backend = initialise(config.device, config.threads, config.seed)
+            self.backend = initialise(config.device, config.mapper_threads, config.seed)
         except RuntimeError as error:
             raise InputError(str(error)) from None
         self.record.device = describe(self.backend)
