@@ -348,6 +348,11 @@ class RefineSettings(StrictModel):
         description="pixels covered where it shows most, below which a Gaussian is removed beforehand; 0 for none",
     )
 
+    @property
+    def wanted(self) -> bool:
+        """Whether the finished map is refined at all."""
+        return self.steps > 0 or self.seconds is not None
+
 
 class OfflineSettings(StrictModel):
     """Offline 3DGS [Kerbl 2023], the baseline: optimisation on all frames, starting from the tracked points.

@@ -21,6 +21,7 @@ EXAMPLES = examples(
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
+    "modp-ti run --replay OUT   (repeat a recorded realtime run)",
     "modp-ti run scene.yaml --quiet --json > result.json",
 )
 
@@ -36,6 +37,12 @@ def run(
             "--resume", metavar="OUT", help="go on with the run whose output folder this is, from its snapshot"
         ),
     ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            "--replay", metavar="OUT", help="repeat the realtime run whose output folder this is, from its session.zip"
+        ),
+    ] = None,
     fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
     best: Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")] = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
@@ -44,11 +51,14 @@ def run(
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
     """Map a posed sequence while its frames arrive, and write splats, poses, metrics, pictures and a report."""
-    if scene is None and resume is None:
+    if scene is None and resume is None and replay is None:
         raise typer.BadParameter("name a scene file, or the output folder of a run to go on with (--resume OUT)")
+    if replay is not None and (scene is not None or resume is not None):
+        raise typer.BadParameter("--replay OUT repeats a whole run: give neither a scene file nor --resume")
     with outcome(as_json) as result:
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
-        folder = _run(scene, resume, overrides, _preset(scene, fast, best), quiet)
+        preset = _preset(scene, fast, best)
+        folder = _run(scene, resume, overrides, preset, quiet) if replay is None else _replay(replay, overrides, quiet)
         result.text = f"written to {folder}"
         if as_json:
             metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
@@ -83,3 +93,15 @@ def _run(scene: Path | None, resume: Path | None, overrides: list[str], preset: 
     from modp_ti.engine.session import run_scene
 
     return run_scene(config, progress_console(quiet), snapshot)
+
+
+def _replay(recorded: Path, overrides: list[str], quiet: bool) -> Path:
+    """Repeat a recorded session. Its output goes to a folder beside that of the recorded run, unless it is set."""
+    from modp_ti.config.scene_file import scene_from_data
+    from modp_ti.engine.recording import RecordedSession
+    from modp_ti.engine.session import run_scene
+
+    session = RecordedSession(recorded)
+    beside = recorded.resolve().with_name(f"{recorded.resolve().name}-replayed")
+    settings = {**session.settings, "output": str(beside)}
+    return run_scene(scene_from_data(settings, str(recorded), overrides), progress_console(quiet), replayed=session)

@@ -230,6 +230,11 @@ class ExportSettings(StrictModel):
         description="write the undistorted images to `colmap/images`. The cameras in `colmap/` belong to these images, "
         "so other programs need them",
     )
+    session: bool = Field(
+        default=False,
+        description="write `session.zip`, all that arrived in a realtime run and what was decided by the clock, with "
+        "which `modp-ti run --replay OUT` repeats it exactly",
+    )
     report: bool = Field(
         default=True, description="write `report.html`, a page with the metrics, plots, images and settings of the run"
     )
