@@ -115,10 +115,6 @@ class TrackingProcess(Tracker):
         return self._unreadable
 
     @property
-    def undistorter(self) -> Undistorter:
-        return self._intrinsics.undistorter(self._scale)
-
-    @property
     def live(self) -> LiveCounts | None:
         return self._board.counts(len(self._log)) if self._config.source.follows_clock else None
 
