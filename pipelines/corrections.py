@@ -99,9 +99,14 @@ class MapCorrector:
         self.motion = GaussianMotion(densifier.gaussians)
 
     def correct(
-        self, correction: PoseCorrection, settings: CorrectionSettings
+        self, correction: PoseCorrection, settings: CorrectionSettings, more: bool = False
     ) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64]]:
         """Apply poses and points that the tracker has revised. Call it between two steps.
+
+        Args:
+            correction: The revised poses and points.
+            settings: When Gaussians follow.
+            more: Whether another correction follows at once, with which the Gaussians then move.
 
         Returns:
             Motion of the world as `revise` returns it, and the keyframes (N,) whose Gaussians moved, as places in the
@@ -109,7 +114,7 @@ class MapCorrector:
         """
         around = revise(self.keyframes, correction)
         pending = np.array([pending_motion_in_pixels(view) for view in self.keyframes])
-        if not (settings.enabled and (pending > settings.min_pixels).any()):
+        if more or not (settings.enabled and (pending > settings.min_pixels).any()):
             return around, np.zeros(0, dtype=np.int64)
         self._move_gaussians()
         return around, np.flatnonzero(pending > 0)

@@ -158,7 +158,7 @@ class OfflineMapper(Pipeline):
         self.keyframes.append(frame)
         return FrameReport(frame.index, True, len(self.keyframes), 0, None)
 
-    def correct(self, correction: PoseCorrection) -> CorrectionReport:
+    def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
         """Apply revised poses and points to the stored frames. The map is built later, so no Gaussians move."""
         return CorrectionReport(revise(self.keyframes, correction), moved=False)
 

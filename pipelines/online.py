@@ -14,7 +14,7 @@ from pipelines import online_state
 from pipelines.corrections import CorrectionReport
 from pipelines.online_map import OnlineMap
 from pipelines.pipeline import FrameReport
-from pipelines.refinement import refine
+from pipelines.refinement import Schedule, refine
 from pipelines.select.views import global_probabilities
 from pipelines.settings import RefineSettings
 from pipelines.state import MapState
@@ -33,6 +33,7 @@ class OnlineMapper(OnlineMap):
         seed: Seed of the random generator.
         depth: Depth estimator; None builds the one that `settings.depth` names.
         views: View selection; None for `LocalGlobalViews`.
+        pace: How much work a frame gets; None for all of the settings.
 
     Example:
         mapper = modp_ti.OnlineMapper(modp_ti.MappingSettings(), max_width=640, max_height=480, seed=0)
@@ -59,35 +60,37 @@ class OnlineMapper(OnlineMap):
             last = self.keyframes[-1] if len(self.keyframes) else None
             if self.gate.refuses(frame, last, self.renderer, self.near):
                 return FrameReport(frame.index, False, len(self.keyframes), len(self.gaussians), None)
-            is_wanted = self.selector.is_keyframe(frame, last)
+            is_wanted = self.selector.is_keyframe(frame, last) and self.pace.takes_keyframe()
             is_keyframe = is_wanted and self.budget.takes_keyframe(frame)
-        psnr = None
+        psnr, steps = None, 0
         if is_keyframe:
-            psnr = self._add_keyframe(frame)
+            psnr, steps = self._add_keyframe(frame)
         elif len(self.keyframes):
             # Other frames only add their tracked points, at a pose corrected by the neighbouring keyframes.
             self.densifier.add_tracked_points(self.keyframes.view(frame))
             if is_wanted:
                 # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them,
                 # every frame is selected as a keyframe; each therefore gets only 1 / max_gap of the steps.
-                steps = -(-self.settings.optimise.steps // self.settings.keyframes.max_gap)
+                steps = -(-self.pace.plan(level=0).steps // self.settings.keyframes.max_gap)
                 count = 1 + self.settings.views.local_views + self.settings.views.global_views
                 psnr = self._optimise_evenly(np.arange(len(self.keyframes)), steps, count)
-        return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr)
+        return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr, steps)
 
-    def _add_keyframe(self, frame: TrackedFrame) -> float | None:
-        """Add a keyframe, add Gaussians from it, and optimise. Returns the mean PSNR of the last step."""
+    def _add_keyframe(self, frame: TrackedFrame) -> tuple[float | None, int]:
+        """Add a keyframe, add Gaussians from it, and optimise. Returns the last step's mean PSNR, and the steps."""
         view = self.keyframes.append(frame)
         if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
             self.optimiser.poses.align(view)
         with self.stopwatch.measure("optimise"):
             self.optimiser.exposure.begin(self.keyframes, self.renderer, self.near)
         level = self._draw_level(view)
+        plan = self.pace.plan(level)
         image = view.at_level(level)
         self.densifier.add_tracked_points(image)
-        if self.settings.densify.error_compensation:
-            self.densifier.add_error_pixels(image, warming_up=self.frame_count <= self.settings.densify.warm_up)
-        return self.optimise(self.settings.optimise.steps, level)
+        if self.settings.densify.error_compensation and plan.pixels > 0:
+            warming_up = self.frame_count <= self.settings.densify.warm_up
+            self.densifier.add_error_pixels(image, warming_up, plan.pixels)
+        return self.optimise(plan.steps, level), plan.steps
 
     def _draw_level(self, view: Keyframe) -> int:
         """Draw the pyramid level of a new keyframe from the levels that its image has."""
@@ -138,17 +141,27 @@ class OnlineMapper(OnlineMap):
                 self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
             return self.optimiser.settle() if steps > 0 else None
 
-    def correct(self, correction: PoseCorrection) -> CorrectionReport:
+    def optimise_further(self) -> float | None:
+        """Make one step on views of the whole map, for time in which no frame waits.
+
+        Returns:
+            Mean PSNR of its views; None if there is nothing to optimise yet.
+        """
+        if len(self.keyframes) == 0:
+            return None
+        return self._optimise_evenly(np.arange(len(self.keyframes)), 1, self.settings.views.global_views)
+
+    def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
         """Apply poses and points that the tracker has revised, see `MapCorrector`.
 
-        If Gaussians move, `corrections.steps` optimisation steps on the keyframes that moved remove the seams.
+        If Gaussians move, optimisation steps on the keyframes that moved remove the seams.
         """
         settings = self.settings.corrections
         with self.stopwatch.measure("correct"):
             self.optimiser.settle()
-            around, moved = self.corrector.correct(correction, settings)
+            around, moved = self.corrector.correct(correction, settings, more)
         if len(moved):
-            self._optimise_evenly(moved, settings.steps, settings.views)
+            self._optimise_evenly(moved, self.pace.steps_after_correction(), settings.views)
         return CorrectionReport(around, moved=len(moved) > 0)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
@@ -165,9 +178,13 @@ class OnlineMapper(OnlineMap):
         return psnr
 
     def refine(
-        self, settings: RefineSettings, progress: Callable[[int, float], None] | None = None, done: int = 0
+        self,
+        settings: RefineSettings,
+        progress: Callable[[int, float], None] | None = None,
+        done: int = 0,
+        schedule: Schedule | None = None,
     ) -> None:
-        refine(self, settings, progress, done)
+        refine(self, settings, progress, done, schedule)
 
     def state(self) -> MapState:
         return online_state.state_of(self)

@@ -16,6 +16,7 @@ from pipelines.densify.densifier import Densifier
 from pipelines.densify.depth import DepthEstimator, build_depth
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.optimise.safeguards import Safeguards
+from pipelines.pace import CompletePace, Pace
 from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import Renderer
 from pipelines.select.frame_gate import FrameGate
@@ -37,6 +38,7 @@ class OnlineMap(Pipeline):
         seed: Seed of the random generator.
         depth: Depth estimator; None builds the one that `settings.depth` names.
         views: View selection; None for `LocalGlobalViews`.
+        pace: How much work a frame gets; None for all of the settings.
 
     Attributes:
         frame_count: Number of frames processed so far.
@@ -52,6 +54,7 @@ class OnlineMap(Pipeline):
         seed: int = 0,
         depth: DepthEstimator | None = None,
         views: ViewSelection | None = None,
+        pace: Pace | None = None,
     ) -> None:
         self.settings = settings
         self.rng = np.random.default_rng(seed)
@@ -68,6 +71,7 @@ class OnlineMap(Pipeline):
         depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
         self.budget = self.densifier.budget
+        self.pace = pace or CompletePace(settings)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self.corrector = MapCorrector(self.keyframes, self.densifier)
         self.frame_count = 0

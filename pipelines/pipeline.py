@@ -37,6 +37,7 @@ class FrameReport:
         keyframes: Number of keyframes.
         gaussians: Number of Gaussians.
         psnr: Mean PSNR of the last step's views [dB]; None if nothing was optimised.
+        steps: Number of optimisation steps that it got.
     """
 
     index: int
@@ -44,6 +45,7 @@ class FrameReport:
     keyframes: int
     gaussians: int
     psnr: float | None
+    steps: int = 0
 
 
 class Pipeline(ABC):
@@ -81,8 +83,13 @@ class Pipeline(ABC):
         """
 
     @abstractmethod
-    def correct(self, correction: PoseCorrection) -> CorrectionReport:
-        """Apply poses and points that the tracker has revised."""
+    def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
+        """Apply poses and points that the tracker has revised.
+
+        Args:
+            correction: The revised poses and points.
+            more: Whether another correction follows at once, with which the Gaussians then move.
+        """
 
     @abstractmethod
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> object:
@@ -112,7 +119,11 @@ class Pipeline(ABC):
         """Set the bytes that are kept outside the map and count towards its memory budget."""
 
     def refine(
-        self, settings: RefineSettings, progress: Callable[[int, float], None] | None = None, done: int = 0
+        self,
+        settings: RefineSettings,
+        progress: Callable[[int, float], None] | None = None,
+        done: int = 0,
+        schedule: Callable[[int], float | None] | None = None,
     ) -> None:
         """Optimise the finished map on all keyframes, see `pipelines.refinement.refine`.
 

@@ -2,13 +2,41 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from pipelines.online_map import OnlineMap
 from pipelines.select.views import global_probabilities
 from pipelines.settings import RefineSettings
 
-__all__ = ["decay", "refine"]
+__all__ = ["Schedule", "decay", "in_seconds", "in_steps", "refine"]
+
+Schedule = Callable[[int], float | None]
+"""Schedule of a refinement: returns the share of it that has passed before a step, None after the last step."""
+
+
+def in_steps(steps: int) -> Schedule:
+    """Return the schedule of a refinement of so many steps. The first has the share 0, the last 1."""
+    return lambda step: step / max(steps - 1, 1) if step < steps else None
+
+
+def in_seconds(seconds: float, clock: Callable[[], float] = time.perf_counter) -> Schedule:
+    """Return the schedule of a refinement that takes so much time, from its first step on.
+
+    Args:
+        seconds: The time [s].
+        clock: Returns the time on any clock [s].
+    """
+    began: list[float] = []
+
+    def share(_: int) -> float | None:
+        now = clock()
+        if not began:
+            began.append(now)
+        passed = (now - began[0]) / seconds
+        return passed if passed < 1.0 else None
+
+    return share
 
 
 def decay(step: int, steps: int, final: float) -> float:
@@ -21,6 +49,7 @@ def refine(
     settings: RefineSettings,
     progress: Callable[[int, float], None] | None = None,
     done: int = 0,
+    schedule: Schedule | None = None,
 ) -> None:
     """Optimise a finished map on error-weighted draws from all keyframes.
 
@@ -33,6 +62,7 @@ def refine(
         progress: Called after every step with (steps done, mean PSNR of its views).
         done: Number of steps made before the mapper was restored. The remaining steps are the same as without the
             interruption.
+        schedule: When the refinement ends, and how far the rates have decayed; None for what the settings say.
 
     Example:
         mapper.finish()
@@ -42,24 +72,29 @@ def refine(
     pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0
     if len(store) == 0 or len(mapper.gaussians) == 0:
         return
-    if settings.steps and not done and settings.min_contribution > 0:
+    if schedule is None:
+        schedule = in_steps(settings.steps) if settings.seconds is None else in_seconds(settings.seconds)
+    step, share = done, schedule(done)
+    if not done and settings.min_contribution > 0 and share is not None:
         with mapper.stopwatch.measure("refine"):
             shown = mapper.contribution.measure(store, mapper.near)
             mapper.gaussians.remove(shown >= settings.min_contribution)
-    for step in range(done, settings.steps):
+    while share is not None:
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0)
             batch = [int(j) for j in mapper.rng.choice(len(store), settings.views, p=p)]
-            slower = decay(step, settings.steps, settings.position_decay)
+            slower = settings.position_decay**share
             rates = mapper.optimiser.rates(
                 store.scene_depth,
                 position_factor=slower,
-                scale_factor=decay(step, settings.steps, settings.scale_decay),
-                other_factor=decay(step, settings.steps, settings.rate_decay),
+                scale_factor=settings.scale_decay**share,
+                other_factor=settings.rate_decay**share,
             )
             psnr = mapper.optimiser.step(store, batch, rates, pose_rate * slower)
+        step += 1
         if progress is not None:
-            progress(step + 1, psnr)
+            progress(step, psnr)
+        share = schedule(step)
     with mapper.stopwatch.measure("refine"):
         mapper.optimiser.settle()
     mapper.prune()

@@ -298,6 +298,16 @@ class MappingSettings(StrictModel):
         ge=0,
         description="memory of a GPU for copies of images [GB]; the others are streamed when they are needed",
     )
+    pace: Literal["auto", "complete", "realtime"] = Field(
+        default="auto",
+        description="`complete`: every keyframe gets all its steps, however long they take; `realtime`: the work "
+        "follows the arrival of the frames; `auto`: realtime for live frames and `source.realtime`, otherwise complete",
+    )
+    max_lag: float = Field(
+        default=1.0,
+        gt=0,
+        description="longest time from a frame's arrival to the map that holds it, for `pace: realtime` [s]",
+    )
     gate: GateSettings = GateSettings()
     keyframes: KeyframeSettings = KeyframeSettings()
     densify: DensifySettings = DensifySettings()
@@ -319,6 +329,9 @@ class RefineSettings(StrictModel):
     """
 
     steps: int = Field(default=1000, ge=0, description="steps over all keyframes after the last frame; 0 for none")
+    seconds: float | None = Field(
+        default=None, gt=0, description="refine for this time [s] instead of `steps`; empty: `steps` counts"
+    )
     views: int = Field(default=4, ge=1, description="views per step, drawn as the global views are")
     poses: bool = Field(default=False, description="also refine poses, at a rate that decays as that of positions does")
     position_decay: float = Field(
@@ -336,6 +349,11 @@ class RefineSettings(StrictModel):
         ge=0,
         description="pixels covered where it shows most, below which a Gaussian is removed beforehand; 0 for none",
     )
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the finished map is refined at all."""
+        return self.steps > 0 or self.seconds is not None
 
 
 class OfflineSettings(StrictModel):

@@ -78,6 +78,7 @@ class TrackedFrame:
         vignette: Fraction of the light that reaches each pixel, (H, W, 3) float32 in (0, 1], one array for all frames
             of a camera; None for no vignetting. The image is the scene times the vignette.
         held_out: Whether the frame is for evaluation only. Such a frame never touches the map.
+        arrived: `time.monotonic()` when the image was received [s]; None for files that are not paced.
 
     Raises:
         ValueError: If the shapes or dtypes do not fit, or the pose is not finite.
@@ -99,6 +100,7 @@ class TrackedFrame:
     mask: NDArray[np.bool_] | None = None
     vignette: NDArray[np.float32] | None = None
     held_out: bool = False
+    arrived: float | None = None
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width)

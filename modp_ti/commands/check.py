@@ -63,7 +63,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
     from modp_ti.outputs.progress import ProgressLine
 
     line = ProgressLine(console)
-    tracker = open_tracker(config, line.prepare)
+    tracker = open_tracker(config.without_clock(), line.prepare)
     try:
         frames = iter(tracker)
         first = next(frames, None)

@@ -26,6 +26,7 @@ EXAMPLES = examples(
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
+    "modp-ti run --replay OUT   (repeat a recorded realtime run)",
     "modp-ti run scene.yaml --quiet --json > result.json",
 )
 
@@ -52,6 +53,12 @@ def run(
             "--stream", metavar="CAMERA", help="instead of SCENE: map a camera (number or device) or a URL to out/NAME"
         ),
     ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            "--replay", metavar="OUT", help="repeat the realtime run whose output folder this is, from its session.zip"
+        ),
+    ] = None,
     fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
     best: Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")] = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
@@ -62,17 +69,21 @@ def run(
     """Map a recording or a stream while its frames arrive, and write splats, poses, metrics, pictures and a report."""
     if scene is not None and "=" in scene.name and not scene.exists():  # `--stream 0 --set seed=1 source.stop=600`
         scene, more = None, [str(scene), *(more or [])]
-    if scene is None and resume is None and stream is None:
+    sources = [source for source in (scene, stream, resume, replay) if source is not None]
+    if not sources:
         raise typer.BadParameter(
             "name a scene file, a video or a folder of images, a camera (--stream 0), or the output folder of a run to "
             "go on with (--resume OUT)"
         )
     with outcome(as_json) as result:
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
-        preset = _preset(resume, scene, fast, best)
-        if stream is not None and (scene is not None or resume is not None):
-            raise InputError("--stream is instead of a scene file and of --resume: give one of them")
-        folder = _run(scene, stream, resume, overrides, preset, quiet)
+        preset = _preset(resume or replay, scene, fast, best)
+        if len(sources) > 1 and (stream is not None or replay is not None):
+            raise InputError("--stream and --replay need no scene file and no --resume: give one of them")
+        if replay is not None:
+            folder = _replay(replay, overrides, quiet)
+        else:
+            folder = _run(scene, stream, resume, overrides, preset, quiet)
         result.text = f"written to {folder}"
         if as_json:
             metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
@@ -120,3 +131,15 @@ def _new_scene(scene: Path | None, stream: str | None, overrides: list[str], pre
         return streamed_scene(stream, overrides, preset)
     assert scene is not None, "run() asks for one of them"
     return recorded_scene(scene, overrides, preset) if is_recording(scene) else load_scene(scene, overrides, preset)
+
+
+def _replay(recorded: Path, overrides: list[str], quiet: bool) -> Path:
+    """Repeat a recorded session. Its output goes to a folder beside that of the recorded run, unless it is set."""
+    from modp_ti.config.scene_file import scene_from_data
+    from modp_ti.engine.recording import RecordedSession
+    from modp_ti.engine.session import run_scene
+
+    session = RecordedSession(recorded)
+    beside = recorded.resolve().with_name(f"{recorded.resolve().name}-replayed")
+    settings = {**session.settings, "output": str(beside)}
+    return run_scene(scene_from_data(settings, str(recorded), overrides), progress_console(quiet), replayed=session)

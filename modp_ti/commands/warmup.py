@@ -96,7 +96,7 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     if size is None and config.tracker.is_live:
         raise InputError("no frame is there before a tracker sends one: give the size, --size 640x480")
     if size is None:
-        first = next(iter(open_tracker(config)), None)
+        first = next(iter(open_tracker(config.without_clock())), None)
         if first is None:
             raise InputError("the tracker delivered no frame: nothing to compile for")
         camera = first.camera

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -108,6 +109,9 @@ class SourceSettings(StrictModel):
     stream: int | str | None = Field(
         default=None, description="instead of `path`: number of a camera or URL of a stream, for live frames"
     )
+    realtime: bool = Field(
+        default=False, description="deliver the images of a file or folder at the times of their time stamps"
+    )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
     scale: Literal["auto"] | Annotated[float, Field(gt=0, le=1)] = Field(
@@ -158,6 +162,11 @@ class SourceSettings(StrictModel):
         "trajectory errors (`ate_rmse`) in `metrics.json` and the report; empty for none",
     )
 
+    @property
+    def follows_clock(self) -> bool:
+        """Whether the images arrive by the clock instead of when they are asked for."""
+        return self.realtime or self.stream is not None
+
     def scale_for(self, width: int, height: int) -> float:
         """Return the scale of images of this size: `scale` if it is a number, otherwise what `auto` chooses.
 
@@ -192,6 +201,8 @@ class SourceSettings(StrictModel):
             raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; remove one of them")
         if self.stream is not None and self.path is not None:
             raise ValueError("source.path and source.stream cannot both be set; remove one of them")
+        if self.stream is not None and self.realtime:
+            raise ValueError("source.realtime is for source.path, a stream always sets the pace; remove it")
         return self
 
     @model_validator(mode="after")
@@ -218,6 +229,11 @@ class ExportSettings(StrictModel):
         default=False,
         description="write the undistorted images to `colmap/images`. The cameras in `colmap/` belong to these images, "
         "so other programs need them",
+    )
+    session: bool = Field(
+        default=False,
+        description="write `session.zip`, all that arrived in a realtime run and what was decided by the clock, with "
+        "which `modp-ti run --replay OUT` repeats it exactly",
     )
     report: bool = Field(
         default=True, description="write `report.html`, a page with the metrics, plots, images and settings of the run"
@@ -296,7 +312,12 @@ class SceneConfig(StrictModel):
         description="number of frames between snapshots of the run in `snapshot.npz`, for `modp-ti run --resume` after "
         "a crash; empty or 0: none. Ctrl-C always writes a snapshot",
     )
-    threads: int | None = Field(default=None, ge=1, description="number of CPU threads; empty: one per core")
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        description="number of CPU threads; empty: one per core, and one less where `klt` follows a clock beside the "
+        "mapper",
+    )
     mapping: MappingSettings = MappingSettings()
     refine: RefineSettings = RefineSettings()
     offline: OfflineSettings = OfflineSettings()
@@ -311,20 +332,48 @@ class SceneConfig(StrictModel):
         return self.model_copy(update={"source": self.source.model_copy(update={"scale": scale})})
 
     @property
+    def tracks_beside_mapping(self) -> bool:
+        """Whether the tracker runs in a process of its own."""
+        return self.is_realtime and self.source.follows_clock and self.tracker.kind == "klt"
+
+    @property
+    def mapper_threads(self) -> int | None:
+        """Number of CPU threads of the mapper; None for one per core. A tracker beside it gets one core."""
+        if self.threads is not None or not self.tracks_beside_mapping:
+            return self.threads
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores - 1)
+
+    @property
     def is_live(self) -> bool:
         """Whether the frames come from a live source and cannot be read again after the run."""
         return self.source.stream is not None or self.tracker.is_live
 
     @property
+    def is_realtime(self) -> bool:
+        """Whether the mapper keeps pace with the frames instead of giving each all its work."""
+        if self.mode != "online" or self.mapping.pace != "auto":
+            return self.mode == "online" and self.mapping.pace == "realtime"
+        return self.source.realtime or self.is_live
+
+    @property
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
-        return self.mode == "online" and not self.is_live
+        return self.mode == "online" and not (self.is_live or self.is_realtime or self.source.realtime)
+
+    def without_clock(self) -> SceneConfig:
+        """Return these settings for all images of a file or folder, however long their processing takes."""
+        mapping = self.mapping.model_copy(update={"pace": "complete"})
+        source = self.source.model_copy(update={"realtime": False})
+        return self.model_copy(update={"source": source, "mapping": mapping})
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
         if self.snapshot_every and not self.can_be_resumed:
             if self.mode != "online":
                 raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
+            if not self.is_live:
+                raise ValueError("snapshot_every is for `mapping.pace: complete`; remove one of them")
             raise ValueError("snapshot_every: live frames cannot be read again; record them, or remove the key")
         return self
 
@@ -335,6 +384,11 @@ class SceneConfig(StrictModel):
             raise ValueError(NO_PATH)
         if source.intrinsics.given and tracker.brings_cameras:
             raise ValueError(f"tracker.kind: {tracker.kind} provides the cameras; remove source.intrinsics")
+        if source.realtime and not tracker.follows_streams:
+            raise ValueError(
+                f"tracker.kind: {tracker.kind} does not follow the images as they arrive; remove source.realtime, or "
+                "take tracker.kind: klt"
+            )
         if source.stream is not None and not tracker.follows_streams:
             raise ValueError(
                 f"tracker.kind: {tracker.kind} cannot use source.stream, it needs recorded images; set source.path"

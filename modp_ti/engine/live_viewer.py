@@ -16,6 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
+from modp_ti.outputs.live_status import LiveStatus
 from modp_ti.outputs.viewer.budget import CostLimit, ThreadClock
 from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Latest
 from modp_ti.outputs.viewer.modes import SPLATS, Photograph, painter
@@ -126,18 +127,23 @@ class LiveViewer(Observer):
         self._began = self._clock()
         self._serving.since_last()  # do not charge for browsers that connected before mapping began
 
-    def on_frame(self, frame: TrackedFrame, report: FrameReport | None) -> None:
+    def on_frame(self, frame: TrackedFrame, report: FrameReport | None, live: LiveStatus | None = None) -> None:
         self._frame = frame
         count = len(self._mapper.frames)
         of = "" if self._frames is None else f" of {self._frames}"
         if report is not None and report.psnr is not None:
             self._psnr = f"{report.psnr:.2f} dB"
         seconds = self._clock() - self._began - self.waited
-        self._state = f"frame **{count}**{of}, {count / max(seconds, 1e-9):.2f} frames/s  \n{self._psnr}"
+        speed = f", {count / max(seconds, 1e-9):.2f} frames/s" if live is None else f"  \n{live.text()}"
+        self._state = f"frame **{count}**{of}{speed}  \n{self._psnr}"
         self._changed()
 
-    def on_step(self, stage: str, step: int, steps: int, psnr: float) -> None:
-        self._state = f"{stage}: step **{step}** of {steps}  \n{psnr:.2f} dB"
+    def on_further_step(self) -> None:
+        self._changed()
+
+    def on_step(self, stage: str, step: int, steps: int | None, psnr: float) -> None:
+        of = "" if steps is None else f" of {steps}"
+        self._state = f"{stage}: step **{step}**{of}  \n{psnr:.2f} dB"
         self._changed()
 
     def on_stage(self, stage: str) -> None:

@@ -21,7 +21,9 @@ from modp_ti.outputs.formats.map_folder import appearing, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.offline import OfflineMapper
 from pipelines.online import OnlineMapper
+from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
+from pipelines.refinement import Schedule
 from pipelines.render.renderer import RenderedView
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings
 from pipelines.state import MapState
@@ -41,6 +43,7 @@ class Mapper:
         settings: Settings of the online loop, or of the offline baseline, which builds its map in `finish`. None for
             the online loop's defaults.
         seed: Seed of the random numbers.
+        pace: How much work a frame of the online loop gets; None for all of the settings.
 
     Attributes:
         pipeline: The online or offline mapper, with its Gaussians, keyframes and renderer.
@@ -56,14 +59,19 @@ class Mapper:
     """
 
     def __init__(
-        self, width: int, height: int, settings: MappingSettings | OfflineSettings | None = None, seed: int = 0
+        self,
+        width: int,
+        height: int,
+        settings: MappingSettings | OfflineSettings | None = None,
+        seed: int = 0,
+        pace: Pace | None = None,
     ) -> None:
         program()
         self.pipeline: Pipeline
         if isinstance(settings, OfflineSettings):
             self.pipeline = OfflineMapper(settings, width, height, seed)
         else:
-            self.pipeline = OnlineMapper(settings or MappingSettings(), width, height, seed)
+            self.pipeline = OnlineMapper(settings or MappingSettings(), width, height, seed, pace=pace)
         self.frames = DeliveredFrames(trajectory=self.pipeline.trajectory)
         self.finished = True
 
@@ -91,8 +99,20 @@ class Mapper:
         self.finished = False
         return report
 
-    def correct(self, correction: PoseCorrection) -> None:
+    def optimise_further(self) -> bool:
+        """Make one optimisation step on the whole map, for time in which no frame waits.
+
+        Returns:
+            Whether there was something to optimise. False for an offline map.
+        """
+        return isinstance(self.pipeline, OnlineMapper) and self.pipeline.optimise_further() is not None
+
+    def correct(self, correction: PoseCorrection, more: bool = False) -> None:
         """Apply poses and points that the tracker has revised, for example after a loop closure.
+
+        Args:
+            correction: The revised poses and points.
+            more: Whether another correction follows at once, with which the Gaussians then move.
 
         Raises:
             InputError: If the correction refers to a frame that has not been added yet.
@@ -102,7 +122,7 @@ class Mapper:
                 f"the tracker corrects frame {correction.index[-1]} after frame {self.frames.index[-1]}, "
                 "before it has come"
             )
-        report = self.pipeline.correct(correction)
+        report = self.pipeline.correct(correction, more)
         self.frames.correct(correction, report.around, report.moved)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> None:
@@ -130,14 +150,16 @@ class Mapper:
         settings: RefineSettings | None = None,
         progress: Callable[[int, float], None] | None = None,
         done: int = 0,
+        schedule: Schedule | None = None,
     ) -> None:
         """Call `finish`, then optimise the map on all keyframes equally. More frames may follow.
 
         Args:
-            steps: Number of refinement steps. It replaces `settings.steps`.
+            steps: Number of refinement steps. It replaces `settings.steps` and `settings.seconds`.
             settings: The other settings of the refinement, None for the defaults.
             progress: Callback, see `pipelines.refinement.refine`.
             done: Steps that were done before, see `pipelines.refinement.refine`.
+            schedule: When the refinement ends instead of after `steps`, see `pipelines.refinement.refine`.
 
         Raises:
             ValueError: If the map is an offline one, whose optimisation already covers all frames.
@@ -146,7 +168,7 @@ class Mapper:
             raise ValueError("an offline map is not refined: give its settings more steps")
         self.finish()
         settings = RefineSettings() if settings is None else settings
-        self.pipeline.refine(settings.model_copy(update={"steps": steps}), progress, done)
+        self.pipeline.refine(settings.model_copy(update={"steps": steps, "seconds": None}), progress, done, schedule)
 
     def restore(self, state: MapState, frames: DeliveredFrames, again: Iterable[TrackedFrame], finished: bool) -> None:
         """Restore the state of another mapper with the same settings.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.engine.mapper import Mapper
+from modp_ti.outputs.live_status import LiveStatus
 from pipelines.pipeline import FrameReport
 
 __all__ = ["Observer"]
@@ -29,21 +30,25 @@ class Observer:
             frames: Number of frames that will come, None if unknown.
         """
 
-    def on_frame(self, frame: TrackedFrame, report: FrameReport | None) -> None:
+    def on_frame(self, frame: TrackedFrame, report: FrameReport | None, live: LiveStatus | None = None) -> None:
         """Called after each frame.
 
         Args:
             frame: The frame.
             report: What the frame did to the map, None for a held-out frame.
+            live: The figures of a realtime run, None for other runs.
         """
 
-    def on_step(self, stage: str, step: int, steps: int, psnr: float) -> None:
+    def on_further_step(self) -> None:
+        """Called after each step that a realtime run makes while no frame waits."""
+
+    def on_step(self, stage: str, step: int, steps: int | None, psnr: float) -> None:
         """Called after each step of refinement or offline optimisation.
 
         Args:
             stage: "refining" or "optimising".
             step: Number of the step, from 1.
-            steps: Total number of steps.
+            steps: Total number of steps, None if it is not known.
             psnr: Mean PSNR of the step's views [dB].
         """
 

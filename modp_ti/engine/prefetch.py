@@ -35,6 +35,7 @@ class FramesAhead(Iterator[Item]):
         self._frames = iter(frames)
         self._ready: SimpleQueue[Item | BaseException] = SimpleQueue()
         self._free = Semaphore(ahead)  # number of frames that may still be read ahead
+        self._held: Item | None = None  # the next one, taken from the queue already
         self._end: BaseException | None = None
         self._closed = False
         # A daemon thread, so that the process can exit even if this object was not closed. It only reads.
@@ -43,6 +44,9 @@ class FramesAhead(Iterator[Item]):
             self._thread.start()
 
     def __next__(self) -> Item:
+        if self._held is not None:
+            item, self._held = self._held, None
+            return item
         if self._thread is None:
             return next(self._frames)
         if self._end is not None:
@@ -53,6 +57,33 @@ class FramesAhead(Iterator[Item]):
             raise item
         self._free.release()
         return item
+
+    @property
+    def waiting(self) -> int:
+        """Number of frames and corrections that were read in advance. The end of `frames` counts as one."""
+        return self._ready.qsize() + (self._held is not None)
+
+    def ready(self) -> bool:
+        """Return whether the next frame, the end or an error is there already, so that `next` does not wait.
+
+        Without a thread, frames are read on demand, so that the next one counts as there.
+        """
+        return self._thread is None or self._end is not None or self.waiting > 0
+
+    def peek(self) -> Item | None:
+        """Return what comes next without taking it; None if it is not there yet, or is the end or an error."""
+        if self._held is None and self._end is None and not self._ready.empty():
+            item = self._ready.get()
+            if isinstance(item, BaseException):
+                self._end = item
+            else:
+                self._free.release()
+                self._held = item
+        return self._held
+
+    def put_back(self, item: Item) -> None:
+        """Make an item that was just taken the next one again."""
+        self._held = item
 
     def __enter__(self) -> FramesAhead[Item]:
         return self

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +16,13 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.conductor import Conductor, Event
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.engine.realtime import RealtimeRun
+from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
@@ -34,15 +35,20 @@ from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import retention
 from modp_ti.outputs.time_left import TimeAfterMapping
+from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport
-from pipelines.stopwatch import Stopwatch, breakdown_percent
+from pipelines.settings import RefineSettings
+from pipelines.stopwatch import breakdown_percent
 
 __all__ = ["build_mapper", "run_scene"]
 
-Event = TrackedFrame | PoseCorrection
 
-
-def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snapshot | None = None) -> Path:
+def run_scene(
+    config: SceneConfig,
+    console: Console | None = None,
+    resumed: Snapshot | None = None,
+    replayed: RecordedSession | None = None,
+) -> Path:
     """Map a scene and write its output folder.
 
     All files except snapshots are written after the map is finished, and appear together.
@@ -51,6 +57,7 @@ def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snap
         config: The scene's settings.
         console: Receives progress and notes, None for no output.
         resumed: Snapshot to continue from, None to start from the first frame.
+        replayed: Recorded session to repeat instead of opening the tracker, None for none.
 
     Returns:
         The output folder.
@@ -67,14 +74,17 @@ def run_scene(config: SceneConfig, console: Console | None = None, resumed: Snap
             print((output / "metrics.json").read_text())
     """
     with ExitStack() as held:
-        return _Session(config, console or Console(quiet=True), held).run(resumed)
+        return _Session(config, console or Console(quiet=True), held, replayed).run(resumed)
 
 
 class _Session:
     """A run in progress, with the state that its stages share. `held` closes the run's resources when it ends."""
 
-    def __init__(self, config: SceneConfig, console: Console, held: ExitStack) -> None:
+    def __init__(
+        self, config: SceneConfig, console: Console, held: ExitStack, replayed: RecordedSession | None
+    ) -> None:
         self.config = config
+        self.replayed = replayed
         self.held = held
         self.clock = RunClock()
         self.record = RunRecord()
@@ -83,13 +93,14 @@ class _Session:
         self.observer = self._open_observer()  # opened first, as what follows may take minutes
         self.stop = Interruption(lambda: self.line.note("stopping after this step; Ctrl-C again stops at once"))
         try:
-            self.backend = initialise(config.device, config.threads, config.seed)
+            self.backend = initialise(config.device, config.mapper_threads, config.seed)
         except RuntimeError as error:
             raise InputError(str(error)) from None
         self.record.device = describe(self.backend)
         self.line.note(f"device: {self.record.device}")
         # Set once the first frame has arrived.
         self.tracker: Tracker
+        self.conductor: Conductor
         self.mapper: Mapper
         self.after_mapping: TimeAfterMapping
         self.checkpointer: Checkpointer
@@ -111,11 +122,15 @@ class _Session:
     def _map_the_stream(self, resumed: Snapshot | None) -> None:
         """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
-        self.tracker = open_tracker(self.config, self.line.prepare)
+        self.tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
+        self.conductor = self._open_conductor()
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
+            undistorter = self.tracker.undistorter if self.config.is_realtime else None
+            if undistorter is not None:  # the kernels are compiled while the first frames are tracked
+                self._make_mapper(undistorter.camera)
             first = next(arriving, None)
             if first is None:
                 raise InputError("the tracker delivered no frame: nothing to map")
@@ -126,17 +141,17 @@ class _Session:
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes)
-            self.mapper = build_mapper(self.config, first.camera)
-            self.mapper.pipeline.stopwatch.seconds["track"] = prepared
-            with self.line.working("compiling kernels (the first time on this machine takes longest)"):
-                self.mapper.pipeline.compile()
-            rest: Iterator[Event] = chain([first], arriving)
-            self._open_keeper(resumed, rest)
+            if undistorter is None:
+                self._make_mapper(first.camera)
+            seconds = self.mapper.pipeline.stopwatch.seconds
+            seconds["track"] = prepared - (0.0 if undistorter is None else seconds["compile"])
+            arriving.put_back(first)
+            self._open_keeper(resumed, arriving)
             self.observer.begin(self.mapper, self.tracker.frame_count)
             self.held.enter_context(self.stop)
             self.clock.begin_mapping()
             try:
-                self._map(rest)
+                self._map(arriving)
             except RunStopped:
                 raise self._stopped() from None
             scoring = self.mapper.pipeline.stopwatch.seconds.get("evaluate", 0.0)
@@ -144,7 +159,23 @@ class _Session:
         # A live tracker adds notes at its end.
         self._say(*(note for note in self.tracker.notes if note not in notes))
 
-    def _open_keeper(self, resumed: Snapshot | None, arriving: Iterator[Event]) -> None:
+    def _make_mapper(self, camera: PinholeCamera) -> None:
+        self.mapper = build_mapper(self.config, camera, self.conductor.pace)
+        with self.line.working("compiling kernels (the first time on this machine takes longest)"):
+            self.mapper.pipeline.compile()
+
+    def _open_conductor(self) -> Conductor:
+        if self.replayed is not None:
+            return ReplayedRun(self.replayed)
+        if not self.config.is_realtime:
+            return Conductor()
+        self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
+        recorder = SessionRecorder() if self.config.export.session else None
+        if recorder is not None:
+            self.held.callback(recorder.close)
+        return RealtimeRun(self.config.mapping, self.tracker, recorder)
+
+    def _open_keeper(self, resumed: Snapshot | None, arriving: FramesAhead[Event]) -> None:
         """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""
         self.checkpointer = checkpointer = Checkpointer(self.config, self.mapper, self.record, self.clock, self._say)
         if resumed is not None:
@@ -154,7 +185,7 @@ class _Session:
         elif checkpointer.path.exists():
             self._say(f"{checkpointer.path} is of an earlier run: the first one of this run takes its place")
 
-    def _map(self, arriving: Iterator[Event]) -> None:
+    def _map(self, arriving: FramesAhead[Event]) -> None:
         """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
         mapper, line, offline = self.mapper, self.line, self.config.mode == "offline"
         after = self.after_mapping = TimeAfterMapping(self.config, mapper.pipeline)
@@ -167,10 +198,10 @@ class _Session:
         size = None
         self.record.begin()
         try:
-            for frame in _timed(arriving, mapper.pipeline.stopwatch, self.stop):
+            for frame in self.conductor.events(arriving, mapper, self.stop, self.observer.on_further_step):
                 self.checkpointer.digest.add(frame)
                 if isinstance(frame, PoseCorrection):
-                    mapper.correct(frame)
+                    self.conductor.correct(mapper, frame)
                     continue
                 this = f"{frame.camera.width}x{frame.camera.height}"
                 size = size or this
@@ -178,10 +209,7 @@ class _Session:
                     raise InputError(
                         f"{frame.name} is {this}, the first frame {size}: all images of a scene must have one size"
                     )
-                report = mapper.add(frame)
-                line.frame(report, self.tracker.frame_count)
-                self.record.frame(frame.index, report, self._mapped_psnr(report))
-                self.observer.on_frame(frame, report)
+                self._add(frame)
                 self.checkpointer.after_frame()
             if offline:
                 line.start("optimising", self.config.offline.steps)
@@ -192,10 +220,21 @@ class _Session:
         finally:
             line.stop()
 
+    def _add(self, frame: TrackedFrame) -> None:
+        """Map a frame, record it, and show it."""
+        report = self.conductor.add(self.mapper, frame)
+        status = self.conductor.status()
+        self.line.frame(report, self.tracker.frame_count, status)
+        self.record.frame(frame.index, report, self._mapped_psnr(report), **self.conductor.note())
+        self.observer.on_frame(frame, report, status)
+
     def _mapped_psnr(self, report: FrameReport | None) -> float | None:
-        """Return the PSNR of a keyframe that was just mapped, for `retention`. None for other frames."""
+        """Return the PSNR of a keyframe that was just mapped, for `retention`. None for other frames.
+
+        In a realtime run, there is no time for it.
+        """
         pipeline = self.mapper.pipeline
-        if report is None or not report.is_keyframe or report.psnr is None:
+        if self.conductor.pace is not None or report is None or not report.is_keyframe or report.psnr is None:
             return None
         with pipeline.stopwatch.measure("evaluate"):
             return keyframe_psnr(pipeline, pipeline.keyframes[-1])
@@ -218,24 +257,30 @@ class _Session:
                 "give a tracker with points or lower mapping.keyframes.min_points"
             )
         versions = {config.mode: checkpointer.online or self.mapper.version()}
-        if config.refine.steps and config.mode != "offline":
+        if config.refine.wanted and config.mode != "offline":
             checkpointer.after_mapping()
             checkpointer.online = versions[config.mode]
-            scores = self.after_mapping.scores(len(self.mapper.frames)) / config.refine.views  # in steps
-            self.line.start("refining", config.refine.steps, checkpointer.refined, lambda step: step * scores)
             try:
-                try:
-                    self.mapper.refine(config.refine.steps, config.refine, self._refined, checkpointer.refined)
-                finally:
-                    self.line.stop()
+                self._refine(config.refine)
             except RunStopped:
                 raise self._stopped() from None
             versions["refined"] = self.mapper.version()
         return versions
 
+    def _refine(self, settings: RefineSettings) -> None:
+        """Refine the map for the settings' steps or time. Raises RunStopped between two steps."""
+        done, steps = self.checkpointer.refined, settings.steps if settings.seconds is None else None
+        scores = self.after_mapping.scores(len(self.mapper.frames)) / settings.views  # in steps
+        self.line.start("refining", steps, done, lambda step: step * scores)
+        schedule = self.conductor.schedule(settings)
+        try:
+            self.mapper.refine(settings.steps, settings, self._refined, done, schedule)
+        finally:
+            self.line.stop()
+
     def _refined(self, step: int, psnr: float) -> None:
         """Callback after a step of refinement."""
-        steps = self.config.refine.steps
+        steps = self.config.refine.steps if self.config.refine.seconds is None else None
         self.line.step(step, psnr)
         self.record.steps.append(StepNote(step, psnr))
         self.observer.on_step("refining", step, steps, psnr)
@@ -251,6 +296,8 @@ class _Session:
             with results.writing():
                 with self.line.working("writing the map"):
                     versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
+                    self.conductor.write_session(results.folder, self.config)
+                self.conductor.saved()
                 scores = self._score(versions, results)
                 metrics = None if scores is None else self._write_figures(scores, versions, results)
         except InputError as error:
@@ -311,6 +358,7 @@ class _Session:
             "breakdown_percent": self.breakdown,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
             "retention": retention(self.record.frames, scores),
+            **self.conductor.metrics(),
             **trajectory_errors(frames.T_tracked, list(versions.values())[-1].trajectory, truth),
         }
         results.write_scores(scores, metrics)
@@ -358,24 +406,19 @@ class _Session:
             self.record.notes.append(note)
 
 
-def build_mapper(config: SceneConfig, camera: PinholeCamera) -> Mapper:
+def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None = None) -> Mapper:
     """Create the mapper for the scene's mode and for images of this camera.
+
+    Args:
+        config: The scene's settings.
+        camera: The camera.
+        pace: Pace of the online loop, None for all the work of the settings.
 
     Raises:
         InputError: If the settings do not fit the images.
     """
     settings = config.offline if config.mode == "offline" else config.mapping
     try:
-        return Mapper(camera.width, camera.height, settings, config.seed)
+        return Mapper(camera.width, camera.height, settings, config.seed, pace)
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def _timed(frames: Iterator[Event], watch: Stopwatch, stop: Interruption) -> Iterator[Event]:
-    """Yield the frames and corrections, counting the time that the mapper waits for each of them as `read`."""
-    while True:
-        with watch.measure("read"), stop.waiting():
-            frame = next(frames, None)
-        if frame is None:
-            return
-        yield frame

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import UnreadableImageError
+from modp_ti.inputs.live_counts import LiveCounts
 
 if TYPE_CHECKING:
     from modp_ti.inputs.sources import Undistorter
@@ -74,6 +75,11 @@ class Tracker(ABC):
     @property
     def undistorter(self) -> Undistorter | None:
         """Undistorter of the first frame's image, or None if the tracker does not provide one."""
+        return None
+
+    @property
+    def live(self) -> LiveCounts | None:
+        """What a tracker that follows a clock has done so far; None for other trackers."""
         return None
 
     def close(self) -> None:  # noqa: B027 - most trackers hold nothing open

@@ -176,6 +176,7 @@ def tracked_frame(
         mask=picture.mask,
         vignette=picture.vignette,
         held_out=is_held_out(index if place is None else place, reader.source),
+        arrived=reader.images.arrived(frame.name),
     )
 
 

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from modp_ti.outputs.time_left import TimeLeft, duration
 
 if TYPE_CHECKING:
+    from modp_ti.outputs.live_status import LiveStatus
     from pipelines.pipeline import FrameReport
 
 __all__ = ["ProgressLine"]
@@ -89,12 +90,13 @@ class ProgressLine:
         self._progress.add_task(what, total=total, completed=done, state="", left="")
         self._progress.start()
 
-    def frame(self, report: FrameReport | None, total: int | None = None) -> None:
+    def frame(self, report: FrameReport | None, total: int | None = None, live: LiveStatus | None = None) -> None:
         """Count a finished frame.
 
         Args:
             report: What the frame did to the map, None if it is held out.
             total: Number of frames as it is known now, None if it has not changed.
+            live: The figures of a realtime run, None for other runs.
         """
         if report is not None:
             psnr = "" if report.psnr is None else f"  {report.psnr:.2f} dB"
@@ -102,8 +104,9 @@ class ProgressLine:
             self._state = f"{report.keyframes} keyframes{gaussians}{psnr}"
         frame_rate = self._progress.tasks[0].speed if self._progress is not None else None
         speed = f"  {frame_rate:.2f} frames/s" if frame_rate else ""
+        state = self._state + speed if live is None else f"{live.text()}, {self._state}"
         changed = {} if total is None else {"total": total}
-        self._update(advance=1, state=self._state + speed, **changed)
+        self._update(advance=1, state=state, **changed)
 
     def step(self, step: int, psnr: float, gaussians: int | None = None) -> None:
         """Show a finished step of refinement or, with the number of Gaussians, of offline optimisation."""

@@ -112,15 +112,15 @@ class TimeAfterMapping:
             return None
         optimise, select, refine = self._config.mapping.optimise, self._config.mapping.views, self._config.refine
         views = max(optimise.last_steps - optimise.steps, 0) * (1 + select.local_views + select.global_views)
-        if refine.steps:
+        if refine.seconds is None:
             views += refine.steps * refine.views
-        if refine.steps and refine.min_contribution:
+        if refine.wanted and refine.min_contribution:
             views += RENDERED * len(self._pipeline.keyframes) * frames / done
-        return pace * FULL_SIZE * (views + self.scores(frames))
+        return pace * FULL_SIZE * (views + self.scores(frames)) + (refine.seconds or 0.0)
 
     def scores(self, frames: int) -> float:
         """Return the number of views that take as long as the scores of all frames in all versions of the map."""
-        versions = 2 if self._config.refine.steps and self._config.mode == "online" else 1
+        versions = 2 if self._config.refine.wanted and self._config.mode == "online" else 1
         return SCORED * versions * frames
 
 

@@ -82,19 +82,20 @@ class Densifier:
         seeds = tracked_seeds(view)
         self._grow(seeds, view)
 
-    def add_error_pixels(self, view: Keyframe, warming_up: bool) -> None:
+    def add_error_pixels(self, view: Keyframe, warming_up: bool, share: float = 1.0) -> None:
         """Add Gaussians at pixels of high error of the latest keyframe. Call `add_tracked_points` first.
 
         Args:
             view: The keyframe, or a level of it.
             warming_up: Whether the map is too young to render; pixels are then drawn from the whole image.
+            share: Share of `densify.pixels` that is drawn.
         """
         with self._stopwatch.measure("depth"):
             self.optimiser.compare(view, self.keyframes.scene_depth)
             images = self.optimiser.renderer.images
             error = None if warming_up else dissimilarity(images.colour_to_numpy(), view.rgba)
             opacity = images.opacity_to_numpy()
-            pixels = error_pixels(view, error, self.settings.densify, self._rng)
+            pixels = error_pixels(view, error, self.settings.densify, self._rng, share)
             column, row = np.floor(pixels).astype(int).T
             depth = self.settings.depth
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)

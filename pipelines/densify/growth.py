@@ -89,6 +89,7 @@ def error_pixels(
     error: NDArray[np.float32] | None,
     settings: DensifySettings,
     rng: np.random.Generator,
+    share: float = 1.0,
 ) -> NDArray[np.float64]:
     """Sample pixels of high error regions: 1 - SSIM is high, and there is no tracked point (Section 3.2.2).
 
@@ -97,6 +98,7 @@ def error_pixels(
         error: 1 - SSIM (H, W) of the map's render; None samples from all valid pixels, as in the warm-up.
         settings: Threshold and number of pixels.
         rng: Random generator.
+        share: Share of the settings' number of pixels.
 
     Returns:
         Pixel centres (N, 2) as (x, y).
@@ -108,7 +110,7 @@ def error_pixels(
     inside = view.points.pixels[view.camera.contains(view.points.pixels)].astype(int)
     candidate[inside[:, 1], inside[:, 0]] = False
     places = np.flatnonzero(candidate)
-    count = min(round(settings.pixels * (width * height / (640 * 480)) ** 0.75), len(places))
+    count = min(round(share * settings.pixels * (width * height / (640 * 480)) ** 0.75), len(places))
     chosen = np.sort(rng.choice(places, count, replace=False))
     return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
 

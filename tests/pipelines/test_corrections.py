@@ -212,6 +212,20 @@ def test_small_corrections_add_up_until_they_count(mapped: OnlineMapper) -> None
     assert mine.sum() > 20 and pending_motion_in_pixels(moved) == 0.0
 
 
+def test_corrections_in_a_row_move_the_map_once(mapped: OnlineMapper) -> None:
+    """There and back again: the Gaussians have not moved in between, but the poses have."""
+    before, poses = mapped.gaussians.to_numpy(), [view.T_tracked.copy() for view in mapped.keyframes]
+    assert not mapped.correct(moving(mapped, S), more=True).moved
+    np.testing.assert_allclose(mapped.keyframes[1].T_tracked, moved_pose(S, poses[1]), atol=1e-9)
+    assert not mapped.correct(moving(mapped, np.linalg.inv(S))).moved
+    np.testing.assert_array_equal(mapped.gaussians.to_numpy()["position"], before["position"])
+    # On in two parts: as in one.
+    mapped.correct(moving(mapped, S), more=True)
+    assert mapped.correct(moving(mapped, S)).moved
+    way = moved_points(S @ S, before["position"].astype(np.float64))
+    np.testing.assert_allclose(mapped.gaussians.to_numpy()["position"], way, atol=1e-4)
+
+
 def test_a_world_that_moves_as_a_whole_looks_as_before_in_the_voxels_of_a_fresh_insertion(mapped: OnlineMapper) -> None:
     view = mapped.keyframes[3]
     spacing = np.array([anchor.spacing for anchor in mapped.densifier.anchors])

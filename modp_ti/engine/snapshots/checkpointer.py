@@ -69,7 +69,7 @@ class Checkpointer:
         if self._every:
             self.keep()
 
-    def after_step(self, step: int, steps: int) -> None:
+    def after_step(self, step: int, steps: int | None) -> None:
         """Record the finished refinement step `step`, which counts from 1, and write a snapshot if one is due.
 
         A snapshot is due after as many steps as `snapshot_every` keyframes take, and after the last step.

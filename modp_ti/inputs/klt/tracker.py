@@ -18,9 +18,10 @@ from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
 from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
+from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import PosedImage, Unreadable, readable_sizes, tracked_frame
-from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, Undistorter, open_source, require_intrinsics
 from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 __all__ = ["KltTracker", "open_klt"]
@@ -31,7 +32,9 @@ CALIBRATION_STRIDE = 3
 DIAGONAL_35MM = 43.27  # mm
 
 
-def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = None) -> KltTracker:
+def open_klt(
+    source: SourceSettings, seed: int = 0, progress: Progress | None = None, images: ImageSource | None = None
+) -> KltTracker:
     """Open the images of a source and return a tracker for them.
 
     If the source has no intrinsics, they are estimated from its first images; the focal length in EXIF, or a typical
@@ -41,11 +44,12 @@ def open_klt(source: SourceSettings, seed: int = 0, progress: Progress | None = 
         source: Settings of the images.
         seed: Seed of RANSAC.
         progress: Called during the estimation of the camera.
+        images: The images, None to open those of the settings.
 
     Raises:
         InputError: If the images are missing, unreadable or of several sizes, or do not fit the intrinsics.
     """
-    images = open_source(source)
+    images = open_source(source) if images is None else images
     reader = FrameReader(images, source)
     first = next(images.arriving(source.start, source.stop, source.step), None)
     if first is None:
@@ -90,8 +94,9 @@ def _estimated(reader: FrameReader, blank: Intrinsics, seed: int, progress: Prog
         TYPICAL_FOCAL * max(width, height) if film is None else film / DIAGONAL_35MM * float(np.hypot(width, height))
     )
     stride = int(np.clip(len(there) // CALIBRATION_FRAMES, 1, CALIBRATION_STRIDE))
-    # A live source has few images so far, so the next ones are awaited and used without a stride.
-    names = there[::stride] if len(there) >= CALIBRATION_FRAMES else _arriving(reader)
+    # Images that have not arrived yet are awaited, and used without a stride.
+    recorded = reader.images.arrivals is None and len(there) >= CALIBRATION_FRAMES
+    names = there[::stride] if recorded else _arriving(reader)
     undistorter = blank.undistorter(_followed_scale(width, height))
 
     def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]:
@@ -185,8 +190,20 @@ class KltTracker(Tracker):
 
     @property
     def frame_count(self) -> int | None:
-        """Number of images without those skipped so far, so that it may still become smaller. None for live images."""
-        return None if self._reader.source.stream is not None else len(_there(self._reader)) - self._skipped
+        """Number of images without those left out so far, so that it may still become smaller. None for live images."""
+        if self._reader.source.stream is not None:
+            return None
+        arrivals = self._reader.images.arrivals
+        return len(_there(self._reader)) - self._skipped - (0 if arrivals is None else arrivals.thinned)
+
+    @property
+    def live(self) -> LiveCounts | None:
+        """Counts of the frames of a source that follows a clock. None waits: frames are tracked when they are taken."""
+        arrivals = self._reader.images.arrivals
+        if arrivals is None:
+            return None
+        tracked = 0 if self._trajectory is None else len(self._trajectory.frames)
+        return LiveCounts(arrivals.arrived, tracked, arrivals.thinned, self._skipped, 0, arrivals.newest)
 
     @property
     def scale(self) -> float:
@@ -195,6 +212,10 @@ class KltTracker(Tracker):
     @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
         return self._unreadable
+
+    @property
+    def undistorter(self) -> Undistorter:
+        return self._delivered
 
     def close(self) -> None:
         self._reader.images.close()

@@ -17,6 +17,7 @@ from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.frame_reader import FrameReader, Picture
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.intrinsics import Intrinsics, given_intrinsics
+from modp_ti.inputs.sources.paced import PacedSource
 from modp_ti.inputs.sources.protocol import ImageSource, require_intrinsics
 from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
 from modp_ti.inputs.sources.undistortion import Undistorter
@@ -44,13 +45,14 @@ __all__ = [
 ]
 
 
-def open_source(source: SourceSettings) -> ImageSource:
+def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSource:
     """Open the configured images and set their camera and scale.
 
     `source.intrinsics` override the source's own camera.
 
     Args:
         source: Settings of the images.
+        folder: Folder in which a live source stores its frames, None for a temporary one of its own.
 
     Raises:
         InputError: If there are no images, or the intrinsics belong to another image size.
@@ -58,7 +60,7 @@ def open_source(source: SourceSettings) -> ImageSource:
     if source.stream is not None:
         from modp_ti.inputs.sources.live import LiveSource
 
-        live = LiveSource(source.stream)
+        live = LiveSource(source.stream, folder)
         try:
             return _scaled(_with_camera(live, source), source)
         except InputError:
@@ -69,7 +71,8 @@ def open_source(source: SourceSettings) -> ImageSource:
     images = _OPENERS[kind](path, source)
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
         images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
-    return _scaled(_with_camera(images, source), source)
+    images = _scaled(_with_camera(images, source), source)
+    return PacedSource(images) if source.realtime else images
 
 
 def recognised_kind(path: Path) -> str:

@@ -12,54 +12,66 @@ import signal
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.listed_images import decoded, quiet_opencv
+from modp_ti.inputs.sources.backlog import Arrivals, Backlog
+from modp_ti.inputs.sources.frame_store import FrameStore
+from modp_ti.inputs.sources.listed_images import quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
 
 __all__ = ["LiveSource"]
 
-# Capacity of the queue of arrived frames: one second at 8 frames per second. If it is full, the oldest are dropped.
-WAITING = 8
+# Memory [bytes] of decoded frames that wait for the tracker. Further ones wait on disk.
+MEMORY = 64 << 20
 # Timeout of a network stream [s], for opening it and for each frame.
 PATIENCE = 10.0
+
+
+@dataclass
+class _Captured:
+    """A frame (H, W, 3) BGR that waits for the tracker, in memory or in a file."""
+
+    image: NDArray[np.uint8] | None
+    file: Path
 
 
 class LiveSource(ImageSource):
     """A source that is still recording. The n-th delivered frame is called `live_<n, six digits>`.
 
-    A thread captures frames continuously. Up to `WAITING` frames are queued for `arriving`; if more arrive, the oldest
-    are dropped and counted. Each delivered frame is stored without loss in a temporary folder, from which `read`
-    decodes it again; `close` removes the folder. Times are those of arrival [s], on the Unix clock.
+    A thread captures frames continuously. They wait for `arriving` in a `Backlog`, which leaves frames out evenly if
+    they arrive faster than they are taken. Each delivered frame is stored without loss in a folder, from which `read`
+    decodes it again. Times are those of arrival [s], on the Unix clock.
 
-    The recording ends when the stream ends, when `arriving` reaches its `stop`, when `finish` is called, or on the
-    first Ctrl-C if the source was opened in the main thread. After that, Ctrl-C interrupts as usual.
+    The recording ends when the stream ends, when `arriving` reaches its `stop`, when `finish` is called, if the disk is
+    full, or on the first Ctrl-C if the source was opened in the main thread of a process that does not ignore Ctrl-C.
+    After that, Ctrl-C interrupts as usual.
 
     Args:
         stream: Number of a camera, or URL.
-
-    Attributes:
-        dropped: Number of dropped frames.
+        folder: Folder for the frames, which belongs to the caller. If it is None, `close` removes a temporary one.
 
     Raises:
         InputError: If the stream cannot be opened or sends no frame.
     """
 
-    def __init__(self, stream: int | str) -> None:
+    def __init__(self, stream: int | str, folder: Path | None = None) -> None:
         if isinstance(stream, str) and stream.isdigit():
             stream = int(stream)
         super().__init__(Path(_shown(stream)))
-        self.dropped = 0
-        self._waiting: deque[tuple[float, NDArray[np.uint8]]] = deque()
+        self._backlog: Backlog[_Captured] = Backlog(self._drop)
+        self._held = 0  # bytes of the images that wait in memory
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
         self._ended = False
+        self._full: InputError | None = None
+        self._last: tuple[str, NDArray[np.uint8]] | None = None
+        self._received: list[float] = []
         self._capture = _open(stream)
         # The system clock may be adjusted during the recording, so times advance with the monotonic clock.
         self._clock = time.time() - time.monotonic()
@@ -68,15 +80,20 @@ class LiveSource(ImageSource):
             self._capture.release()
             raise InputError(f"{self.path}: sends no frame (source.stream); is it in use by another program?")
         self._size = (first[1].shape[1], first[1].shape[0])
-        self._waiting.append(first)
-        self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
+        self._kept = None
+        if folder is None:
+            self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
+            folder = Path(self._kept.name)
+        self._store = FrameStore(folder)
+        self._add(*first)
         # A daemon, so that a stalled stream does not keep the process alive. `close` is registered with atexit because
         # Python would otherwise kill the thread inside the decoder at shutdown.
         self._thread = threading.Thread(target=self._take, name=f"frames of {self.path}", daemon=True)
         self._thread.start()
         atexit.register(self.close)
         self._interrupt = None
-        if threading.current_thread() is threading.main_thread():
+        ours = threading.current_thread() is threading.main_thread()
+        if ours and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
             self._interrupt = signal.signal(signal.SIGINT, self._interrupted)
 
     @property
@@ -85,11 +102,14 @@ class LiveSource(ImageSource):
             f"{self.path} is mapped live: Ctrl-C ends the recording, and the map is finished with what came",
             *self._notes,
         ]
-        if self.dropped:
+        counts = self.arrivals
+        if counts.thinned:
             notes.append(
-                f"{self.dropped} frames of {self.path} came faster than they were taken and were dropped; "
-                f"{len(self._names)} were used"
+                f"{counts.thinned} of {counts.arrived} frames of {self.path} came faster than they could be tracked "
+                "and were left out evenly"
             )
+        if self._full is not None:
+            notes.append(f"the recording ended early: {self._full}")
         return notes
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
@@ -107,7 +127,14 @@ class LiveSource(ImageSource):
                 return
             yield self._names[position]
             position += step
-        self.finish()
+        self._end_now()
+
+    @property
+    def arrivals(self) -> Arrivals:
+        return self._backlog.arrivals
+
+    def arrived(self, name: str) -> float | None:
+        return self._received[self._position[name]]
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Read a delivered frame (H, W, 3) uint8 RGB, exactly as it arrived.
@@ -115,33 +142,41 @@ class LiveSource(ImageSource):
         Raises:
             InputError: If the stored frame is missing or damaged.
         """
-        file = self._file(self._position[name])
-        try:
-            image = decoded(file.read_bytes())
-        except OSError:
-            image = None
-        if image is None:
-            raise InputError(f"{file}: the frame that was kept there is gone or damaged: leave the folder alone")
-        return image
+        import cv2
+
+        last = self._last
+        if last is not None and last[0] == name:
+            return np.asarray(cv2.cvtColor(last[1], cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        return self._store.read(name)
 
     def finish(self) -> None:
-        """End the recording. Queued frames are dropped."""
+        """End the recording. Frames that have arrived are still delivered."""
         with self._changed:
             self._ended = True
-            self._waiting.clear()
+            self._changed.notify_all()
+
+    def _end_now(self) -> None:
+        """End the recording and forget the frames that wait."""
+        with self._changed:
+            self._ended = True
+            self._backlog.clear()
             self._changed.notify_all()
 
     def close(self) -> None:
-        """End the recording, release the camera and remove the stored frames."""
-        self.finish()
+        """End the recording and release the camera. A temporary folder is removed with the frames."""
+        self._end_now()
         # If the stream has stalled, the thread ends after its own timeout. Nothing depends on it.
         self._thread.join(1.0)
         self._give_back_interrupt()
-        self._kept.cleanup()
+        self._last = None
+        if self._kept is not None:
+            self._kept.cleanup()
         atexit.unregister(self.close)
 
+    # ---- the capturing thread --------------------------------------------------------------------------------
+
     def _grab(self) -> tuple[float, NDArray[np.uint8]] | None:
-        """Capture the next frame (BGR) with its time of arrival; None at the end of the stream."""
+        """Capture the next frame (BGR) with its time of arrival [s]; None at the end of the stream."""
         import cv2
 
         try:
@@ -150,52 +185,77 @@ class LiveSource(ImageSource):
             more, image = self._capture.retrieve() if more else (False, None)
         except cv2.error:
             return None
-        return (self._clock + arrived, np.asarray(image, dtype=np.uint8)) if more else None
+        return (arrived, np.asarray(image, dtype=np.uint8)) if more else None
 
     def _take(self) -> None:
         """Capture frames until the recording ends; runs in the thread."""
         while not self._ended:
             frame = self._grab()
-            with self._changed:
+            try:
                 if frame is None:
-                    self._ended = True
+                    self.finish()
                 elif not self._ended:
-                    self._waiting.append(frame)
-                    if len(self._waiting) > WAITING:
-                        self._waiting.popleft()
-                        self.dropped += 1
-                self._changed.notify_all()
+                    self._add(*frame)
+            except InputError as error:
+                self._full = error
+                self.finish()
         self._capture.release()
+
+    def _add(self, arrived: float, image: NDArray[np.uint8]) -> None:
+        """Let a frame wait, on disk if there is no room in memory. Raises InputError if the disk is full."""
+        captured = _Captured(image, self._store.waiting_file(self._backlog.arrivals.arrived))
+        if self._held + image.nbytes > MEMORY:
+            self._store.write(captured.file, image)
+            captured.image = None
+        with self._changed:
+            if self._ended:
+                captured.file.unlink(missing_ok=True)
+                return
+            self._held += 0 if captured.image is None else image.nbytes
+            self._backlog.add(arrived, captured)
+            self._changed.notify_all()
+
+    def _drop(self, captured: _Captured) -> None:
+        """Forget a frame that is left out."""
+        if captured.image is None:
+            captured.file.unlink(missing_ok=True)
+        else:
+            self._held -= captured.image.nbytes
+
+    # ---- the tracker's thread --------------------------------------------------------------------------------
 
     def _delivered(self, position: int) -> bool:
         """Wait until the frame at `position` is delivered or the recording has ended; return whether it exists."""
         with self._delivering:
             while len(self._names) <= position:
                 with self._changed:
-                    while not self._waiting and not self._ended:
+                    while (taken := self._backlog.take(time.monotonic())) is None:
+                        if self._ended:
+                            return False
                         self._changed.wait()
-                    if not self._waiting:
-                        return False
-                    arrived, image = self._waiting.popleft()
-                self._keep(arrived, image)
+                    arrived, captured = taken
+                    self._held -= 0 if captured.image is None else captured.image.nbytes
+                try:
+                    self._keep(arrived, captured)
+                except InputError as error:
+                    if not self._names:
+                        raise
+                    self._full = error
+                    self._end_now()
+                    return False
             return True
 
-    def _keep(self, arrived: float, image: NDArray[np.uint8]) -> None:
-        import cv2
-
+    def _keep(self, arrived: float, captured: _Captured) -> None:
+        """Store a frame under its number. Raises InputError if the disk is full."""
         number = len(self._names)
-        try:
-            _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-            self._file(number).write_bytes(data.tobytes())
-        except OSError as error:
-            raise InputError(
-                f"{self._kept.name}: frames of the live source cannot be kept there: {error.strerror}; "
-                "make room, or set TMPDIR to a folder that has some"
-            ) from None
-        self._append(f"live_{number:06d}", arrived)
-
-    def _file(self, number: int) -> Path:
-        return Path(self._kept.name) / f"{number:06d}.png"
+        name = self._store.name(number)
+        if captured.image is None:
+            self._store.deliver(captured.file, number)
+        else:
+            self._store.write(self._store.file(number), captured.image)
+            self._last = name, captured.image  # the tracker reads it next, so it need not be decoded
+        self._received.append(arrived)
+        self._append(name, self._clock + arrived)
 
     def _interrupted(self, *_: object) -> None:
         self._give_back_interrupt()

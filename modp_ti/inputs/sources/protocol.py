@@ -5,12 +5,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
+
+if TYPE_CHECKING:
+    from modp_ti.inputs.sources.backlog import Arrivals
 
 __all__ = ["IMAGE_SUFFIXES", "ImageSource", "require_intrinsics"]
 
@@ -107,6 +111,18 @@ class ImageSource(ABC):
     def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
         """Yield the names of `selected` as soon as their images are available. Ends when no more will come."""
         return iter(self.selected(start, stop, step))
+
+    def finish(self) -> None:  # noqa: B027 - other sources end by themselves
+        """End the recording of a source that follows a clock. Images that have arrived are still delivered."""
+
+    @property
+    def arrivals(self) -> Arrivals | None:
+        """Number of images received so far; None for a source that follows no clock."""
+        return None
+
+    def arrived(self, name: str) -> float | None:
+        """Return `time.monotonic()` when a delivered image was received [s]; None if the source follows no clock."""
+        return None
 
     @property
     def frame_size(self) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -60,6 +61,7 @@ class Spool(ImageSource):
         self.reader = FrameReader(self, source)
         self._encoding = hello.encoding
         self._last: tuple[str, NDArray[np.uint8]] | None = None
+        self._received: dict[str, float] = {}
 
     def add(self, frame: Frame) -> str:
         """Store a frame's image.
@@ -79,8 +81,16 @@ class Spool(ImageSource):
         except InputError as error:
             (self.path / name).unlink(missing_ok=True)
             raise UnfitError(f"FRAME {frame.number}: {error}", frame.number) from None
+        self._received[name] = time.monotonic()
         self._append(name, frame.timestamp)
         return name
+
+    def received(self, name: str) -> float:
+        """`time.monotonic()` when the frame was received [s]."""
+        return self._received[name]
+
+    def arrived(self, name: str) -> float | None:
+        return self.received(name)
 
     def name(self, number: int) -> str:
         """The name of the frame with this number."""
@@ -126,9 +136,10 @@ class Spool(ImageSource):
 
     def _decoded(self, name: str) -> NDArray[np.uint8]:
         """Image (H, W, 3 or 4) uint8, RGB first. The last one is cached, since it is decoded to check it first."""
-        if self._last is None or self._last[0] != name:
-            self._last = name, self._decode(name)
-        return self._last[1]
+        last = self._last  # another thread may replace it
+        if last is None or last[0] != name:
+            self._last = last = name, self._decode(name)
+        return last[1]
 
     def _decode(self, name: str) -> NDArray[np.uint8]:
         width, height = self.frame_size

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from queue import Full, Queue
+from queue import Empty, Full, Queue
 from threading import Event, Thread
 
 import numpy as np
@@ -14,6 +14,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import PosedImage, points_inside, tracked_frame
 from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, SenderGoneError
@@ -35,9 +36,14 @@ from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError
 
 __all__ = ["TrackerServer", "open_tracker_server"]
 
+# What the server has received, in order; the images and points of frames are in the spool.
+_Waiting = PosedImage | PoseCorrection | InputError | None
+
 # Pause [s] after a connection that failed before its first frame: BREATH times the number of such connections, at most
 # LONGEST_BREATH. Without it, a client that reconnects in a loop would keep a processor busy.
 BREATH, LONGEST_BREATH = 0.01, 0.5
+# Frames and corrections that wait for the mapper before the server reads slower. They wait on disk.
+MAX_WAITING = 1000
 # Unusable messages that are skipped before the stream ends: FEW_UNFIT, plus UNFIT_SHARE of the frames received.
 FEW_UNFIT, UNFIT_SHARE = 3, 0.1
 
@@ -68,9 +74,9 @@ def open_tracker_server(
 class TrackerServer(Tracker):
     """A live `Tracker` that listens on a socket and delivers what another program sends.
 
-    A background thread reads, checks and decodes the messages. At most `source.prefetch` decoded frames and
-    corrections (at least one) wait for the mapper. When this queue is full, the server stops reading, and the sender's
-    writes block.
+    A background thread reads and checks the messages, and stores images and points on disk. A second one decodes them
+    for the mapper, `source.prefetch` frames (at least one) ahead. When `MAX_WAITING` frames and corrections wait to be
+    decoded, the server stops reading, and the sender's writes block.
 
     A connection that fails before its first frame is dropped and counted in a note; the server keeps listening. Idle
     connections do not block an active sender. After the first frame, the end of the connection ends the stream, and the
@@ -99,13 +105,18 @@ class TrackerServer(Tracker):
         self._indices: dict[int, int] = {}  # indices of the delivered frames by the sender's frame numbers
         self._dropped, self._dropped_note = 0, ""
         self._unfit: list[str] = []  # error messages of the skipped messages
+        self._waiting: Queue[_Waiting] = Queue(MAX_WAITING)
         self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
+        self._newest = 0.0  # arrival of the newest frame
+        self._arrived = self._lost = 0
         self._closed = Event()
         self._ended = False
         self._say_waiting(0)
-        # A daemon thread, so that the process can exit without `close`.
+        # Daemon threads, so that the process can exit without `close`.
         self._thread = Thread(target=self._serve, name="server", daemon=True)
+        self._decoder = Thread(target=self._decode, name="received frames", daemon=True)
         self._thread.start()
+        self._decoder.start()
 
     # ---- called by the mapper, in its thread -----------------------------------------------------------------
 
@@ -117,6 +128,12 @@ class TrackerServer(Tracker):
     def scale(self) -> float:
         """Factor on the sent images' sides. `source.scale: auto` keeps them, since their sender chooses their size."""
         return 1.0 if self._source.scale == "auto" else self._source.scale
+
+    @property
+    def live(self) -> LiveCounts:
+        tracked = len(self._indices)
+        waiting = tracked - len(self._history.frames)
+        return LiveCounts(self._arrived, tracked, 0, self._lost, max(0, waiting), self._newest)
 
     def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
         """Iterate once over frames and corrections as they arrive.
@@ -152,6 +169,7 @@ class TrackerServer(Tracker):
         """Stop listening, disconnect the sender and delete the temporary files."""
         self._closed.set()
         self._thread.join()
+        self._decoder.join()
         if self._spool is not None:
             self._spool.close()
 
@@ -188,7 +206,7 @@ class TrackerServer(Tracker):
             self._listener.close()
             if self._path is not None:
                 self._path.unlink(missing_ok=True)
-            self._put(end)
+            self._put(self._waiting, end)
 
     def _talk(self, connection: Connection) -> bool:
         """Serve one connection until it ends. Returns whether the stream has ended with it."""
@@ -280,37 +298,59 @@ class TrackerServer(Tracker):
         name = spool.add(frame)
         spool.reader.require_fitting([(name, spool.undistorter)])
         ordering.add_frame(frame)
+        self._arrived, self._newest = self._arrived + 1, spool.received(name)
         if len(spool) == 1 and spool.hello.name:
             self._notes.append(f"the tracker there is {spool.hello.name}")
 
     def _deliver(self, ordering: Ordering) -> None:
         """Queue what is ready for the mapper; block while the queue is full."""
         for item in ordering.ready():
+            self._lost = ordering.lost
             if self._closed.is_set():
                 return
             if isinstance(item, Correction):
                 index = np.array([self._indices[number] for number in item.numbers.tolist()], dtype=np.int64)
-                self._put(PoseCorrection(index, item.T_camera_world, item.ids, item.xyz))
+                self._put(self._waiting, PoseCorrection(index, item.T_camera_world, item.ids, item.xyz))
             else:
-                self._put(self._arrived(item))
+                self._put(self._waiting, self._posed(item))
+        self._lost = ordering.lost
 
-    def _arrived(self, frame: Frame) -> TrackedFrame:
+    def _posed(self, frame: Frame) -> PosedImage:
+        """Number a frame that has its pose, and store its points. Returns it without them."""
         spool, pose = self._received, frame.T_camera_world
         assert pose is not None
-        index = len(self._indices)
-        self._indices[frame.number] = index
         pixels = spool.undistorter.points(frame.points.pixels)
         points = points_inside(frame.points.xyz, pixels, frame.points.ids, spool.undistorter, pose)
         name = spool.name(frame.number)
-        tracked = tracked_frame(spool.reader, index, PosedImage(name, spool.undistorter, pose, points))
-        spool.keep_points(name, tracked.points)
-        _ = tracked.pyramid  # computed and cached here, in this thread, to save the mapper time
-        return tracked
+        spool.keep_points(name, points)
+        self._indices[frame.number] = len(self._indices)
+        return PosedImage(name, spool.undistorter, pose)
 
-    def _put(self, event: TrackedFrame | PoseCorrection | InputError | None) -> None:
+    def _put(self, to: Queue, event: _Waiting | TrackedFrame) -> None:
         while not self._closed.is_set():
             try:
-                self._events.put(event, timeout=GLANCE)
+                to.put(event, timeout=GLANCE)
             except Full:
                 continue
             return
+
+    # ---- the decoding thread -----------------------------------------------------------------------------------
+
+    def _decode(self) -> None:
+        """Decode what waits, up to `source.prefetch` frames ahead of the mapper."""
+        index = 0
+        while not self._closed.is_set():
+            try:
+                item = self._waiting.get(timeout=GLANCE)
+                if isinstance(item, PosedImage):
+                    posed = item.with_points(self._received.points(item.name))
+                    item = tracked_frame(self._received.reader, index, posed)
+                    index += 1
+                    _ = item.pyramid  # computed and cached here, in this thread, to save the mapper time
+            except Empty:
+                continue
+            except Exception as error:  # as in `_serve`: the run must not be left waiting
+                item = InputError(f"{self.address}: a stored frame cannot be read again: {error}")
+            self._put(self._events, item)
+            if item is None or isinstance(item, InputError):
+                return

@@ -41,6 +41,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
             from modp_ti.inputs.trackers.transforms import open_transforms
 
             return open_transforms(source, tracker, progress)
+        case kinds.KltSettings() if config.tracks_beside_mapping:
+            from modp_ti.inputs.tracking_process import TrackingProcess
+
+            return TrackingProcess(config, progress)
         case kinds.KltSettings():
             from modp_ti.inputs.klt import open_klt
 

@@ -51,9 +51,11 @@ def write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> None:
                     shutil.copyfile(run.folder / "colmap" / copied, folder / copied)
         return
     config = load_scene(run.folder / "config.yaml")
-    if config.is_live:
-        raise InputError(f"{run.folder}: its frames were live and are gone; such a run needs `export.images: true`")
-    tracker = open_tracker(config, line.prepare)
+    if config.is_live or config.source.realtime:
+        raise InputError(
+            f"{run.folder}: its frames were live and cannot be read again; such a run needs `export.images: true`"
+        )
+    tracker = open_tracker(config.without_clock(), line.prepare)
     other = InputError(
         f"{config.source.path or run.folder}: the source no longer gives the frames that were mapped; run the scene "
         "again, with `export.images: true` to keep them"

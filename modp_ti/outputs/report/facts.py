@@ -134,6 +134,17 @@ def other_figures(metrics: Mapping[str, Any]) -> dict[str, str]:
     if corrections["received"]:
         moved = f"{corrections['received']}, of which {corrections['moved']} moved the map"
         figures["corrections from the tracker"] = moved
+    if live := metrics.get("live"):
+        lag = live["lag_seconds"]
+        figures["lag behind the camera"] = f"{lag['median']:.2f} s, 95 %: {lag['p95']:.2f} s, most: {lag['max']:.2f} s"
+        figures["frames"] = (
+            f"{live['arrived']:,} arrived, {live['tracked']:,} tracked, {live['thinned']:,} left out evenly, "
+            f"{live['lost']:,} lost"
+        )
+        figures["keyframes without work"] = (
+            f"{live['keyframes_skipped']:,} skipped, {live['keyframes_merged']:,} merged"
+        )
+        figures["steps a keyframe"] = f"{live['steps_per_keyframe']:.1f}, and {live['further_steps']:,} between frames"
     kept = (metrics.get("retention") or {}).get(last_stage(metrics))
     if kept is not None:
         text = f"{kept['mean']:+.2f} dB in the mean, {kept['worst']:+.2f} dB in the worst 20 in a row"

@@ -87,6 +87,8 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
     drawings = {"psnr": plots.psnr_of_frames(run.scores, run.record.frames)}
     if run.record.frames and run.config.mode == "online":
         drawings["growth"] = plots.growth(run.record.frames)
+    if any(note.lag is not None for note in run.record.frames):
+        drawings["pace"] = plots.pace(run.record.frames)
     if run.record.steps:
         drawings["steps"] = plots.steps(run.record.steps)
     truth = _aligned(run.truth, last.trajectory)

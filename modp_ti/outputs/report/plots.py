@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["growth", "pose_changes", "psnr_of_frames", "steps", "trajectory"]
+__all__ = ["growth", "pace", "pose_changes", "psnr_of_frames", "steps", "trajectory"]
 
 Arguments = ParamSpec("Arguments")
 
@@ -113,6 +113,23 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
     if mapped:
         _line(axes[2], *_xy(mapped, "index", "psnr"), "view-psnr", color=ORANGE)
         _label(axes[2], "frame", "PSNR of the views\nbeing optimised [dB]")
+    return figure
+
+
+@_drawn
+def pace(frames: Sequence[FrameNote]) -> Figure:
+    """Plot lag, waiting frames and the steps of the keyframes over the time of a realtime run."""
+    figure, (lag, waiting, steps) = _panels(1.5, 3)
+    x, y = _xy(frames, "done", "lag")
+    _line(lag, *binned(x, y), "lag", color=ORANGE)
+    _label(lag, "", "lag [s]")
+    _line(waiting, *binned(*_xy(frames, "done", "waiting")), "waiting", color=BLUE)
+    _label(waiting, "", "frames waiting")
+    keyframes = [note for note in frames if note.is_keyframe]
+    _line(steps, *binned(*_xy(keyframes, "done", "steps")), "keyframe-steps", color=GREEN)
+    _label(steps, "time [s]", "steps a keyframe")
+    for axes in (lag, waiting, steps):
+        axes.set_ylim(bottom=0)
     return figure
 
 

@@ -25,6 +25,9 @@ class FrameNote:
         gaussians: Number of Gaussians after the frame.
         psnr: Mean PSNR of the last optimisation step's views [dB], None if nothing was optimised.
         mapped_psnr: PSNR of the keyframe itself after its own steps [dB], None for other frames.
+        lag: In a realtime run, time from the frame's arrival to the map that holds it [s]; otherwise None.
+        waiting: In a realtime run, number of frames that waited when its work began; otherwise None.
+        steps: Number of optimisation steps that it got.
     """
 
     index: int
@@ -34,6 +37,9 @@ class FrameNote:
     gaussians: int
     psnr: float | None
     mapped_psnr: float | None = None
+    lag: float | None = None
+    waiting: int | None = None
+    steps: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,18 +82,28 @@ class RunRecord:
         """Start the clock, before the first frame or before the next frame of a resumed run."""
         self._first = self.clock() - (self.frames[-1].done if self.frames else 0.0)
 
-    def frame(self, index: int, report: FrameReport | None, mapped_psnr: float | None = None) -> None:
+    def frame(
+        self,
+        index: int,
+        report: FrameReport | None,
+        mapped_psnr: float | None = None,
+        lag: float | None = None,
+        waiting: int | None = None,
+    ) -> None:
         """Record a finished frame.
 
         Args:
             index: The frame's index.
             report: What the frame did to the map, None for a held-out frame.
             mapped_psnr: PSNR of a keyframe after its own steps [dB].
+            lag: Time from its arrival to the map that holds it [s], in a realtime run.
+            waiting: Number of frames that waited when its work began, in a realtime run.
         """
         done = self.clock() - self._first
         if report is None:
             before = self.frames[-1].gaussians if self.frames else 0
-            self.frames.append(FrameNote(index, True, False, done, before, None))
+            note = FrameNote(index, True, False, done, before, None, None, lag, waiting)
         else:
-            note = FrameNote(index, False, report.is_keyframe, done, report.gaussians, report.psnr, mapped_psnr)
-            self.frames.append(note)
+            of = index, False, report.is_keyframe, done, report.gaussians, report.psnr
+            note = FrameNote(*of, mapped_psnr, lag, waiting, report.steps)
+        self.frames.append(note)

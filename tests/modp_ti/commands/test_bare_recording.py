@@ -127,8 +127,12 @@ def test_a_name_that_no_folder_can_have_is_shortened(folder):
     [
         (["gone.yaml"], "gone.yaml: no such scene file"),
         (["gone"], "gone: no such scene file"),
-        (["room.mp4", "--stream", "0"], "--stream is instead of a scene file and of --resume: give one of them"),
-        (["--resume", "out", "--stream", "0"], "--stream is instead of a scene file and of --resume: give one of them"),
+        (["room.mp4", "--stream", "0"], "--stream and --replay need no scene file and no --resume: give one of them"),
+        (["room.mp4", "--replay", "out"], "--stream and --replay need no scene file and no --resume: give one of them"),
+        (
+            ["--resume", "out", "--stream", "0"],
+            "--stream and --replay need no scene file and no --resume: give one of them",
+        ),
         (["room.mp4", "--resume", "out"], "room.mp4: --resume has the recording already; leave it out"),
         (["--stream", "0", "--set", "tracker.kind=colmap"], "colmap cannot use source.stream"),
         (["room.mp4", "--set", "source.scal=1"], "unknown key `source.scal`; did you mean `source.scale`?"),

@@ -348,3 +348,26 @@ def test_reference_of_the_keys_is_up_to_date():
     page = Path(__file__).resolve().parents[3] / "docs" / "configuration.md"
     reference = markdown_of_keys(SceneConfig) + "\n" + markdown_of_presets()
     assert page.read_text() == reference, "run: python -m modp_ti.config > docs/configuration.md"
+
+
+@pytest.mark.parametrize(
+    ("text", "realtime"),
+    [
+        ("source: {path: images}\ntracker: {kind: klt}", False),
+        ("source: {path: images, realtime: true}\ntracker: {kind: klt}", True),
+        ("source: {stream: 0}\ntracker: {kind: klt}", True),
+        ("tracker: {kind: socket}", True),
+        ("source: {stream: 0}\ntracker: {kind: klt}\nmapping: {pace: complete}", False),
+        ("source: {path: images}\ntracker: {kind: klt}\nmapping: {pace: realtime}", True),
+        ("source: {path: images}\ntracker: {kind: klt}\nmapping: {pace: realtime}\nmode: offline", False),
+    ],
+)
+def test_live_frames_set_the_pace_unless_the_scene_says_otherwise(scene, text: str, realtime: bool) -> None:
+    config = load_scene(scene(f"{text}\noutput: out\n"))
+    assert config.is_realtime is realtime
+    assert not (config.is_realtime and config.can_be_resumed)
+
+
+def test_a_realtime_run_has_no_snapshots(scene) -> None:
+    text = failure(scene(MINIMAL), "mapping.pace=realtime", "snapshot_every=10")
+    assert "snapshot_every is for `mapping.pace: complete`; remove one of them" in text

@@ -137,3 +137,34 @@ def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scen
         [sys.executable, "-c", RUNS, str(scene)], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_what_is_there_is_known_before_it_is_taken() -> None:
+    more = threading.Event()
+
+    def source() -> Iterator[TrackedFrame]:
+        first, second = Source(2)
+        yield first
+        assert more.wait(timeout=PATIENCE)
+        yield second
+
+    with FramesAhead(source(), 2) as frames:
+        assert next(frames).index == 0
+        assert not frames.ready() and frames.waiting == 0 and frames.peek() is None
+        more.set()
+        thread = frames._thread
+        assert thread is not None
+        thread.join(timeout=PATIENCE)  # the second frame and the end are there
+        assert frames.ready() and frames.waiting == 2
+        peeked = frames.peek()
+        assert peeked is not None and peeked.index == 1 and frames.waiting == 2
+        assert next(frames) is peeked
+        assert frames.ready() and frames.peek() is None, "the end is there, but nothing to take"
+        assert next(frames, None) is None and frames.ready()
+
+
+@pytest.mark.parametrize("ahead", [0, 3])
+def test_what_is_put_back_comes_next(ahead: int) -> None:
+    with FramesAhead(Source(3), ahead) as frames:
+        frames.put_back(next(frames))
+        assert [frame.index for frame in frames] == [0, 1, 2]

@@ -6,6 +6,7 @@ import pytest
 from rich.console import Console
 
 from modp_ti.outputs import progress
+from modp_ti.outputs.live_status import LiveStatus
 from modp_ti.outputs.progress import ProgressLine
 from pipelines.pipeline import FrameReport
 
@@ -100,3 +101,13 @@ def test_what_follows_may_be_told_from_the_pace(monkeypatch: pytest.MonkeyPatch)
         line.step(step, 25.0)
     line.stop()
     assert console.file.getvalue().split("refining 20/40")[1].splitlines()[0].endswith("2 min left")
+
+
+def test_a_realtime_run_shows_how_it_keeps_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    console = Console(file=io.StringIO(), width=200)
+    line = ProgressLine(console)
+    line.start("mapping", None)
+    line.frame(FrameReport(0, True, 1, 1200, 20.5, 4), None, LiveStatus(10.0, 9.5, 0.42, 3, 4.25))
+    line.stop()
+    assert "lag 0.4 s, 3 waiting, camera 10.0/s, tracked 9.5/s, 4.2 steps a keyframe" in console.file.getvalue()

@@ -40,6 +40,7 @@ def listing(folder: Path) -> None:
 DATA = {
     "A folder of images": (lambda at: image(at / "images/frame2.jpg", 64, 48), "frame2.jpg", (64, 48)),
     "A video": (lambda at: video(at / "room.mp4"), "room_000012", (64, 48)),
+    "A recording at its own pace": (lambda at: video(at / "room.mp4"), "room_000012", (64, 48)),
     "TUM RGB-D": (lambda at: listing(at / "rgbd_dataset_freiburg1_desk"), "rgb/1.png", (640, 480)),
     "Replica": (lambda at: image(at / "room0/results/frame000000.jpg", 1200, 680), "frame000000.jpg", (1200, 680)),
     "7-Scenes": (

@@ -1,7 +1,4 @@
-"""A live source delivers frames as they come, can be read again, drops what nobody takes, and lets go at its end.
-
-The stream is MJPEG over HTTP from a server in a thread of this process, which sends a frame when the test says so.
-"""
+"""A live source delivers frames as they come, can be read again, keeps what nobody takes, and lets go at its end."""
 
 from __future__ import annotations
 
@@ -11,9 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -21,8 +16,9 @@ import pytest
 
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import open_source
-from modp_ti.inputs.sources.live import WAITING, LiveSource
+from modp_ti.inputs.sources import live, open_source
+from modp_ti.inputs.sources.live import LiveSource
+from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
@@ -38,49 +34,14 @@ def interruptible():
 
 def jpeg(number: int) -> bytes:
     """A flat picture whose grey value tells its number."""
-    _, data = cv2.imencode(".jpg", np.full((48, 64, 3), 5 * number, np.uint8))
-    return data.tobytes()
+    return encoded(np.full((48, 64, 3), 5 * number, np.uint8))
 
 
-class Camera:
-    """send: a frame of this number; end: of the stream."""
-
-    def __init__(self) -> None:
-        self._frames: SimpleQueue[int | None] = SimpleQueue()
-        camera = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                self.send_response(200)
-                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-                self.end_headers()
-                while (number := camera._frames.get()) is not None:
-                    data = jpeg(number)
-                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                    try:
-                        self.wfile.write(head.encode() + data + b"\r\n")
-                    except OSError:
-                        return  # the client is gone
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = True
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-        self.url = f"http://user:secret@127.0.0.1:{self._server.server_address[1]}/stream.mjpg?quality=90"
+class Camera(MjpegCamera):
+    """send: frames of these numbers."""
 
     def send(self, *numbers: int) -> None:
-        for number in numbers:
-            self._frames.put(number)
-
-    def end(self) -> None:
-        self._frames.put(None)
-
-    def shut_down(self) -> None:
-        self.end()
-        self._server.shutdown()
-        self._server.server_close()
+        self.send_jpeg(*map(jpeg, numbers))
 
 
 @pytest.fixture
@@ -132,7 +93,11 @@ def test_frames_arrive_in_order_with_their_times_and_can_be_read_again(camera, o
     assert source.position("live_000004") == 4
     assert source.size("live_000004") == (64, 48)
     assert source.find("x/live_000002.png") == "live_000002" and source.find("2") is None
-    assert len(source.notes) == 1, "nothing was dropped"
+    assert len(source.notes) == 1, "nothing was left out"
+    assert (source.arrivals.arrived, source.arrivals.thinned) == (6, 0)
+    arrived = [source.arrived(name) for name in names]
+    assert arrived == sorted(arrived) and arrived[-1] == source.arrivals.newest <= time.monotonic()
+    assert source.timestamp(names[5]) - source.timestamp(names[0]) == pytest.approx(arrived[5] - arrived[0], abs=1e-5)
     source.add_note("the camera is guessed")
     assert source.notes[1:] == ["the camera is guessed"]
 
@@ -143,8 +108,10 @@ def test_what_is_read_again_is_what_the_decoder_gave(camera, opened):
     source = opened()
     name = list(source.arriving(0, None, 1))[3]
     expected = cv2.imdecode(np.frombuffer(jpeg(3), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    assert np.abs(source.read(name).astype(int) - expected).max() <= 2  # two decoders of JPEG
-    assert np.array_equal(source.read(name), source.read(name))
+    image = source.read(name)
+    assert np.abs(image.astype(int) - expected).max() <= 2  # two decoders of JPEG
+    source._last = None  # so that it is read from the disk
+    assert np.array_equal(source.read(name), image)
 
 
 def test_a_frame_is_delivered_before_the_next_has_come(camera, opened):
@@ -157,16 +124,36 @@ def test_a_frame_is_delivered_before_the_next_has_come(camera, opened):
     assert numbers(source, [next(arriving) for _ in range(4)]) == [3, 4, 5, 6]
 
 
-def test_frames_that_nobody_takes_are_dropped_oldest_first_and_counted(camera, opened):
-    total = WAITING + 15
-    camera.send(*range(total))
+def test_frames_that_nobody_takes_wait_on_disk_beyond_a_limit_of_memory(camera, opened, monkeypatch):
+    monkeypatch.setattr(live, "MEMORY", 3 * 64 * 48 * 3)
+    camera.send(*range(20))
     camera.end()
     source = opened()
     wait_until(lambda: not source._thread.is_alive())
+    assert sorted(file.name for file in source._store.folder.iterdir()) == [
+        f"waiting-{i:06d}.png" for i in range(3, 20)
+    ]
     names = list(source.arriving(0, None, 1))
-    assert numbers(source, names) == list(range(15, total))
-    assert source.dropped == 15
-    assert source.notes[1].startswith("15 frames of ") and source.notes[1].endswith(f"dropped; {WAITING} were used")
+    assert numbers(source, names) == list(range(20)), "their tracker takes no time"
+    assert source._held == 0
+    assert sorted(file.name for file in source._store.folder.iterdir()) == [f"{i:06d}.png" for i in range(20)]
+
+
+def test_a_slow_tracker_gets_frames_that_are_thinned_evenly_and_all_are_counted(camera, opened, monkeypatch):
+    monkeypatch.setattr(live, "MEMORY", 3 * 64 * 48 * 3)
+    camera.send(*range(45))
+    camera.end()
+    source = opened()
+    wait_until(lambda: not source._thread.is_alive())
+    taken = []
+    for name in source.arriving(0, None, 1):
+        taken += numbers(source, [name])
+        time.sleep(0.02)  # the 45 frames came in much less
+    gaps = np.diff(taken)
+    assert len(taken) + source.arrivals.thinned == source.arrivals.arrived == 45
+    assert gaps.max() > 1 and (np.diff(gaps) <= 1).all()
+    assert source.notes[-1].startswith(f"{45 - len(taken)} of 45 frames of ")
+    assert len(list(source._store.folder.iterdir())) == len(taken)
 
 
 def test_stop_lets_the_camera_go(camera, opened):
@@ -276,9 +263,16 @@ def test_full_disk_is_said_in_one_line(camera, opened, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
+    said = r"cannot be kept there: No space left on device; make room, or set TMPDIR"
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_bytes", full)
+        with pytest.raises(InputError, match=said):
+            next(source.arriving(0, None, 1))
+    arriving = source.arriving(0, None, 1)
+    taken = [next(arriving)]
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(InputError, match=r"cannot be kept there: No space left on device; make room, or set TMPDIR"):
-        next(source.arriving(0, None, 1))
+    assert list(arriving) == [] and list(source.names) == taken, "the recording ends with what it has"
+    assert "the recording ended early: " in source.notes[-1] and "No space left" in source.notes[-1]
 
 
 @pytest.mark.parametrize(

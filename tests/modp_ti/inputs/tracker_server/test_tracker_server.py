@@ -20,6 +20,7 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings, SocketSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.tracker_server import open_tracker_server
+from modp_ti.inputs.tracker_server import tracker as tracker_server
 from modp_ti.inputs.trackers import Tracker
 from modp_ti.inputs.trackers.colmap import open_colmap
 from tests.modp_ti.inputs.tracker_server.clients import (
@@ -160,8 +161,29 @@ def test_alpha_says_which_pixels_count(tmp_path: Path) -> None:
         assert only.rgba[0, 0].tolist() == [200, 200, 200, 255]
 
 
+def test_a_sender_is_not_held_up_by_a_busy_mapper(tmp_path: Path) -> None:
+    with opened(tmp_path / "s", prefetch=1, holdout=2) as tracker, greeted(tmp_path / "s") as connection:
+        before = time.monotonic()
+        for number in range(200):
+            connection.sendall(message(FRAME, frame(number, state=2 if number == 100 else 1)))
+        connection.sendall(message(END))
+        assert answer(connection) == (DONE, struct.pack("<I", 199)), "though the mapper has taken none"
+        live = tracker.live
+        assert (live.arrived, live.tracked, live.lost, live.thinned, live.waiting) == (200, 199, 1, 0, 199)
+        assert before <= live.newest <= time.monotonic()
+        events = tracker.events()
+        frames = [next(events) for _ in range(50)]
+        assert tracker.live.waiting == 149
+        frames += events
+        assert colours(frames) == [number for number in range(200) if number != 100]
+        arrived = [f.arrived for f in frames]
+        assert arrived == sorted(arrived) and before <= arrived[0] and arrived[-1] == live.newest
+        assert [f.index for f in frames if f.held_out] == list(range(0, 199, 2))
+
+
 @pytest.mark.slow
-def test_nothing_more_is_read_while_the_mapper_is_busy(tmp_path: Path) -> None:
+def test_nothing_more_is_read_while_too_much_waits_for_the_mapper(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(tracker_server, "MAX_WAITING", 3)
     with opened(tmp_path / "s", prefetch=1) as tracker, greeted(tmp_path / "s") as connection:
         sent = 0
 
@@ -182,7 +204,8 @@ def test_nothing_more_is_read_while_the_mapper_is_busy(tmp_path: Path) -> None:
             before = sent
             time.sleep(0.5)
         assert 0 < sent < 1500
-        assert len(os.listdir(tracker._spool.path)) < 10
+        # Those that wait, one that is decoded, and one that each thread holds; with a file for the points of each.
+        assert len(os.listdir(tracker._spool.path)) <= 2 * (3 + 1 + 2)
         assert sum(1 for _ in tracker) == 1500
         thread.join()
 

@@ -256,3 +256,36 @@ def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path, stages) -> N
     else:
         assert said.startswith("report.html could not be made: IndexError") and "\n" not in said
         assert not (run.config.output / "report.html").exists()
+
+
+def test_a_realtime_run_shows_lag_and_steps_over_time(tmp_path) -> None:
+    run = made_up_run(tmp_path)
+    notes = [
+        dataclasses.replace(note, lag=0.01 * note.index, waiting=note.index % 5, steps=3 + note.index % 4)
+        for note in run.record.frames
+    ]
+    run.record.frames[:] = notes
+    live = {
+        "arrived": 1200,
+        "tracked": 24,
+        "thinned": 1170,
+        "lost": 6,
+        "keyframes_merged": 2,
+        "keyframes_skipped": 3,
+        "steps_per_keyframe": 4.25,
+        "further_steps": 17,
+        "seconds_to_map": 2.5,
+        "rate_arrived": 30.0,
+        "rate_tracked": 12.5,
+        "lag_seconds": {"median": 0.31, "p95": 0.9, "max": 1.25},
+    }
+    page, html = written(tmp_path, dataclasses.replace(run, metrics={**run.metrics, "live": live}))
+    curves = page.curves()
+    done = [note.done for note in notes]
+    assert_draws(curves["lag"][0], done, [note.lag for note in notes])
+    assert_draws(curves["waiting"][0], done, [note.waiting for note in notes])
+    keyframes = [note for note in notes if note.is_keyframe]
+    of = [note.done for note in keyframes], [note.steps for note in keyframes]
+    assert_draws(curves["keyframe-steps"][0], *of)
+    for shown in ("0.31 s, 95 %: 0.90 s, most: 1.25 s", "3 skipped, 2 merged", "4.2, and 17 between frames"):
+        assert shown in html

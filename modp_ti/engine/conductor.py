@@ -1,0 +1,85 @@
+"""`Conductor`: takes the tracker's frames and corrections to the mapper, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.interruption import Interruption
+from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.outputs.live_status import LiveStatus
+from pipelines.pace import Pace
+from pipelines.pipeline import FrameReport
+from pipelines.refinement import Schedule, in_seconds
+from pipelines.settings import RefineSettings
+
+__all__ = ["Conductor", "Event"]
+
+Event = TrackedFrame | PoseCorrection
+
+
+class Conductor:
+    """Takes frames and corrections to the mapper, each as soon as the mapper is done with the previous one."""
+
+    @property
+    def pace(self) -> Pace | None:
+        """Pace of the mapper, None for all the work of the settings."""
+        return None
+
+    def events(
+        self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]
+    ) -> Iterator[Event]:
+        """Yield the frames and corrections, and count the time that the mapper waits for them as `read`.
+
+        Args:
+            ahead: The frames and corrections.
+            mapper: The mapper that they are for.
+            stop: Ends the iteration after Ctrl-C.
+            further: Called after each step that is made between two frames.
+        """
+        while True:
+            with mapper.pipeline.stopwatch.measure("read"), stop.waiting():
+                event = next(ahead, None)
+            if event is None:
+                return
+            yield event
+
+    def add(self, mapper: Mapper, frame: TrackedFrame) -> FrameReport | None:
+        """Map a frame, as `Mapper.add` does."""
+        return mapper.add(frame)
+
+    def correct(self, mapper: Mapper, correction: PoseCorrection) -> None:
+        """Apply a correction."""
+        mapper.correct(correction)
+
+    def schedule(self, settings: RefineSettings) -> Schedule | None:
+        """Return the schedule of the refinement, None for `settings.steps`."""
+        return None if settings.seconds is None else in_seconds(settings.seconds)
+
+    def status(self) -> LiveStatus | None:
+        """Return the recent figures of a realtime run, None for other runs."""
+        return None
+
+    def note(self) -> dict[str, Any]:
+        """Return what `RunRecord.frame` notes of the last frame in a realtime run."""
+        return {}
+
+    def saved(self) -> None:
+        """Called when the map has been written."""
+
+    def write_session(self, folder: Path, config: SceneConfig) -> None:
+        """Write what is needed to repeat a run that followed a clock. Raises OSError if that fails.
+
+        Args:
+            folder: The output folder.
+            config: The run's settings.
+        """
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the entries of `metrics.json` about a realtime run."""
+        return {}

@@ -1,0 +1,224 @@
+"""`RealtimeRun`: the clock of a realtime run, between the arriving frames, the pace and the mapper."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.conductor import Conductor, Event
+from modp_ti.engine.interruption import Interruption
+from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.engine.recording import FILE, SessionRecorder
+from modp_ti.inputs.live_counts import LiveCounts
+from modp_ti.inputs.protocol import Tracker
+from modp_ti.outputs.live_status import LiveStatus
+from pipelines.pace import RealtimePace
+from pipelines.pipeline import FrameReport
+from pipelines.refinement import Schedule
+from pipelines.settings import MappingSettings, RefineSettings
+
+__all__ = ["RealtimeRun"]
+
+# Time over which the shown rates are taken [s], and number of keyframes over which the shown steps are.
+RECENT, KEYFRAMES = 5.0, 10
+
+
+class RealtimeRun(Conductor):
+    """Keeps the mapper in step with the arriving frames.
+
+    This object reads the clock. It tells the pace when frames arrive and what their work costs, and spends the time in
+    which no frame waits on further steps.
+
+    Args:
+        settings: Settings of the mapping.
+        tracker: The tracker, whose counts are shown and reported.
+        recorder: Records the session, None for no recording.
+        clock: Returns the time on the clock of `TrackedFrame.arrived` [s].
+
+    Attributes:
+        lag: Time from each frame's arrival to the map that holds it [s].
+        waiting: Number of frames that waited when each frame's work began.
+        steps: Number of optimisation steps of each frame that should have become a keyframe.
+        further: Number of steps while no frame was waiting.
+    """
+
+    def __init__(
+        self,
+        settings: MappingSettings,
+        tracker: Tracker,
+        recorder: SessionRecorder | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._pace = RealtimePace(settings)
+        self.lag: list[float] = []
+        self.waiting: list[int] = []
+        self.steps: list[int] = []
+        self.further = 0
+        self._tracker = tracker
+        self._recorder = recorder
+        self._clock = clock
+        self._ahead: FramesAhead[Event]
+        self._done: float | None = None  # end of the previous event's work
+        self._first: float | None = None  # arrival of the first frame
+        self._last = 0.0  # arrival of the last one
+        self._saved: float | None = None
+        self._recent: deque[tuple[float, int, int]] = deque()  # newest arrival, frames arrived, frames tracked
+
+    @property
+    def pace(self) -> RealtimePace:
+        return self._pace
+
+    def events(
+        self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]
+    ) -> Iterator[Event]:
+        """Yield frames and corrections as they arrive, and optimise the map further while none waits.
+
+        Args:
+            ahead: The frames and corrections.
+            mapper: The mapper that they are for.
+            stop: Ends the iteration after Ctrl-C.
+            further: Called after each further step.
+        """
+        self._ahead = ahead
+        watch = mapper.pipeline.stopwatch
+        while True:
+            self._count_aside()
+            while not ahead.ready():
+                stop.check()
+                if not self._step_further(mapper):
+                    break  # there is no map yet
+                further()
+            with watch.measure("read"), stop.waiting():
+                event = next(ahead, None)
+            if event is None:
+                return
+            self._done = self._clock()
+            yield event
+
+    def _count_aside(self) -> None:
+        """Count the time since the last frame was mapped, such as the viewer's, for the pace."""
+        if self._done is not None:
+            self.pace.spend_aside(self._clock() - self._done)
+
+    def _step_further(self, mapper: Mapper) -> bool:
+        """Optimise the map by a step; return whether there was something to optimise."""
+        began = self._clock()
+        if not mapper.optimise_further():
+            return False
+        self.further += 1
+        if self._recorder is not None:
+            self._recorder.add_further_step()
+        self.pace.spend_idle(self._clock() - began)
+        return True
+
+    def add(self, mapper: Mapper, frame: TrackedFrame) -> FrameReport | None:
+        """Map a frame by the pace, and learn what it cost."""
+        if self._recorder is not None:
+            self._recorder.add_frame(frame)
+        began = self._clock()
+        arrived = began if frame.arrived is None else frame.arrived
+        self._first = arrived if self._first is None else self._first
+        self._last = arrived
+        self.waiting.append(self._waiting())
+        decisions = len(self.pace.decisions)
+        self.pace.begin_frame(arrived, began)
+        before = dict(mapper.pipeline.stopwatch.seconds)
+        report = mapper.add(frame)
+        after = mapper.pipeline.stopwatch.seconds
+        self._done = self._clock()
+        depth, optimise = (after.get(stage, 0.0) - before.get(stage, 0.0) for stage in ("depth", "optimise"))
+        steps = 0 if report is None else report.steps
+        self.pace.end_frame(self._done - began, depth, optimise, steps)
+        self.lag.append(self._done - arrived)
+        if len(self.pace.decisions) > decisions:
+            self.steps.append(steps)
+        return report
+
+    def correct(self, mapper: Mapper, correction: PoseCorrection) -> None:
+        """Apply a correction, and count its time. If another one waits behind it, the Gaussians move with that one."""
+        more = isinstance(self._ahead.peek(), PoseCorrection)
+        if self._recorder is not None:
+            self._recorder.add_correction(correction, more)
+        mapper.correct(correction, more)
+        self._count_aside()
+        self._done = self._clock()
+
+    def schedule(self, settings: RefineSettings) -> Schedule | None:
+        schedule = super().schedule(settings)
+        return schedule if schedule is None or self._recorder is None else self._recorder.recorded(schedule)
+
+    def write_session(self, folder: Path, config: SceneConfig) -> None:
+        """Write the recorded session to a folder, if it was recorded. Raises OSError if that fails."""
+        if self._recorder is not None:
+            costs = {kind: round(seconds, 5) for kind, seconds in self.pace.costs.known().items()}
+            about = {"settings": config.model_dump(mode="json"), "lag": self.lag, "costs": costs}
+            self._recorder.write(folder / FILE, self.pace.decisions, about)
+
+    def status(self) -> LiveStatus:
+        """Return the recent figures."""
+        counts = self._counts()
+        self._recent.append((counts.newest, counts.arrived, counts.tracked))
+        while len(self._recent) > 2 and self._recent[1][0] < counts.newest - RECENT:
+            self._recent.popleft()
+        since, arrived, tracked = self._recent[0]
+        seconds = max(counts.newest - since, 1e-9)
+        camera, rate = ((now - then) / seconds for now, then in ((counts.arrived, arrived), (counts.tracked, tracked)))
+        steps = self.steps[-KEYFRAMES:]
+        return LiveStatus(
+            camera if len(self._recent) > 1 else 0.0,
+            rate if len(self._recent) > 1 else 0.0,
+            self.lag[-1],
+            counts.waiting,
+            float(np.mean(steps)) if steps else 0.0,
+        )
+
+    def saved(self) -> None:
+        self._saved = self._clock()
+
+    def note(self) -> dict[str, Any]:
+        return {"lag": self.lag[-1], "waiting": self.waiting[-1]}
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the entry `live` of `metrics.json`."""
+        counts = self._counts()
+        seconds = max(counts.newest - (self._first or 0.0), 1e-9)
+        lag = np.array(self.lag)
+        live = {
+            "arrived": counts.arrived,
+            "tracked": counts.tracked,
+            "thinned": counts.thinned,
+            "lost": counts.lost,
+            "keyframes_merged": self.pace.merged,
+            "keyframes_skipped": self.pace.skipped,
+            "steps_per_keyframe": round(float(np.mean(self.steps)), 2) if self.steps else 0.0,
+            "further_steps": self.further,
+            "lag_seconds": {
+                "median": round(float(np.median(lag)), 3),
+                "p95": round(float(np.quantile(lag, 0.95)), 3),
+                "max": round(float(lag.max()), 3),
+            },
+            "seconds_to_map": None if self._saved is None else round(self._saved - counts.newest, 3),
+            "rate_arrived": round((counts.arrived - 1) / seconds, 2),
+            "rate_tracked": round((counts.tracked - 1) / seconds, 2),
+        }
+        return {"live": live}
+
+    def _waiting(self) -> int:
+        live = self._tracker.live
+        return self._ahead.waiting + (0 if live is None else live.waiting)
+
+    def _counts(self) -> LiveCounts:
+        """Return the tracker's counts; for a tracker that follows no clock, those of the frames that it delivered."""
+        live = self._tracker.live
+        if live is not None:
+            return live
+        return LiveCounts(len(self.lag), len(self.lag), 0, 0, self._ahead.waiting, self._last)

@@ -1,0 +1,276 @@
+"""Recording of a realtime run: all that arrived and all that was decided by the clock, so that it can be repeated."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
+from modp_ti.engine.conductor import Conductor, Event
+from modp_ti.engine.interruption import Interruption
+from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.protocol import Tracker
+from pipelines.pace import Plan, RecordedPace
+from pipelines.refinement import Schedule
+from pipelines.settings import RefineSettings
+
+__all__ = ["FILE", "RecordedSession", "ReplayedRun", "SessionRecorder"]
+
+FILE = "session.zip"
+# Version of the file. Others are refused.
+VERSION = 1
+ABOUT = "about.json"
+
+
+class SessionRecorder:
+    """Writes a session to a temporary file while it goes on.
+
+    The file is a zip of one array file per frame or correction, in their order, and of `about.json` with the settings,
+    the decisions and the measured times. Images are kept without loss.
+
+    Raises:
+        InputError: If the file cannot be created.
+    """
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-session-", ignore_cleanup_errors=True)
+        self._file = Path(self._folder.name) / FILE
+        self._zip = zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED)
+        self._vignette: NDArray[np.float32] | None = None
+        self._count = self._further = 0
+        self._shares: list[float] | None = None
+
+    def add_further_step(self) -> None:
+        """Count a step that was made before the next frame or correction."""
+        self._further += 1
+
+    def add_frame(self, frame: TrackedFrame) -> None:
+        """Write a frame."""
+        _, image = cv2.imencode(".png", frame.rgba, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        c, points = frame.camera, frame.points
+        arrays = {
+            "index": np.array(frame.index),
+            "timestamp": np.array(frame.timestamp),
+            "arrived": np.array(np.nan if frame.arrived is None else frame.arrived),
+            "name": np.array(frame.name),
+            "image": image,
+            "camera": np.array([c.fx, c.fy, c.cx, c.cy, c.width, c.height]),
+            "T_camera_world": frame.T_camera_world,
+            "xyz": points.xyz,
+            "pixels": points.pixels,
+            "ids": points.ids,
+            "masked": np.array(frame.mask is not None),
+            "held_out": np.array(frame.held_out),
+        }
+        if frame.vignette is not None and frame.vignette is not self._vignette:
+            self._vignette = arrays["vignette"] = frame.vignette
+        self._write(arrays)
+
+    def add_correction(self, correction: PoseCorrection, more: bool) -> None:
+        """Write a correction. `more` is as in `Mapper.correct`."""
+        arrays = {field.name: np.asarray(getattr(correction, field.name)) for field in fields(correction)}
+        self._write({**arrays, "more": np.array(more)})
+
+    def recorded(self, schedule: Schedule) -> Schedule:
+        """Return the schedule of a refinement, and record what it says."""
+        shares = self._shares = []
+
+        def share(step: int) -> float | None:
+            now = schedule(step)
+            if now is not None:
+                shares.append(now)
+            return now
+
+        return share
+
+    def write(self, path: Path, plans: list[Plan | None], about: Mapping[str, Any]) -> None:
+        """Complete the recording and copy it to a path.
+
+        Args:
+            path: The file to write.
+            plans: Decisions of the pace.
+            about: Settings and measured times, as JSON.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        decisions = {
+            "version": VERSION,
+            "plans": [None if plan is None else [plan.pixels, plan.steps] for plan in plans],
+            "further": self._further,
+            "refinement": self._shares,
+        }
+        self._zip.writestr(ABOUT, json.dumps({**decisions, **about}))
+        self._zip.close()
+        shutil.copyfile(self._file, path)
+
+    def close(self) -> None:
+        """Delete the temporary file."""
+        self._zip.close()
+        self._folder.cleanup()
+
+    def _write(self, arrays: dict[str, NDArray]) -> None:
+        file = io.BytesIO()
+        np.savez(file, allow_pickle=False, **arrays, further=np.array(self._further))
+        try:
+            self._zip.writestr(f"{self._count:06d}.npz", file.getvalue())
+        except OSError as error:
+            raise InputError(
+                f"{self._folder.name}: the session cannot be recorded there: {error.strerror}; set TMPDIR to a folder "
+                "with more room, or export.session to false"
+            ) from None
+        self._count, self._further = self._count + 1, 0
+
+
+class RecordedSession(Tracker):
+    """A `Tracker` that delivers the frames and corrections of a recorded session.
+
+    Args:
+        output: Output folder of the recorded run.
+
+    Attributes:
+        settings: Settings of the recorded run, as JSON.
+        plans: Decisions of its pace.
+        further: Number of further steps before each frame or correction, and before the end.
+        more: Whether each correction was followed by another one at once, in order.
+        shares: Schedule of its refinement; None if it followed the number of steps.
+
+    Raises:
+        InputError: If there is no recorded session, or it cannot be read.
+    """
+
+    reads_ahead: ClassVar[bool] = True
+
+    def __init__(self, output: Path) -> None:
+        self._path = output / FILE
+        if not self._path.is_file():
+            raise InputError(f"{self._path}: there is no recorded session; record one with `export.session: true`")
+        try:
+            self._zip = zipfile.ZipFile(self._path)
+            about = json.loads(self._zip.read(ABOUT))
+            if about["version"] != VERSION:
+                raise InputError(f"{self._path}: a session of version {about['version']}, this program reads {VERSION}")
+            self.settings: dict[str, Any] = dict(about["settings"])
+            self.plans = [None if plan is None else Plan(float(plan[0]), int(plan[1])) for plan in about["plans"]]
+            self.shares: list[float] | None = about["refinement"]
+            self._names = sorted(name for name in self._zip.namelist() if name != ABOUT)
+            self.further: list[int] = []
+            self.more: list[bool] = []
+            for name in self._names:
+                arrays = self._arrays(name)
+                self.further.append(int(arrays["further"]))
+                if "more" in arrays:
+                    self.more.append(bool(arrays["more"]))
+            self.further.append(int(about["further"]))
+        except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, IndexError) as error:
+            raise self._damaged(error) from None
+
+    @property
+    def notes(self) -> list[str]:
+        return [f"repeats the session in {self._path}"]
+
+    @property
+    def frame_count(self) -> int:
+        return len(self._names) - len(self.more)
+
+    def __iter__(self) -> Iterator[TrackedFrame]:
+        return (event for event in self.events() if isinstance(event, TrackedFrame))
+
+    def events(self) -> Iterator[Event]:
+        vignette = None
+        for name in self._names:
+            try:
+                arrays = self._arrays(name)
+                vignette = arrays.get("vignette", vignette)
+                event = _frame(arrays, vignette) if "image" in arrays else _correction(arrays)
+            except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, cv2.error) as error:
+                raise self._damaged(error) from None
+            yield event
+
+    def close(self) -> None:
+        """Close the file."""
+        self._zip.close()
+
+    def _arrays(self, name: str) -> dict[str, NDArray]:
+        with np.load(io.BytesIO(self._zip.read(name)), allow_pickle=False) as arrays:
+            return dict(arrays)
+
+    def _damaged(self, error: Exception) -> InputError:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return InputError(f"{self._path}: not a recorded session, or a damaged one ({reason}); record it again")
+
+
+def _frame(arrays: dict[str, NDArray], vignette: NDArray[np.float32] | None) -> TrackedFrame:
+    rgba = np.asarray(cv2.imdecode(arrays["image"], cv2.IMREAD_UNCHANGED), dtype=np.uint8)
+    fx, fy, cx, cy, width, height = arrays["camera"].tolist()
+    return TrackedFrame(
+        index=int(arrays["index"]),
+        timestamp=float(arrays["timestamp"]),
+        name=str(arrays["name"]),
+        image=np.divide(rgba[..., :3], np.float32(255.0), dtype=np.float32),
+        camera=PinholeCamera(fx, fy, cx, cy, int(width), int(height)),
+        T_camera_world=arrays["T_camera_world"],
+        points=SparsePoints(arrays["xyz"], arrays["pixels"], arrays["ids"]),
+        mask=rgba[..., 3] > 0 if bool(arrays["masked"]) else None,
+        vignette=vignette,
+        held_out=bool(arrays["held_out"]),
+    )
+
+
+def _correction(arrays: dict[str, NDArray]) -> PoseCorrection:
+    return PoseCorrection(**{field.name: arrays[field.name] for field in fields(PoseCorrection)})
+
+
+class ReplayedRun(Conductor):
+    """Repeats a recorded session: the same frames get the same work, whatever it costs now.
+
+    Args:
+        session: The recorded session, which is also the tracker.
+    """
+
+    def __init__(self, session: RecordedSession) -> None:
+        self._session = session
+        self._pace = RecordedPace(session.plans)
+        self._more = iter(session.more)
+
+    @property
+    def pace(self) -> RecordedPace:
+        return self._pace
+
+    def events(
+        self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]
+    ) -> Iterator[Event]:
+        counts = iter(self._session.further)
+
+        def step() -> None:
+            for _ in range(next(counts)):
+                stop.check()
+                mapper.optimise_further()
+                further()
+
+        step()
+        for event in super().events(ahead, mapper, stop, further):
+            yield event
+            step()
+
+    def correct(self, mapper: Mapper, correction: PoseCorrection) -> None:
+        mapper.correct(correction, next(self._more))
+
+    def schedule(self, settings: RefineSettings) -> Schedule | None:
+        shares = self._session.shares
+        return None if shares is None else lambda step: shares[step] if step < len(shares) else None

@@ -1,0 +1,141 @@
+"""The tracker's process: opens the source and the tracker, tracks, and sends what the tracker delivers."""
+
+from __future__ import annotations
+
+import os
+import queue
+import shutil
+import signal
+import sys
+import threading
+from multiprocessing.connection import Connection
+
+import cv2
+
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.klt.tracker import KltTracker, open_klt
+from modp_ti.inputs.sources import FrameReader, ImageSource, open_source
+from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout
+from modp_ti.inputs.tracking_process.messages import Delivered, Ended, FrameRecord, Job, Opened, Preparing, RingMade
+from modp_ti.inputs.tracking_process.outbox import Outbox
+
+__all__ = ["main"]
+
+# Interval [s] at which the counts are published and the wish to finish is noticed.
+GLANCE = 0.05
+
+
+def main() -> None:
+    """Serve the parent process, whose descriptors of pipe, ring and board are the arguments."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent decides what it means
+    cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the end of a stream is told in a note
+    pipe, ring, board = (int(argument) for argument in sys.argv[1:4])
+    connection = Connection(pipe)
+    try:
+        job = connection.recv()
+    except EOFError:
+        return
+    _Child(connection, ring, CountsBoard(board), job).run()
+
+
+class _Child:
+    """The tracker and its threads: this one tracks, one sends, and one listens to the parent."""
+
+    def __init__(self, connection: Connection, ring: int, board: CountsBoard, job: Job) -> None:
+        self._connection = connection
+        self._memory = ring
+        self._board = board
+        self._job = job
+        self._slots = max(2, job.config.source.prefetch)
+        self._free: queue.SimpleQueue[int] = queue.SimpleQueue()
+        for slot in range(self._slots):
+            self._free.put(slot)
+        self._outbox = Outbox(self._slots)
+        self._images: ImageSource | None = None
+        self._tracker: KltTracker | None = None
+        threading.Thread(target=self._listen, name="parent", daemon=True).start()
+
+    def run(self) -> None:
+        """Track the source to its end."""
+        source = self._job.config.source
+        error = failure = None
+        sender = None
+        try:
+            self._images = open_source(source, self._job.folder)
+            self._tracker = tracker = open_klt(source, self._job.config.seed, self._prepare, self._images)
+            self._publish()
+            self._connection.send(Opened(tracker.notes, tracker.scale, tracker.intrinsics))
+            sender = threading.Thread(target=self._send, name="sender", daemon=True)
+            sender.start()
+            for event in tracker.events():
+                self._publish()
+                self._outbox.put(event)
+        except InputError as caught:
+            error = caught
+        except Exception as caught:  # told to the parent, which saves its map
+            failure = f"{type(caught).__name__}: {caught}"
+        self._publish()
+        notes = [] if self._tracker is None else self._tracker.notes
+        ended = Ended(notes, {} if self._tracker is None else dict(self._tracker.unreadable), error, failure)
+        if sender is None:
+            self._connection.send(ended)
+        else:
+            self._outbox.put(ended)
+            sender.join()
+        if self._images is not None:
+            self._images.close()
+
+    def _prepare(self, what: str, done: int, total: int) -> None:
+        self._connection.send(Preparing(what, done, total))
+
+    def _publish(self) -> None:
+        if self._tracker is not None:
+            self._board.write(self._tracker.live, self._tracker.frame_count)
+
+    # ---- the sending thread ----------------------------------------------------------------------------------
+
+    def _send(self) -> None:
+        """Send the events in order, each frame as soon as a slot is free."""
+        assert self._tracker is not None and self._images is not None
+        reader = FrameReader(self._images, self._job.config.source)
+        undistorter = self._tracker.undistorter
+        ring: FrameRing | None = None
+        while True:
+            event = self._outbox.get()
+            try:
+                if isinstance(event, FrameRecord | TrackedFrame):
+                    slot = self._free.get()
+                    if isinstance(event, FrameRecord):
+                        event = event.with_picture(reader.read(event.name, undistorter))
+                    if ring is None:
+                        ring = FrameRing(self._memory, SlotLayout.of(event), self._slots)
+                        self._connection.send(RingMade(ring.layout, event.vignette))
+                    ring.write(slot, event)
+                    self._connection.send(Delivered(slot, FrameRecord.of(event), event.mask is not None))
+                else:
+                    self._connection.send(event)
+                    if isinstance(event, Ended):
+                        return
+            except InputError as error:  # a stored image is gone
+                self._connection.send(Ended(self._tracker.notes, self._tracker.unreadable, error))
+                return
+
+    # ---- the listening thread --------------------------------------------------------------------------------
+
+    def _listen(self) -> None:
+        """Take back slots, publish the counts and end the recording when asked. If the parent is gone, exit."""
+        finished = False
+        try:
+            while True:
+                if self._connection.poll(GLANCE):
+                    self._free.put(self._connection.recv())
+                self._publish()
+                if self._board.finish and not finished and self._images is not None:
+                    finished = True
+                    self._images.finish()
+        except (EOFError, OSError):
+            if self._job.folder is not None:
+                shutil.rmtree(self._job.folder, ignore_errors=True)
+            os._exit(1)

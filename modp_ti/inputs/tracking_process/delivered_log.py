@@ -1,0 +1,69 @@
+"""The frames that the tracker's process has delivered, with their latest poses and points."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import SparsePoints
+from modp_ti.inputs.tracking_process.messages import FrameRecord
+
+__all__ = ["DeliveredLog"]
+
+POINT = np.dtype([("id", "i8"), ("xyz", "f8", 3), ("pixel", "f8", 2)])
+
+
+class DeliveredLog:
+    """Records of the delivered frames in order, with all corrections applied.
+
+    Only the frames that a correction lists move: `klt` lists all that it moves. The points are kept in a file without
+    a name.
+
+    Attributes:
+        records: The records without their points.
+    """
+
+    def __init__(self) -> None:
+        self.records: list[FrameRecord] = []
+        self._counts: list[int] = []
+        self._points: IO[bytes] = tempfile.TemporaryFile()
+        self._moved: dict[int, NDArray[np.float64]] = {}
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def add(self, record: FrameRecord) -> None:
+        """Add a delivered frame."""
+        points = record.points
+        table = np.zeros(len(points), POINT)
+        table["id"], table["xyz"], table["pixel"] = points.ids, points.xyz, points.pixels
+        self._points.seek(0, 2)
+        self._points.write(table.tobytes())
+        self.records.append(record.with_pose(record.T_camera_world, SparsePoints()))
+        self._counts.append(len(points))
+
+    def correct(self, correction: PoseCorrection) -> None:
+        """Apply a correction."""
+        for index, T in zip(correction.index.tolist(), correction.T_camera_world, strict=True):
+            record = self.records[index]
+            self.records[index] = record.with_pose(T, record.points)
+        self._moved.update(zip(correction.ids.tolist(), correction.xyz, strict=True))
+
+    def __iter__(self) -> Iterator[FrameRecord]:
+        at = 0
+        for record, count in zip(self.records, self._counts, strict=True):
+            self._points.seek(at)
+            data = self._points.read(count * POINT.itemsize)
+            at += len(data)
+            table = np.frombuffer(data, POINT)
+            xyz = np.array([self._moved.get(i, old) for i, old in zip(table["id"].tolist(), table["xyz"], strict=True)])
+            points = SparsePoints(xyz.reshape(-1, 3), table["pixel"].copy(), table["id"].copy())
+            yield record.with_pose(record.T_camera_world, points)
+
+    def close(self) -> None:
+        self._points.close()

@@ -1,0 +1,168 @@
+"""Shared memory of the two processes: slots for frames, and the counts of the stream."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.pyramid import ImageLevel
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.live_counts import LiveCounts
+from modp_ti.inputs.sources import Picture
+
+if TYPE_CHECKING:
+    from modp_ti.inputs.tracking_process.messages import FrameRecord
+
+__all__ = ["CountsBoard", "FrameRing", "SlotLayout", "anonymous_memory"]
+
+
+def anonymous_memory() -> int:
+    """Return the descriptor of a new empty memory without a name.
+
+    The system frees it with the last process that holds it, however that process ends.
+    """
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("modp-ti-frames")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
+@dataclass(frozen=True)
+class SlotLayout:
+    """Sizes of the arrays of a frame in a slot.
+
+    Attributes:
+        width: Image width [px].
+        height: Image height [px].
+        levels: (width, height) of each level of the image pyramid.
+    """
+
+    width: int
+    height: int
+    levels: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, frame: TrackedFrame) -> SlotLayout:
+        levels = tuple((level.camera.width, level.camera.height) for level in frame.pyramid)
+        return cls(frame.camera.width, frame.camera.height, levels)
+
+    @property
+    def bytes(self) -> int:
+        """Size of a slot: the image as float32, the levels of the pyramid, and the mask."""
+        pixels = self.width * self.height
+        return 12 * pixels + sum(4 * width * height for width, height in self.levels) + pixels
+
+
+class FrameRing:
+    """Slots in shared memory, each for one frame. Both processes map the same memory.
+
+    Who may use which slot is agreed upon by messages; the ring itself does not lock.
+
+    Args:
+        memory: Descriptor of the memory, see `anonymous_memory`. It grows to the size that is needed.
+        layout: Layout of a slot.
+        slots: Number of slots.
+    """
+
+    def __init__(self, memory: int, layout: SlotLayout, slots: int) -> None:
+        self.layout = layout
+        size = layout.bytes * slots
+        if os.fstat(memory).st_size < size:
+            os.ftruncate(memory, size)
+        self._map = mmap.mmap(memory, size)
+
+    def write(self, slot: int, frame: TrackedFrame) -> None:
+        """Copy the arrays of a frame to a slot.
+
+        Raises:
+            InputError: If the frame has another size than the ring's.
+        """
+        if SlotLayout.of(frame) != self.layout:
+            raise InputError(
+                f"{frame.name} is {frame.camera.width}x{frame.camera.height}, the first frame "
+                f"{self.layout.width}x{self.layout.height}: all images of a scene must have one size"
+            )
+        image, levels, mask = self._arrays(slot)
+        np.copyto(image, frame.image)
+        for level, here in zip(frame.pyramid, levels, strict=True):
+            np.copyto(here, level.rgba)
+        if frame.mask is not None:
+            np.copyto(mask, frame.mask)
+
+    def read(self, slot: int, record: FrameRecord, masked: bool, vignette: NDArray[np.float32] | None) -> TrackedFrame:
+        """Return the frame in a slot. Its arrays are copies.
+
+        Args:
+            slot: The slot.
+            record: The frame without its image.
+            masked: Whether the frame has a mask.
+            vignette: Its vignette.
+        """
+        image, levels, mask = self._arrays(slot)
+        frame = record.with_picture(Picture(image.copy(), mask.copy() if masked else None, vignette))
+        pyramid, camera = [], frame.camera
+        for level in levels:
+            height, width = level.shape[:2]
+            camera = camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
+            pyramid.append(ImageLevel(level.copy(), camera))
+        # What the properties of these names have cached in the other process.
+        frame.__dict__.update(rgba=pyramid[0].rgba, pyramid=tuple(pyramid))
+        return frame
+
+    def _arrays(self, slot: int) -> tuple[NDArray[np.float32], list[NDArray[np.uint8]], NDArray[np.bool_]]:
+        """Views of a slot: image (H, W, 3), levels (H_l, W_l, 4) and mask (H, W)."""
+        layout, at = self.layout, slot * self.layout.bytes
+
+        def view(dtype: type, *shape: int) -> NDArray:
+            nonlocal at
+            array = np.frombuffer(self._map, dtype, int(np.prod(shape)), at).reshape(shape)
+            at += array.nbytes
+            return array
+
+        image = view(np.float32, layout.height, layout.width, 3)
+        levels = [view(np.uint8, height, width, 4) for width, height in layout.levels]
+        return image, levels, view(np.bool_, layout.height, layout.width)
+
+
+class CountsBoard:
+    """Counts of the stream in shared memory, written by the child, and the wish of the parent that it ends.
+
+    Each number is read and written at once, without locks.
+
+    Args:
+        memory: Descriptor of the memory, see `anonymous_memory`.
+    """
+
+    def __init__(self, memory: int) -> None:
+        os.ftruncate(memory, 8 * 7)
+        self._numbers = np.frombuffer(mmap.mmap(memory, 8 * 7), np.float64)
+
+    def write(self, counts: LiveCounts | None, frame_count: int | None) -> None:
+        if counts is not None:
+            self._numbers[:5] = counts.arrived, counts.tracked, counts.thinned, counts.lost, counts.newest
+        self._numbers[5] = -1 if frame_count is None else frame_count
+
+    def counts(self, delivered: int) -> LiveCounts:
+        """Return the counts, of which the parent has taken `delivered` frames."""
+        arrived, tracked, thinned, lost = (int(number) for number in self._numbers[:4])
+        return LiveCounts(arrived, tracked, thinned, lost, max(0, tracked - delivered), float(self._numbers[4]))
+
+    @property
+    def frame_count(self) -> int | None:
+        return None if self._numbers[5] < 0 else int(self._numbers[5])
+
+    @property
+    def finish(self) -> bool:
+        """Whether the parent wants the recording to end. Setting it is safe in a signal handler."""
+        return bool(self._numbers[6])
+
+    @finish.setter
+    def finish(self, wanted: bool) -> None:
+        self._numbers[6] = wanted

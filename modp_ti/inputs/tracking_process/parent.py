@@ -1,0 +1,252 @@
+"""`TrackingProcess`: the tracker `klt` in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from multiprocessing import Pipe
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.inputs.live_counts import LiveCounts
+from modp_ti.inputs.protocol import Progress, Tracker
+from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.sources.frame_store import StoredFrames
+from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
+from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
+from modp_ti.inputs.tracking_process.messages import Delivered, Ended, Job, Opened, Preparing, RingMade
+
+__all__ = ["TrackingProcess"]
+
+# Time [s] that the process gets to end by itself.
+PATIENCE = 2.0
+
+
+class TrackingProcess(Tracker):
+    """The tracker `klt`, and the capture of its images, in a process of its own, so that mapping does not delay them.
+
+    `events` delivers once what the tracker there delivers. Frames wait there until they are taken, without their images
+    beyond the first few. Iterating over this object yields the frames with their latest poses; it reads their images
+    again in this process, so the other one need not exist any more.
+
+    The first Ctrl-C ends the recording, if this object is made in the main thread. If the process dies, the recording
+    ends too, with a note. The process ends when this one does.
+
+    Args:
+        config: The scene; the tracker is `klt`.
+        progress: Called while the tracker is opened.
+
+    Raises:
+        InputError: If the tracker cannot be opened.
+    """
+
+    def __init__(self, config: SceneConfig, progress: Progress | None = None) -> None:
+        self._config = config
+        self._slots = max(2, config.source.prefetch)
+        self._ring: FrameRing | None = None
+        self._vignette: NDArray[np.float32] | None = None
+        self._log = DeliveredLog()
+        self._again: FrameReader | None = None
+        self._unreadable: Mapping[str, UnreadableImageError] = {}
+        self._ended = False
+        self._kept = None
+        if config.source.stream is not None:
+            self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
+        self._memory, board = anonymous_memory(), anonymous_memory()
+        self._board = CountsBoard(board)
+        self._connection, theirs = Pipe()
+        self._process = _started([theirs.fileno(), self._memory, board])
+        theirs.close()
+        os.close(board)
+        self._interrupt = None
+        ours = threading.current_thread() is threading.main_thread()
+        if ours and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            self._interrupt = signal.signal(signal.SIGINT, self._interrupted)
+        try:
+            self._connection.send(Job(config, None if self._kept is None else Path(self._kept.name)))
+            opened = self._wait_for_opening(progress)
+        except BaseException:
+            self.close()
+            raise
+        self._notes = [*opened.notes, _shared_cores(config)]
+        self._scale = opened.scale
+        self._undistorter = opened.intrinsics.undistorter(opened.scale)
+
+    def _wait_for_opening(self, progress: Progress | None) -> Opened:
+        while True:
+            message = self._receive()
+            if isinstance(message, Opened):
+                return message
+            if isinstance(message, Preparing) and progress is not None:
+                progress(message.what, message.done, message.total)
+            if isinstance(message, Ended):
+                raise message.error or InputError(f"the tracker could not be opened: {message.failure}")
+
+    @property
+    def notes(self) -> list[str]:
+        return self._notes
+
+    @property
+    def scale(self) -> float:
+        return self._scale
+
+    @property
+    def undistorter(self) -> Undistorter:
+        return self._undistorter
+
+    @property
+    def frame_count(self) -> int | None:
+        return self._board.frame_count
+
+    @property
+    def unreadable(self) -> Mapping[str, UnreadableImageError]:
+        """Damaged images that were skipped. They are known when the stream has ended."""
+        return self._unreadable
+
+    @property
+    def live(self) -> LiveCounts | None:
+        return self._board.counts(len(self._log)) if self._config.source.follows_clock else None
+
+    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+        """Iterate once over frames and corrections as the tracker delivers them.
+
+        Raises:
+            InputError: If the tracker rejects its input, or the process ends before the first frame.
+        """
+        while not self._ended:
+            message = self._receive()
+            if isinstance(message, RingMade):
+                self._ring = FrameRing(self._memory, message.layout, self._slots)
+                self._vignette = message.vignette
+            elif isinstance(message, Delivered):
+                yield self._delivered(message)
+            elif isinstance(message, PoseCorrection):
+                self._log.correct(message)
+                yield message
+            elif isinstance(message, Ended):
+                self._end(message)
+
+    def __iter__(self) -> Iterator[TrackedFrame]:
+        for _ in self.events():
+            pass
+        if self._again is None:
+            self._again = FrameReader(self._images_again(), self._config.source)
+        for record in self._log:
+            yield record.with_picture(self._again.read(record.name, self._undistorter))
+
+    def close(self) -> None:
+        """End the recording and the process, and remove what was stored."""
+        self._ended = True
+        self._connection.close()  # the process exits when it notices
+        try:
+            self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._give_back_interrupt()
+        if self._again is not None:
+            self._again.images.close()
+        if self._memory >= 0:
+            os.close(self._memory)
+            self._memory = -1
+        self._log.close()
+        if self._kept is not None:
+            self._kept.cleanup()
+
+    # ---- messages --------------------------------------------------------------------------------------------
+
+    def _receive(self) -> object:
+        """Wait for the next message. The death of the process counts as an `Ended`."""
+        try:
+            return self._connection.recv()
+        except (EOFError, OSError):
+            return Ended([], {}, failure=f"the tracker process ended ({self._cause()})")
+
+    def _cause(self) -> str:
+        try:
+            code = self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            return "it closed its pipe"
+        return f"signal {-code}" if code < 0 else f"exit code {code}"
+
+    def _delivered(self, message: Delivered) -> TrackedFrame:
+        assert self._ring is not None
+        frame = self._ring.read(message.slot, message.record, message.masked, self._vignette)
+        self._log.add(message.record)
+        try:
+            self._connection.send(message.slot)
+        except OSError:
+            pass  # the process is gone: the next message says so
+        return frame
+
+    def _end(self, message: Ended) -> None:
+        self._ended = True
+        self._unreadable = message.unreadable
+        self._notes += [note for note in message.notes if note not in self._notes]
+        if message.error is not None:
+            raise message.error
+        if message.failure is not None:
+            count = len(self._log)
+            if count == 0:
+                raise InputError(f"{message.failure} before it delivered a frame")
+            frames = "the frame" if count == 1 else f"the {count} frames"
+            self._notes.append(f"{message.failure}; the map is finished with {frames} before")
+
+    def _images_again(self) -> ImageSource:
+        """The images of the delivered frames, for this process."""
+        if self._kept is None:
+            return open_source(self._config.without_clock().source)
+        records = self._log.records
+        return StoredFrames(Path(self._kept.name), [r.name for r in records], [r.timestamp for r in records])
+
+    # ---- Ctrl-C ----------------------------------------------------------------------------------------------
+
+    def _interrupted(self, *_: object) -> None:
+        self._give_back_interrupt()
+        if self._ended:
+            raise KeyboardInterrupt
+        self._board.finish = True
+
+    def _give_back_interrupt(self) -> None:
+        if self._interrupt is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self._interrupt)
+            self._interrupt = None
+
+
+def _started(descriptors: list[int]) -> subprocess.Popen[bytes]:
+    """Start the child with these descriptors. It ignores Ctrl-C from its beginning, where possible."""
+    places = [place or os.getcwd() for place in sys.path]
+    # One thread for each library: the other cores are the mapper's.
+    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(places), "PYTHONSAFEPATH": "1"}
+    code = "from modp_ti.inputs.tracking_process.child import main; main()"
+    in_main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main else None
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-c", code, *map(str, descriptors)],
+            pass_fds=descriptors,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+    finally:
+        if in_main:
+            signal.signal(signal.SIGINT, before)
+
+
+def _shared_cores(config: SceneConfig) -> str:
+    threads = config.mapper_threads
+    mapper = "a thread for each core" if threads is None else "1 thread" if threads == 1 else f"{threads} threads"
+    return f"the tracker has a process of its own with one core, the mapper {mapper} (`threads`)"

@@ -1,0 +1,40 @@
+"""`RecordedPace`: repeats the decisions of an earlier run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pipelines.pace.pace import Plan
+
+__all__ = ["RecordedPace"]
+
+
+class RecordedPace:
+    """Repeats recorded decisions in their order, so that the same frames give the same map.
+
+    Args:
+        decisions: For every frame that should have become a keyframe, its plan, or None if it was merged.
+    """
+
+    def __init__(self, decisions: Iterable[Plan | None]) -> None:
+        self._decisions = iter(decisions)
+        self._next: Plan | None = None
+
+    def takes_keyframe(self) -> bool:
+        """Return the next decision.
+
+        Raises:
+            ValueError: If the recording has no further decision, so that its frames were other ones.
+        """
+        try:
+            self._next = next(self._decisions)
+        except StopIteration:
+            raise ValueError("the recorded decisions end before the frames: these are other frames") from None
+        return self._next is not None
+
+    def plan(self, level: int) -> Plan:
+        assert self._next is not None, "takes_keyframe comes first, and was True"
+        return self._next
+
+    def steps_after_correction(self) -> int:
+        return 0

@@ -1,0 +1,32 @@
+"""Delivered frames come again in order, with the poses and points of the last correction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fields.frames.pose_correction import PoseCorrection
+from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
+from modp_ti.inputs.tracking_process.messages import FrameRecord
+from tests.modp_ti.inputs.tracking_process.frames import random_frame
+
+
+def test_corrections_move_the_frames_and_points_that_they_list():
+    log = DeliveredLog()
+    frames = [random_frame(i, points=n) for i, n in enumerate((4, 0, 3))]
+    for frame in frames:
+        log.add(FrameRecord.of(frame))
+    T = np.eye(4)
+    T[0, 3] = 9.0
+    log.correct(PoseCorrection(np.array([2]), T[None], np.array([3, 77]), np.array([[1.0, 2.0, 3.0], [0, 0, 1]])))
+    for _ in range(2):
+        first, second, third = log
+        np.testing.assert_array_equal(first.T_camera_world, frames[0].T_camera_world)
+        np.testing.assert_array_equal(third.T_camera_world, T)
+        assert [len(record.points) for record in log] == [4, 0, 3]
+        np.testing.assert_array_equal(first.points.pixels, frames[0].points.pixels)
+        np.testing.assert_array_equal(first.points.xyz[:3], frames[0].points.xyz[:3])
+        assert first.points.xyz[3].tolist() == third.points.xyz[1].tolist() == [1, 2, 3], "point 3, in both"
+        assert second.points.ids.tolist() == []
+    log.add(FrameRecord.of(random_frame(3)))
+    assert len(log) == 4 and len(list(log)[3].points) == 5
+    log.close()

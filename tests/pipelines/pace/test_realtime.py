@@ -1,0 +1,192 @@
+"""The realtime pace with a made-up clock and made-up costs: a mapper, a camera and a tracker that are only numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from pipelines.pace import Plan, RealtimePace
+from pipelines.settings import MappingSettings, OptimiseSettings
+
+SETTINGS = MappingSettings()
+LEVELS = SETTINGS.levels.probabilities
+
+
+@dataclass
+class SimulatedMapper:
+    """Spends made-up times on frames, in order, and tells the pace what they cost.
+
+    Attributes:
+        step: Cost of a step at the full size [s].
+        depth: Cost of the depth of all high-error pixels [s].
+        keyframe: Other costs of a keyframe [s].
+        points: Cost of a frame that only adds its tracked points [s].
+        every: Number of frames from one wanted keyframe to the next.
+        hiccups: Extra time at a frame, by its number [s].
+    """
+
+    step: float = 0.08
+    depth: float = 0.2
+    keyframe: float = 0.03
+    points: float = 0.006
+    every: int = 4
+    hiccups: dict[int, float] = field(default_factory=dict)
+
+    def run(self, arrivals: np.ndarray, pace: RealtimePace) -> Session:
+        """Map frames that arrive at these times (N,) [s]."""
+        rng = np.random.default_rng(5)
+        session = Session()
+        now = float(arrivals[0])
+        for n, arrived in enumerate(arrivals.tolist()):
+            while now < arrived:  # nothing waits
+                cost = self.step * 4 / 6
+                session.idle += cost
+                pace.spend_idle(cost)
+                now += cost
+            pace.begin_frame(arrived, now)
+            session.waiting.append(int(np.searchsorted(arrivals, now, side="right")) - n)
+            plan = None
+            depth = optimise = 0.0
+            seconds = self.points * rng.uniform(0.7, 1.3)
+            if n % self.every == 0:
+                if pace.takes_keyframe():
+                    level = int(rng.choice(len(LEVELS), p=LEVELS))
+                    plan = pace.plan(level)
+                    seconds, depth, optimise = self.costs_of(plan, level, rng)
+                session.plans.append(plan)
+            seconds += depth + optimise
+            pace.end_frame(seconds, depth, optimise, plan.steps if plan else 0)
+            now += seconds + self.hiccups.get(n, 0.0)
+            session.lag.append(now - arrived)
+        session.end = now
+        return session
+
+    def costs_of(self, plan: Plan, level: int, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Times of the keyframe itself, of its depth and of its steps [s]."""
+        keyframe, depth, step = (mean * rng.uniform(0.7, 1.3) for mean in (self.keyframe, self.depth, self.step))
+        # Half of the cost of depth is fixed, which is not the pace's own model of it.
+        depth *= 0.5 + 0.5 * plan.pixels if plan.pixels else 0.0
+        return keyframe, depth, plan.steps * step * 0.5**level
+
+
+@dataclass
+class Session:
+    """What a simulated session did: lag [s] of every frame and frames waiting at it, plans of the wanted keyframes,
+    time left over [s], and the time of the end [s]."""
+
+    lag: list[float] = field(default_factory=list)
+    waiting: list[int] = field(default_factory=list)
+    plans: list[Plan | None] = field(default_factory=list)
+    idle: float = 0.0
+    end: float = 0.0
+
+    def worked(self) -> np.ndarray:
+        """Places of the keyframes that got steps."""
+        return np.flatnonzero([plan is not None and plan.steps > 0 for plan in self.plans])
+
+
+def camera(rate: float, seconds: float) -> np.ndarray:
+    """Times at which the frames of a camera arrive that is a little irregular."""
+    jitter = np.random.default_rng(1).uniform(0.0, 0.3 / rate, round(rate * seconds))
+    return np.arange(round(rate * seconds)) / rate + jitter
+
+
+@pytest.mark.parametrize("rate", [10, 30])
+@pytest.mark.parametrize("every", [1, 3, 5])
+@pytest.mark.parametrize("slow", [0.5, 1.0, 3.0])
+def test_the_lag_stays_below_its_limit_at_every_rate(rate: float, every: int, slow: float) -> None:
+    pace = RealtimePace(SETTINGS)
+    mapper = SimulatedMapper(0.08 * slow, 0.2 * slow, 0.03 * slow, 0.006 * slow, every)
+    session = mapper.run(camera(rate, 60.0), pace)
+    assert max(session.lag) < 2 * SETTINGS.max_lag
+    assert np.quantile(session.lag, 0.95) < 1.1 * SETTINGS.max_lag
+    # The mapper is never idle for want of a plan, nor does its queue grow.
+    assert np.mean(session.waiting[-100:]) < rate * SETTINGS.max_lag + 1
+
+
+@pytest.mark.parametrize("rate", [10, 30])
+def test_a_hiccup_is_caught_up_with(rate: float) -> None:
+    pace = RealtimePace(SETTINGS)
+    hiccup = round(20 * rate)
+    session = SimulatedMapper(hiccups={hiccup: 3.0}).run(camera(rate, 40.0), pace)
+    assert max(session.lag[:hiccup]) < 2 * SETTINGS.max_lag
+    assert session.lag[hiccup] > 3.0
+    assert max(session.lag[hiccup + round(5 * rate) :]) < 2 * SETTINGS.max_lag
+
+
+def test_a_camera_that_wants_too_many_keyframes_still_leaves_views_everywhere() -> None:
+    pace = RealtimePace(SETTINGS)
+    session = SimulatedMapper(keyframe=0.09, every=1).run(camera(30, 60.0), pace)
+    kept = np.flatnonzero([plan is not None for plan in session.plans])
+    assert pace.merged > 100 and max(session.lag) < 2 * SETTINGS.max_lag
+    gaps = np.diff(kept[5:])
+    assert gaps.max() <= 2 * np.median(gaps) + 2
+
+
+def test_a_slow_camera_gets_all_the_work() -> None:
+    pace = RealtimePace(SETTINGS)
+    session = SimulatedMapper().run(camera(1.0, 120.0), pace)
+    late = [plan for plan in session.plans[5:] if plan is not None]
+    assert all(plan.pixels == 1.0 for plan in late)
+    assert pace.merged == pace.skipped == 0
+    assert session.idle > 0.5 * session.end, "the time left over goes into the map"
+
+
+def test_steps_give_way_before_depth_and_depth_before_whole_keyframes() -> None:
+    """The slower the machine, the less of each; nothing gives way before what comes first has."""
+    shares = []
+    for slow in (0.3, 1.0, 1.5, 2.0, 4.0):
+        pace = RealtimePace(SETTINGS)
+        session = SimulatedMapper(0.08 * slow, 0.2 * slow, 0.03 * slow, 0.006, every=4).run(camera(10, 60.0), pace)
+        plans = [plan for plan in session.plans[20:] if plan is not None]
+        worked = [plan for plan in plans if plan.steps]
+        shares.append(
+            (
+                np.mean([plan.steps for plan in plans]) / SETTINGS.optimise.steps,
+                np.mean([plan.pixels for plan in worked]),
+                len(worked) / len(session.plans[20:]),
+            )
+        )
+    steps, pixels, keyframes = np.array(shares).T
+    assert (np.diff(steps) < 0.02).all() and (np.diff(keyframes) < 0.02).all()
+    assert steps[1] < 0.8 and pixels[1] > 0.95 and keyframes[1] > 0.95, "only steps give way at first"
+    assert pixels[2] < pixels[1] and keyframes[2] > 0.9, "then depth"
+    assert keyframes[-1] < 0.8, "then whole keyframes"
+
+
+def test_keyframes_are_skipped_evenly() -> None:
+    pace = RealtimePace(SETTINGS)
+    session = SimulatedMapper(0.2, 0.4, 0.02, 0.004, every=2).run(camera(10, 60.0), pace)
+    assert pace.skipped > 20 and pace.merged == 0
+    gaps = np.diff(session.worked()[5:])
+    assert gaps.max() <= 2 * np.median(gaps) + 1
+
+
+def test_the_decisions_are_those_that_the_mapper_was_given() -> None:
+    pace = RealtimePace(SETTINGS)
+    session = SimulatedMapper(hiccups={50: 3.0}).run(camera(10, 30.0), pace)
+    assert pace.decisions == session.plans
+    assert pace.merged == sum(plan is None for plan in session.plans)
+
+
+def test_no_measurement_of_a_clock_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same times give the same decisions, whatever the real clock says."""
+
+    def decisions() -> list[Plan | None]:
+        pace = RealtimePace(SETTINGS)
+        SimulatedMapper().run(camera(30, 10.0), pace)
+        return pace.decisions
+
+    first = decisions()
+    for name in ("time", "monotonic", "perf_counter"):
+        monkeypatch.setattr(f"time.{name}", lambda: pytest.fail("the pace read a clock"))
+    assert decisions() == first
+
+
+def test_a_repeated_setting_of_no_steps_is_kept() -> None:
+    pace = RealtimePace(MappingSettings(optimise=OptimiseSettings(steps=0)))
+    session = SimulatedMapper().run(camera(2, 20.0), pace)
+    assert all(plan is not None and plan.steps == 0 for plan in session.plans)
+    assert pace.skipped == 0
