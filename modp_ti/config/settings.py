@@ -332,18 +332,6 @@ class SceneConfig(StrictModel):
         return self.model_copy(update={"source": self.source.model_copy(update={"scale": scale})})
 
     @property
-    def is_live(self) -> bool:
-        """Whether the frames come from a live source and cannot be read again after the run."""
-        return self.source.stream is not None or self.tracker.is_live
-
-    @property
-    def is_realtime(self) -> bool:
-        """Whether the mapper keeps pace with the frames instead of giving each all its work."""
-        if self.mode != "online" or self.mapping.pace != "auto":
-            return self.mode == "online" and self.mapping.pace == "realtime"
-        return self.source.realtime or self.is_live
-
-    @property
     def tracks_beside_mapping(self) -> bool:
         """Whether the tracker runs in a process of its own."""
         return self.is_realtime and self.source.follows_clock and self.tracker.kind == "klt"
@@ -355,6 +343,18 @@ class SceneConfig(StrictModel):
             return self.threads
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         return max(1, cores - 1)
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the frames come from a live source and cannot be read again after the run."""
+        return self.source.stream is not None or self.tracker.is_live
+
+    @property
+    def is_realtime(self) -> bool:
+        """Whether the mapper keeps pace with the frames instead of giving each all its work."""
+        if self.mode != "online" or self.mapping.pace != "auto":
+            return self.mode == "online" and self.mapping.pace == "realtime"
+        return self.source.realtime or self.is_live
 
     @property
     def can_be_resumed(self) -> bool:
@@ -369,10 +369,6 @@ class SceneConfig(StrictModel):
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
-        if self.snapshot_every and self.source.realtime:
-            raise ValueError(
-                "snapshot_every: a run at the pace of source.realtime cannot be resumed; remove one of them"
-            )
         if self.snapshot_every and not self.can_be_resumed:
             if self.mode != "online":
                 raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")

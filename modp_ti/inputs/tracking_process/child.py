@@ -100,7 +100,7 @@ class _Child:
         """Send the events in order, each frame as soon as a slot is free."""
         assert self._tracker is not None and self._images is not None
         reader = FrameReader(self._images, self._job.config.source)
-        undistorter = self._tracker.intrinsics.undistorter(self._tracker.scale)
+        undistorter = self._tracker.undistorter
         ring: FrameRing | None = None
         while True:
             event = self._outbox.get()

@@ -81,7 +81,7 @@ class TrackingProcess(Tracker):
             raise
         self._notes = [*opened.notes, _shared_cores(config)]
         self._scale = opened.scale
-        self._intrinsics = opened.intrinsics
+        self._undistorter = opened.intrinsics.undistorter(opened.scale)
 
     def _wait_for_opening(self, progress: Progress | None) -> Opened:
         while True:
@@ -102,6 +102,10 @@ class TrackingProcess(Tracker):
         return self._scale
 
     @property
+    def undistorter(self) -> Undistorter:
+        return self._undistorter
+
+    @property
     def frame_count(self) -> int | None:
         return self._board.frame_count
 
@@ -109,10 +113,6 @@ class TrackingProcess(Tracker):
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
         """Damaged images that were skipped. They are known when the stream has ended."""
         return self._unreadable
-
-    @property
-    def undistorter(self) -> Undistorter:
-        return self._intrinsics.undistorter(self._scale)
 
     @property
     def live(self) -> LiveCounts | None:
@@ -142,9 +142,8 @@ class TrackingProcess(Tracker):
             pass
         if self._again is None:
             self._again = FrameReader(self._images_again(), self._config.source)
-        undistorter = self._intrinsics.undistorter(self._scale)
         for record in self._log:
-            yield record.with_picture(self._again.read(record.name, undistorter))
+            yield record.with_picture(self._again.read(record.name, self._undistorter))
 
     def close(self) -> None:
         """End the recording and the process, and remove what was stored."""

@@ -121,7 +121,7 @@ def test_the_setting_opens_it_with_the_camera_and_the_scale(folder):
         ({"source": {"stream": 0, "realtime": True}, "tracker": {"kind": "klt"}}, "a stream always sets the pace"),
         (
             {"source": {"path": "x", "realtime": True}, "tracker": {"kind": "klt"}, "snapshot_every": 5},
-            "source.realtime cannot be resumed",
+            "snapshot_every is for `mapping.pace: complete`",
         ),
     ],
 )

@@ -27,7 +27,8 @@ def test_a_run_on_sent_frames_gives_the_same_map_byte_for_byte(finished: Path, t
     options = ["--to", str(tmp_path / "server"), "--late", "2", "--wait", "300"]
     sender = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
-        sent = finished_run(tmp_path, LIVE + SHORT_RUN.partition("output:  out\n")[2], "9 frames, ")
+        settings = SHORT_RUN.partition("output:  out\n")[2].replace("mapping: {", "mapping: {pace: complete, ")
+        sent = finished_run(tmp_path, LIVE + settings, "9 frames, ")
         assert sender.communicate(timeout=PATIENCE)[0] == "9 frames taken\n"
     finally:
         sender.kill()
