@@ -20,9 +20,9 @@ from screenshot import choose_mode, missing, open_page
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import ViewSettings
+from modp_ti.engine.build import build_mapper
 from modp_ti.engine.live_viewer import LiveViewer
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.session import build_mapper
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.viewer.modes import MODES

@@ -86,7 +86,7 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     """
     from fields.geometry.camera import PinholeCamera
     from fields.runtime.backend import initialise
-    from modp_ti.engine.session import build_mapper
+    from modp_ti.engine.build import build_mapper
     from modp_ti.inputs.trackers import open_tracker
 
     try:

@@ -177,7 +177,7 @@ class RealtimeRun(Conductor):
             camera if len(self._recent) > 1 else 0.0,
             rate if len(self._recent) > 1 else 0.0,
             self.lag[-1],
-            counts.waiting,
+            self._waiting(),
             float(np.mean(steps)) if steps else 0.0,
         )
 
@@ -221,4 +221,4 @@ class RealtimeRun(Conductor):
         live = self._tracker.live
         if live is not None:
             return live
-        return LiveCounts(len(self.lag), len(self.lag), 0, 0, self._ahead.waiting, self._last)
+        return LiveCounts(len(self.lag), len(self.lag), 0, 0, 0, self._last)

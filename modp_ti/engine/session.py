@@ -16,13 +16,13 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.build import build_mapper, open_conductor
 from modp_ti.engine.conductor import Conductor, Event
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
-from modp_ti.engine.realtime import RealtimeRun
-from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
+from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
@@ -35,12 +35,11 @@ from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import retention
 from modp_ti.outputs.time_left import TimeAfterMapping
-from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport
 from pipelines.settings import RefineSettings
 from pipelines.stopwatch import breakdown_percent
 
-__all__ = ["build_mapper", "run_scene"]
+__all__ = ["run_scene"]
 
 
 def run_scene(
@@ -126,7 +125,9 @@ class _Session:
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
-        self.conductor = self._open_conductor()
+        if self.config.is_realtime:
+            self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
+        self.conductor = open_conductor(self.config, self.tracker, self.held)
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             undistorter = self.tracker.undistorter if self.config.is_realtime else None
             if undistorter is not None:  # the kernels are compiled while the first frames are tracked
@@ -163,17 +164,6 @@ class _Session:
         self.mapper = build_mapper(self.config, camera, self.conductor.pace)
         with self.line.working("compiling kernels (the first time on this machine takes longest)"):
             self.mapper.pipeline.compile()
-
-    def _open_conductor(self) -> Conductor:
-        if self.replayed is not None:
-            return ReplayedRun(self.replayed)
-        if not self.config.is_realtime:
-            return Conductor()
-        self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
-        recorder = SessionRecorder() if self.config.export.session else None
-        if recorder is not None:
-            self.held.callback(recorder.close)
-        return RealtimeRun(self.config.mapping, self.tracker, recorder)
 
     def _open_keeper(self, resumed: Snapshot | None, arriving: FramesAhead[Event]) -> None:
         """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""
@@ -404,21 +394,3 @@ class _Session:
         for note in notes:
             self.line.note(f"note: {note}")
             self.record.notes.append(note)
-
-
-def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None = None) -> Mapper:
-    """Create the mapper for the scene's mode and for images of this camera.
-
-    Args:
-        config: The scene's settings.
-        camera: The camera.
-        pace: Pace of the online loop, None for all the work of the settings.
-
-    Raises:
-        InputError: If the settings do not fit the images.
-    """
-    settings = config.offline if config.mode == "offline" else config.mapping
-    try:
-        return Mapper(camera.width, camera.height, settings, config.seed, pace)
-    except ValueError as error:
-        raise InputError(str(error)) from None

@@ -16,9 +16,12 @@ from fields.runtime.backend import initialise
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.live_viewer import PATIENCE, LiveViewer
 from modp_ti.engine.mapper import Mapper
+from modp_ti.outputs.live_status import LiveStatus
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import LEAST_SIDE, MODES
+from pipelines.pipeline import FrameReport
 from pipelines.settings import MappingSettings
+from tests.pipelines.wall import frame
 
 if TYPE_CHECKING:
     from tests.room import RoomRecording
@@ -114,6 +117,14 @@ def test_a_paused_run_whose_browser_has_gone_goes_on(viewer: LiveViewer):
     assert viewer._clock() > PATIENCE
     assert viewer.waited > 0
     assert viewer.said == []
+
+
+def test_a_realtime_run_shows_how_it_keeps_pace(viewer: LiveViewer):
+    viewer.on_frame(frame(0), FrameReport(0, True, 1, 100, 25.5, 4), LiveStatus(10.0, 9.5, 0.42, 3, 4.25))
+    numbers = viewer._overview().numbers
+    assert numbers is not None
+    assert "lag 0.4 s, 3 waiting, camera 10.0/s, tracked 9.5/s, 4.2 steps a keyframe" in numbers
+    assert "25.50 dB" in numbers
 
 
 def test_a_viewer_that_fails_says_so_once_and_lets_the_run_go_on(viewer: LiveViewer):

@@ -1,0 +1,57 @@
+"""The parts of a run that its settings choose: the mapper, and the conductor that takes the frames to it."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.conductor import Conductor
+from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.realtime import RealtimeRun
+from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.protocol import Tracker
+from pipelines.pace import Pace
+
+__all__ = ["build_mapper", "open_conductor"]
+
+
+def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None = None) -> Mapper:
+    """Create the mapper for the scene's mode and for images of this camera.
+
+    Args:
+        config: The scene's settings.
+        camera: The camera.
+        pace: Pace of the online loop, None for all the work of the settings.
+
+    Raises:
+        InputError: If the settings do not fit the images.
+    """
+    settings = config.offline if config.mode == "offline" else config.mapping
+    try:
+        return Mapper(camera.width, camera.height, settings, config.seed, pace)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Conductor:
+    """Return the conductor of a run: one that repeats a recorded session, follows the clock, or knows no clock.
+
+    Args:
+        config: The scene's settings.
+        tracker: The tracker, or a recorded session.
+        held: Closes the recording when the run ends.
+
+    Raises:
+        InputError: If the session cannot be recorded.
+    """
+    if isinstance(tracker, RecordedSession):
+        return ReplayedRun(tracker)
+    if not config.is_realtime:
+        return Conductor()
+    recorder = None
+    if config.export.session:
+        recorder = SessionRecorder()
+        held.callback(recorder.close)
+    return RealtimeRun(config.mapping, tracker, recorder)
