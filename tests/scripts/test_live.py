@@ -309,5 +309,6 @@ def test_a_session_whose_camera_fails_saves_its_map(faults: list[str], tmp_path:
     assert (row["exit_code"], row["map_saved"]) == (0, True)
     assert row["figures"]["sent"] + row["dropped_by_camera"] == 40
     assert row["memory_mb"] and max(row["memory_mb"]) > 50
-    assert 2 <= row["figures"]["tracked"] <= 40 and row["figures"]["psnr"] > 15
+    # FFmpeg may deliver the image that was cut as well.
+    assert 2 <= row["figures"]["tracked"] <= 41 and row["figures"]["psnr"] > 15
     assert (tmp_path / "live.md").read_text() == result.stdout

@@ -27,7 +27,7 @@ class FrameNote:
         mapped_psnr: PSNR of the keyframe itself after its own steps [dB], None for other frames.
         lag: In a realtime run, time from the frame's arrival to the map that holds it [s]; otherwise None.
         waiting: In a realtime run, number of frames that waited when its work began; otherwise None.
-        steps: Number of optimisation steps that it got.
+        steps: In a realtime run, number of optimisation steps that the frame got; otherwise 0.
     """
 
     index: int
@@ -105,5 +105,5 @@ class RunRecord:
             note = FrameNote(index, True, False, done, before, None, None, lag, waiting)
         else:
             of = index, False, report.is_keyframe, done, report.gaussians, report.psnr
-            note = FrameNote(*of, mapped_psnr, lag, waiting, report.steps)
+            note = FrameNote(*of, mapped_psnr, lag, waiting, 0 if lag is None else report.steps)
         self.frames.append(note)
