@@ -16,6 +16,7 @@ from fields.map.trajectory import Trajectory
 from pipelines.corrections import CorrectionReport, revise
 from pipelines.densify.adaptive_density import AdaptiveDensity
 from pipelines.densify.point_initialisation import initialise, union_of_points
+from pipelines.offline_settings import OfflineSettings
 from pipelines.optimise.adam import Adam, LearningRates
 from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.optimise.losses import LossValues
@@ -23,7 +24,6 @@ from pipelines.optimise.safeguards import EXPLODED, Safeguards
 from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
 from pipelines.refinement import decay
 from pipelines.render.renderer import Renderer
-from pipelines.settings import OfflineSettings
 from pipelines.stopwatch import Stopwatch
 
 __all__ = ["OfflineMapper", "Schedule", "scene_extent"]

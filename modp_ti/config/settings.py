@@ -14,7 +14,8 @@ from pydantic import Field, field_validator, model_validator
 
 from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
-from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
+from pipelines.offline_settings import OfflineSettings
+from pipelines.settings import MappingSettings, RefineSettings, StrictModel
 
 __all__ = [
     "LONGER_SIDE",

@@ -20,12 +20,13 @@ from modp_ti.outputs.formats.colmap_model import image_names
 from modp_ti.outputs.formats.map_folder import appearing, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.offline import OfflineMapper
+from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
 from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
 from pipelines.refinement import Schedule
 from pipelines.render.renderer import RenderedView
-from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings
+from pipelines.settings import MappingSettings, RefineSettings
 from pipelines.state import MapState
 
 __all__ = ["Mapper"]

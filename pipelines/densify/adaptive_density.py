@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.view import ViewField
 from fields.map.gaussians import GaussianField
-from pipelines.settings import OfflineSettings
+from pipelines.offline_settings import OfflineSettings
 
 __all__ = ["Adaptation", "AdaptiveDensity", "GradientStatistics"]
 

@@ -14,8 +14,9 @@ from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.corrections import WorldMotion, pending_motion_in_pixels, revise
 from pipelines.offline import OfflineMapper
+from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
-from pipelines.settings import MappingSettings, OfflineSettings
+from pipelines.settings import MappingSettings
 from tests.pipelines.wall import CAMERA, frame, pose
 
 pytestmark = pytest.mark.slow

@@ -8,9 +8,10 @@ from fields.runtime.backend import initialise
 from modp_ti.engine.mapper import Mapper
 from modp_ti.files.errors import InputError
 from pipelines.offline import OfflineMapper
+from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
 from pipelines.pipeline import NothingToMapError, Pipeline
-from pipelines.settings import OfflineSettings, RefineSettings
+from pipelines.settings import RefineSettings
 from pipelines.state import MapState
 from tests.pipelines.wall import frame
 

@@ -12,8 +12,9 @@ from fields.frames.tracked_frame import SparsePoints
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.offline import OfflineMapper
+from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
-from pipelines.settings import MappingSettings, OfflineSettings
+from pipelines.settings import MappingSettings
 from tests.pipelines.wall import frame
 
 # Vulkan has no sparse fields: no voxels. Few steps: a software driver takes a quarter of a second for a view. The draw
