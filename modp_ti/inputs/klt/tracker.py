@@ -14,7 +14,7 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics
+from modp_ti.inputs.klt.calibration import ENOUGH, ENOUGH_LIVE, TYPICAL_FOCAL, estimated_intrinsics
 from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
@@ -105,7 +105,8 @@ def _estimated(reader: FrameReader, blank: Intrinsics, seed: int, progress: Prog
             yield undistorter.grey(raw, reader.valid(name, raw))
 
     total = min(CALIBRATION_FRAMES, len(there)) if len(there) > 1 else CALIBRATION_FRAMES
-    found, used = estimated_intrinsics(images(), (width, height), start, seed, progress, total)
+    enough = ENOUGH if reader.images.arrivals is None else ENOUGH_LIVE
+    found, used = estimated_intrinsics(images(), (width, height), start, seed, progress, total, enough)
     advice = "source.intrinsics or a calibrated camera do better"
     if found is not None:
         k = found.distortion.numerator[0] if found.distortion.numerator else 0.0

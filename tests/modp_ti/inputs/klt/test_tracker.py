@@ -13,6 +13,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
+from modp_ti.inputs.klt.calibration import estimated_intrinsics
 from modp_ti.inputs.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 
@@ -114,6 +115,14 @@ def test_a_camera_that_nobody_described_is_estimated_and_said(box_room, box_walk
     tracker = open_klt(SourceSettings(path=box_walk.written(tmp_path / "images")))
     assert "estimated" in tracker.notes[0]
     assert tracker.intrinsics.camera.fx == pytest.approx(box_room.camera.fx, rel=0.05)
+
+
+def test_enough_keyframes_end_the_estimation(box_room, box_walk):
+    images, start = [(grey, None) for grey in box_walk.grey], 0.9 * box_room.camera.fx
+    _, every = estimated_intrinsics(images, (320, 240), start, 0, None, 60, enough=1000)
+    found, used = estimated_intrinsics(images, (320, 240), start, 0, None, 60, enough=10)
+    assert (every, found is not None) == (60, True)
+    assert 10 <= used < 60
 
 
 def test_images_that_do_not_tell_the_camera_give_a_guess_and_a_map_of_nothing_is_refused(tmp_path):
