@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from benchmarks.report import report
 from ending import documented_ending
 from experiments import Job, command_line, execute, named_scenes, parser, write_report
 
+from fields.runtime.parallel import available_cores
 from modp_ti.files.errors import InputError
 
 # (width, height, Gaussians in view) of a phone's frame, a webcam's frame, and full detail.
@@ -92,7 +92,7 @@ def collect(arguments: argparse.Namespace) -> dict[str, Any]:
     runs = (arguments.scene or [str(DEMO)], device, command_line(arguments.set))
     if not arguments.quick:
         planned_runs(*runs, Path())  # reports bad input now instead of after minutes of measuring
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     threads = [cores] if device == "cuda" else sorted({1, cores})
     on = {"device": device, "threads": cores}
     figures: dict[str, Any] = {"device": device, "cores": cores, "steps": []}

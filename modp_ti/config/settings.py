@@ -6,12 +6,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from fields.runtime.parallel import available_cores
 from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
 from pipelines.offline_settings import OfflineSettings
@@ -342,8 +342,7 @@ class SceneConfig(StrictModel):
         """Number of CPU threads of the mapper; None for one per core. A tracker beside it gets one core."""
         if self.threads is not None or not self.tracks_beside_mapping:
             return self.threads
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return max(1, cores - 1)
+        return max(1, available_cores() - 1)
 
     @property
     def is_live(self) -> bool:

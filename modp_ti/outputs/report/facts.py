@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import platform
 import re
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from fields.runtime.parallel import available_cores
 from modp_ti.config.keys import as_yaml, documented_values
 from modp_ti.config.settings import SceneConfig
 from modp_ti.version import __version__
@@ -84,7 +84,7 @@ def machine(device: str) -> dict[str, str]:
             packages.append(f"{name} {version(package)}")
         except PackageNotFoundError:  # installed by another distribution package
             continue
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     return {
         "MODP-Ti": __version__,
         "backend": device,

@@ -21,15 +21,7 @@ from modp_ti.inputs.sources.live import LiveSource
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.patience import PATIENCE
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def interruptible():
-    """Ctrl-C as in a shell's foreground: a process that was started in the background may ignore it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("interruptible")]
 
 
 def jpeg(number: int) -> bytes:

@@ -25,15 +25,7 @@ from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.modp_ti.inputs.tracking_process.frames import assert_same
 from tests.patience import PATIENCE
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def interruptible():
-    """Ctrl-C as in a shell's foreground: a process that was started in the background may ignore it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("interruptible")]
 
 
 @pytest.fixture(scope="module")
