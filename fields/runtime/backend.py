@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import io
+import os
 
 import numpy as np
 import taichi as ti
@@ -88,6 +89,8 @@ def _has_cuda_driver() -> bool:
 
 
 def _start(arch: object, options: dict) -> None:
+    # `ti.init` asks a server for Taichi's latest version, once a day, and at every start where there is no network.
+    os.environ["TI_SKIP_VERSION_CHECK"] = "ON"
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=arch, **options)
 

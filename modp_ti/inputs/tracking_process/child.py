@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import cv2
 
@@ -20,10 +21,12 @@ from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, S
 from modp_ti.inputs.tracking_process.messages import Delivered, Ended, FrameRecord, Job, Opened, Preparing, RingMade
 from modp_ti.inputs.tracking_process.outbox import Outbox
 
-__all__ = ["main"]
+__all__ = ["main", "remove_folder"]
 
 # Interval [s] at which the counts are published and the wish to finish is noticed.
 GLANCE = 0.05
+# A folder to which the capture adds a file between two looks cannot be removed, and is tried again.
+REMOVALS = 100
 
 
 def main() -> None:
@@ -137,5 +140,13 @@ class _Child:
                     self._images.finish()
         except (EOFError, OSError):
             if self._job.folder is not None:
-                shutil.rmtree(self._job.folder, ignore_errors=True)
+                remove_folder(self._job.folder)
             os._exit(1)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove the folder in which the capture may be storing a frame at the same time."""
+    for _ in range(REMOVALS):
+        shutil.rmtree(folder, ignore_errors=True)
+        if not folder.exists():
+            return

@@ -50,3 +50,13 @@ def test_the_number_of_threads_is_taken() -> None:
         "print(ti.lang.impl.current_cfg().cpu_max_num_threads)"
     )
     assert python(code).stdout.split()[-1] == "1"
+
+
+def test_starting_taichi_asks_no_server_for_its_latest_version() -> None:
+    code = (
+        "from taichi import _version_check\n"
+        "_version_check.try_check_version = lambda: print('asked', flush=True)\n"
+        "from fields.runtime.backend import initialise; print(initialise('cpu'))"
+    )
+    said = python(code).stdout.split()
+    assert said[-1] == "cpu" and "asked" not in said

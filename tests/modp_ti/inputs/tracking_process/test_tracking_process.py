@@ -20,7 +20,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
 from modp_ti.inputs.sources import FrameReader, open_source
 from modp_ti.inputs.trackers import open_tracker
-from modp_ti.inputs.tracking_process import TrackingProcess
+from modp_ti.inputs.tracking_process import TrackingProcess, child
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.modp_ti.inputs.tracking_process.frames import assert_same
 from tests.patience import PATIENCE
@@ -218,3 +218,21 @@ def test_nothing_is_left_when_the_parent_is_killed(camera, box_walk, tmp_path):
     wait_until(lambda: not Path(f"/proc/{child}").exists() or "Z" in Path(f"/proc/{child}/stat").read_text().split()[2])
     parent.stdin.close()
     parent.stdout.close()
+
+
+def test_a_folder_to_which_the_capture_still_writes_is_removed(tmp_path, monkeypatch):
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    (folder / "000000.png").write_bytes(b"")
+    late = iter(["000001.png", "000002.png"])
+
+    def rmdir(path, **how):
+        for name in late:
+            (folder / name).write_bytes(b"")
+            break
+        remove(path, **how)
+
+    remove = os.rmdir
+    monkeypatch.setattr(os, "rmdir", rmdir)
+    child.remove_folder(folder)
+    assert not folder.exists() and next(late, None) is None
