@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
 import socket
 import subprocess
@@ -20,12 +19,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import yaml
 from ending import documented_ending
 from experiments import markdown_table, write_report
 from live_camera import Show, add_show_options, environment, playing, read_log, show_of
+from live_run import Faults, command
 
 from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig, SourceSettings
@@ -36,8 +36,6 @@ from modp_ti.outputs.formats.trajectory import read_trajectory
 
 SCALE, HOLDOUT = 0.5, 8
 MAX_NAME = 80
-# Time between two looks at the memory of a run [s].
-SAMPLED = 5.0
 # Stands for an address that is not known yet.
 ANYWHERE = "127.0.0.1:1"
 # transforms.json's names of the intrinsics, by those of `source.intrinsics`.
@@ -67,12 +65,14 @@ class Session:
         camera: `source.intrinsics`, None for an unknown camera.
         seconds: Time of the refinement after the stream's end [s]; 0 for none.
         overrides: `KEY=VALUE` settings of the run.
+        faults: Faults of the run, beside those of the camera.
     """
 
     show: Show
     camera: Mapping[str, float] | None
     seconds: float
     overrides: Sequence[str]
+    faults: Faults
 
     @property
     def from_scene(self) -> bool:
@@ -86,7 +86,13 @@ class Session:
         count = "all" if show.frames is None else show.frames
         pace = "at its own pace" if show.rate is None else f"at {show.rate:g} a second"
         who = "socket" if self.from_scene else f"camera {'unknown' if self.camera is None else 'given'}"
-        return ", ".join([f"{count} frames of {show.path.stem} {pace}", who, *show.faults, *self.overrides])
+        said = [who, *self.all_faults, *self.overrides]
+        return ", ".join([f"{count} frames of {show.path.stem} {pace}", *said])
+
+    @property
+    def all_faults(self) -> list[str]:
+        """All faults in a few words each."""
+        return [*self.show.faults, *self.faults.told]
 
     def scene(self, stream: str, output: Path) -> dict[str, Any]:
         """Return the run's scene as plain data. `stream` is the URL of the camera, or the address of the socket."""
@@ -113,36 +119,6 @@ def sending(show: Show, address: str, log: Path) -> Iterator[None]:
         finally:
             process.terminate()
             process.wait()
-
-
-def command(*arguments: str, output: TextIO | None = None) -> tuple[int, list[float]]:
-    """Run `modp-ti` with these arguments. It prints to `output`, or to standard error.
-
-    Returns:
-        Its exit code, and the memory [MB] of its processes every `SAMPLED` seconds.
-    """
-    line, to = [sys.executable, "-m", "modp_ti.commands.app", *arguments], output or sys.stderr
-    process, memory = subprocess.Popen(line, stdout=to, stderr=to, env=environment()), []
-    try:
-        while True:
-            try:
-                return process.wait(SAMPLED), memory
-            except subprocess.TimeoutExpired:
-                memory.append(round(memory_of(process.pid), 1))
-    finally:
-        process.terminate()
-        process.wait()
-
-
-def memory_of(process: int) -> float:
-    """Return the resident memory of a process and its descendants [MB], as Linux tells it; 0 if it does not."""
-    place = Path("/proc") / str(process)
-    try:
-        pages = int((place / "statm").read_text().split()[1])
-        children = [int(word) for file in place.glob("task/*/children") for word in file.read_text().split()]
-    except OSError:  # it has ended, or this is no Linux
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20) + sum(map(memory_of, children))
 
 
 def free_address() -> str:
@@ -184,7 +160,9 @@ def play_and_map(session: Session, folder: Path, cold: bool = False) -> dict[str
     # What is wrong with the settings or the images is said before anything is started.
     config = scene_from_data(session.scene(ANYWHERE, output), str(scene), session.overrides)
     width, height = mapped_size(session, config)
-    folder.mkdir(parents=True, exist_ok=True)
+    session.faults.require_possible()
+    temporary = folder / "tmp"
+    temporary.mkdir(parents=True, exist_ok=True)
     for name in ("metrics.json", "splats.ply", "trajectory.txt"):  # of an earlier call
         (output / name).unlink(missing_ok=True)
     if not cold:
@@ -201,7 +179,9 @@ def play_and_map(session: Session, folder: Path, cold: bool = False) -> dict[str
         settings = [word for setting in session.overrides for word in ("--set", setting)]
         print(f"{session.label}: mapping; see {folder / 'run.log'}", file=sys.stderr, flush=True)
         with (folder / "run.log").open("w", encoding="utf-8") as said:
-            code, memory = command("run", str(scene), *settings, output=said)
+            code, memory = command(
+                "run", str(scene), *settings, output=said, faults=session.faults, temporary=temporary
+            )
     return {**row(session, folder, code), "memory_mb": memory}
 
 
@@ -241,7 +221,7 @@ def row(session: Session, folder: Path, code: int) -> dict[str, Any]:
     }
     return {
         "label": session.label,
-        "faults": session.show.faults,
+        "faults": session.all_faults,
         "figures": figures,
         "exit_code": code,
         "map_saved": (output / "splats.ply").is_file(),
@@ -340,12 +320,19 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="refinement after the end; 0: none (default 60)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the run")
     parser.add_argument("--cold", action="store_true", help="do not compile the kernels before the camera plays")
+    parser.add_argument(
+        "--kill-tracker", type=int, metavar="N", help="kill the tracker's process (-9) when N frames are tracked"
+    )
+    parser.add_argument(
+        "--full-disk", type=float, metavar="MB", help="the disk of the temporary folder is full after MB of frames"
+    )
     arguments = parser.parse_args()
     if not arguments.path.exists():
         raise InputError(f"{arguments.path}: no such video, folder of images or scene file")
     show = show_of(arguments, arguments.path.resolve())
-    session = Session(show, given_camera(arguments), arguments.seconds, arguments.set)
-    if session.from_scene and (show.faults or session.camera or show.frames or show.start):
+    faults = Faults(arguments.kill_tracker, arguments.full_disk)
+    session = Session(show, given_camera(arguments), arguments.seconds, arguments.set, faults)
+    if session.from_scene and (session.all_faults or session.camera or show.frames or show.start):
         raise InputError("a scene file has its own camera and frames: only --rate goes with it")
     folder = arguments.output.resolve()
     place = folder / folder_name(session.label)

@@ -69,11 +69,16 @@ class Conductor:
         """Return what `RunRecord.frame` notes of the last frame in a realtime run."""
         return {}
 
+    @property
+    def notes(self) -> list[str]:
+        """One-line remarks for the user about the run so far."""
+        return []
+
     def saved(self) -> None:
         """Called when the map has been written."""
 
     def write_session(self, folder: Path, config: SceneConfig) -> None:
-        """Write what is needed to repeat a run that followed a clock. Raises OSError if that fails.
+        """Write what is needed to repeat a run that followed a clock.
 
         Args:
             folder: The output folder.

@@ -1,4 +1,4 @@
-"""Ctrl-C handling: the first one stops a run after its current step, the second stops it immediately."""
+"""Ctrl-C handling: the first one stops the mapping after its current step, the second stops it immediately."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ class RunStopped(Exception):  # noqa: N818 - it is no error
 
 
 class Interruption:
-    """Context manager that records the first Ctrl-C and restores the default handler for the second.
+    """Context manager that records the first Ctrl-C after `begin` and restores the default handler for the second.
 
-    It does nothing outside the main thread, or if SIGINT already has another handler (as with a live source) or is
-    ignored.
+    Before `begin` there is no map to save, and Ctrl-C raises `KeyboardInterrupt` as usual. A live source that is opened
+    inside the context ends its recording at the first Ctrl-C, and passes a later one on to this handler.
+
+    It does nothing outside the main thread, or if SIGINT already has another handler or is ignored.
 
     Args:
         say: Called when Ctrl-C is pressed while the run is not waiting for a frame.
@@ -30,6 +32,7 @@ class Interruption:
     def __init__(self, say: Callable[[], None]) -> None:
         self.asked = False
         self._say = say
+        self._begun = False
         self._waits = False
         self._installed = False
 
@@ -42,6 +45,10 @@ class Interruption:
 
     def __exit__(self, *error: object) -> None:
         self._give_back()
+
+    def begin(self) -> None:
+        """There is a map from now on, which Ctrl-C leaves consistent."""
+        self._begun = True
 
     def check(self) -> None:
         """Raise `RunStopped` if Ctrl-C has been pressed. Call it between two steps."""
@@ -62,8 +69,10 @@ class Interruption:
             self._waits = False
 
     def _note(self, *_: object) -> None:
-        self.asked = True
         self._give_back()
+        if not self._begun:
+            raise KeyboardInterrupt
+        self.asked = True
         if self._waits:
             raise RunStopped
         self._say()

@@ -157,11 +157,15 @@ class RealtimeRun(Conductor):
         return schedule if schedule is None or self._recorder is None else self._recorder.recorded(schedule)
 
     def write_session(self, folder: Path, config: SceneConfig) -> None:
-        """Write the recorded session to a folder, if it was recorded. Raises OSError if that fails."""
+        """Write the recorded session to a folder, if it was recorded."""
         if self._recorder is not None:
             costs = {kind: round(seconds, 5) for kind, seconds in self.pace.costs.known().items()}
             about = {"settings": config.model_dump(mode="json"), "lag": self.lag, "costs": costs}
             self._recorder.write(folder / FILE, self.pace.decisions, about)
+
+    @property
+    def notes(self) -> list[str]:
+        return [] if self._recorder is None or self._recorder.problem is None else [self._recorder.problem]
 
     def status(self) -> LiveStatus:
         """Return the recent figures."""

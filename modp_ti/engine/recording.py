@@ -8,6 +8,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -41,13 +42,14 @@ class SessionRecorder:
     """Writes a session to a temporary file while it goes on.
 
     The file is a zip of one array file per frame or correction, in their order, and of `about.json` with the settings,
-    the decisions and the measured times. Images are kept without loss.
+    the decisions and the measured times. Images are kept without loss. A full disk ends the recording, not the run.
 
-    Raises:
-        InputError: If the file cannot be created.
+    Attributes:
+        problem: Why the session cannot be recorded, in one line; None if it can.
     """
 
     def __init__(self) -> None:
+        self.problem: str | None = None
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-session-", ignore_cleanup_errors=True)
         self._file = Path(self._folder.name) / FILE
         self._zip = zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED)
@@ -105,36 +107,42 @@ class SessionRecorder:
             path: The file to write.
             plans: Decisions of the pace.
             about: Settings and measured times, as JSON.
-
-        Raises:
-            OSError: If the file cannot be written.
         """
+        if self.problem is not None:
+            return
         decisions = {
             "version": VERSION,
             "plans": [None if plan is None else [plan.pixels, plan.steps] for plan in plans],
             "further": self._further,
             "refinement": self._shares,
         }
-        self._zip.writestr(ABOUT, json.dumps({**decisions, **about}))
-        self._zip.close()
-        shutil.copyfile(self._file, path)
+        try:
+            self._zip.writestr(ABOUT, json.dumps({**decisions, **about}))
+            self._zip.close()
+            shutil.copyfile(self._file, path)
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            self._fail(path.parent, error)
 
     def close(self) -> None:
         """Delete the temporary file."""
-        self._zip.close()
+        with suppress(OSError):  # closing completes the file, which may not fit on the disk
+            self._zip.close()
         self._folder.cleanup()
 
     def _write(self, arrays: dict[str, NDArray]) -> None:
+        if self.problem is not None:
+            return
         file = io.BytesIO()
         np.savez(file, allow_pickle=False, **arrays, further=np.array(self._further))
         try:
             self._zip.writestr(f"{self._count:06d}.npz", file.getvalue())
         except OSError as error:
-            raise InputError(
-                f"{self._folder.name}: the session cannot be recorded there: {error.strerror}; set TMPDIR to a folder "
-                "with more room, or export.session to false"
-            ) from None
+            self._fail(Path(self._folder.name), error)
         self._count, self._further = self._count + 1, 0
+
+    def _fail(self, place: Path, error: OSError) -> None:
+        self.problem = f"the session is not recorded (export.session): {place}: {error.strerror}"
 
 
 class RecordedSession(Tracker):

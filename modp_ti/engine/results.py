@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +68,19 @@ class Results:
         """Write the map, and return it with its Gaussians as read back from `splats.ply`."""
         write_map(self.folder, version, self.frames, self._names, keyframes, near)
         return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
+
+    def elsewhere(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> str:
+        """Write the map to a new temporary folder, which stays; return the part of an error message that says so."""
+        folder = None
+        try:
+            folder = Path(tempfile.mkdtemp(prefix="modp-ti-map-"))
+            write_map(folder, version, self.frames, self._names, keyframes, near)
+            dump_scene(self.config, folder / "config.yaml")
+        except OSError as error:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+            return f"; nor can {tempfile.gettempdir()}: {error.strerror}, and the map is lost"
+        return f"; the map is in {folder}"
 
     def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
         """Write the pictures of a frame, given its render (H, W, 3), and keep those that the report may show.

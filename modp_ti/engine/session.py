@@ -121,6 +121,7 @@ class _Session:
     def _map_the_stream(self, resumed: Snapshot | None) -> None:
         """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
+        self.held.enter_context(self.stop)
         self.tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
@@ -149,8 +150,8 @@ class _Session:
             arriving.put_back(first)
             self._open_keeper(resumed, arriving)
             self.observer.begin(self.mapper, self.tracker.frame_count)
-            self.held.enter_context(self.stop)
             self.clock.begin_mapping()
+            self.stop.begin()
             try:
                 self._map(arriving)
             except RunStopped:
@@ -287,11 +288,12 @@ class _Session:
                 with self.line.working("writing the map"):
                     versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
                     self.conductor.write_session(results.folder, self.config)
+                self._say(*self.conductor.notes)
                 self.conductor.saved()
                 scores = self._score(versions, results)
                 metrics = None if scores is None else self._write_figures(scores, versions, results)
         except InputError as error:
-            raise InputError(f"{error}{self.checkpointer.way_on()}") from None
+            raise InputError(f"{error}{self._way_on(versions[last])}") from None
         if metrics is None:
             results.remove_figures()
             output = self.config.output
@@ -367,15 +369,22 @@ class _Session:
         frames, keyframes, output = self.mapper.frames, self.mapper.pipeline.keyframes, self.config.output
         said = f"interrupted after {len(frames)} frames"
         if len(keyframes):
-            results = Results(self.config, frames)
+            results, version = Results(self.config, frames), self.mapper.version()
             try:
                 with results.writing():
-                    results.write_map(self.mapper.version(), keyframes, self.mapper.pipeline.near)
+                    results.write_map(version, keyframes, self.mapper.pipeline.near)
             except InputError as error:
-                raise InputError(f"{error}{self.checkpointer.way_on()}") from None
+                raise InputError(f"{error}{self._way_on(version)}") from None
             results.remove_figures()
             said += f"; the map so far is in {output}"
         return KeyboardInterrupt(f"{said}; modp-ti run --resume {output} goes on" if resumable else said)
+
+    def _way_on(self, version: MapVersion) -> str:
+        """Return the part of an error message that says how to go on, or where the map is."""
+        if self.checkpointer.possible:
+            return self.checkpointer.way_on()
+        pipeline = self.mapper.pipeline
+        return Results(self.config, self.mapper.frames).elsewhere(version, pipeline.keyframes, pipeline.near)
 
     def _open_observer(self) -> Observer:
         """Start the live viewer if the settings ask for it."""

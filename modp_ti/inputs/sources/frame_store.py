@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.files.disk_room import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.listed_images import decoded
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -42,7 +43,7 @@ class FrameStore:
         """Store a frame (H, W, 3) BGR in one of these files.
 
         Raises:
-            InputError: If it cannot be written.
+            InputError: If it cannot be written, or would leave too little of the disk free.
         """
         import cv2
 
@@ -52,6 +53,11 @@ class FrameStore:
             how += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
         _, data = cv2.imencode(".png", image, how)
         try:
+            if not has_room(self.folder, len(data)):
+                raise InputError(
+                    f"{self.folder.parent}: less than 1 GiB is free for the frames of the live source; make room, or "
+                    "set TMPDIR to a folder that has some"
+                )
             file.write_bytes(data.data)
         except OSError as error:
             file.unlink(missing_ok=True)

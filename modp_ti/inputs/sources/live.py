@@ -8,7 +8,6 @@ from __future__ import annotations
 import atexit
 import os
 import re
-import signal
 import tempfile
 import threading
 import time
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
+from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import FrameStore
 from modp_ti.inputs.sources.listed_images import quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -31,6 +31,8 @@ __all__ = ["LiveSource"]
 MEMORY = 64 << 20
 # Timeout of a network stream [s], for opening it and for each frame.
 PATIENCE = 10.0
+# Time [s] without a frame from which on the end of a stream is told as a pause.
+PAUSE = 1.0
 
 
 @dataclass
@@ -48,9 +50,9 @@ class LiveSource(ImageSource):
     they arrive faster than they are taken. Each delivered frame is stored without loss in a folder, from which `read`
     decodes it again. Times are those of arrival [s], on the Unix clock.
 
-    The recording ends when the stream ends, when `arriving` reaches its `stop`, when `finish` is called, if the disk is
-    full, or on the first Ctrl-C if the source was opened in the main thread of a process that does not ignore Ctrl-C.
-    After that, Ctrl-C interrupts as usual.
+    The recording ends when the stream ends or sends nothing for `PATIENCE`, when `arriving` reaches its `stop`, when
+    `finish` is called, if the disk is full, or on the first Ctrl-C if the source was opened in the main thread of a
+    process that does not ignore Ctrl-C. A later Ctrl-C goes to the handler that was there before.
 
     Args:
         stream: Number of a camera, or URL.
@@ -69,7 +71,7 @@ class LiveSource(ImageSource):
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
         self._ended = False
-        self._full: InputError | None = None
+        self._end: str | None = None  # why the recording ended, if not on request
         self._last: tuple[str, NDArray[np.uint8]] | None = None
         self._received: list[float] = []
         self._capture = _open(stream)
@@ -91,10 +93,7 @@ class LiveSource(ImageSource):
         self._thread = threading.Thread(target=self._take, name=f"frames of {self.path}", daemon=True)
         self._thread.start()
         atexit.register(self.close)
-        self._interrupt = None
-        ours = threading.current_thread() is threading.main_thread()
-        if ours and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-            self._interrupt = signal.signal(signal.SIGINT, self._interrupted)
+        self._interrupt = RecordingInterrupt(self._interrupted)
 
     @property
     def notes(self) -> list[str]:
@@ -108,8 +107,8 @@ class LiveSource(ImageSource):
                 f"{counts.thinned} of {counts.arrived} frames of {self.path} came faster than they could be tracked "
                 "and were left out evenly"
             )
-        if self._full is not None:
-            notes.append(f"the recording ended early: {self._full}")
+        if self._end is not None:
+            notes.append(f"the recording ended: {self._end}")
         return notes
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
@@ -128,6 +127,10 @@ class LiveSource(ImageSource):
             yield self._names[position]
             position += step
         self._end_now()
+
+    @property
+    def recording(self) -> bool:
+        return not self._ended
 
     @property
     def arrivals(self) -> Arrivals:
@@ -167,7 +170,7 @@ class LiveSource(ImageSource):
         self._end_now()
         # If the stream has stalled, the thread ends after its own timeout. Nothing depends on it.
         self._thread.join(1.0)
-        self._give_back_interrupt()
+        self._interrupt.give_back()
         self._last = None
         if self._kept is not None:
             self._kept.cleanup()
@@ -190,14 +193,20 @@ class LiveSource(ImageSource):
     def _take(self) -> None:
         """Capture frames until the recording ends; runs in the thread."""
         while not self._ended:
+            asked = time.monotonic()
             frame = self._grab()
+            if self._ended:
+                break
             try:
                 if frame is None:
+                    waited = time.monotonic() - asked
+                    sent = f"sent nothing for {waited:.0f} s" if waited >= PAUSE else "sends no more frames"
+                    self._end = f"{self.path} {sent}"
                     self.finish()
-                elif not self._ended:
+                else:
                     self._add(*frame)
             except InputError as error:
-                self._full = error
+                self._end = str(error)
                 self.finish()
         self._capture.release()
 
@@ -240,7 +249,7 @@ class LiveSource(ImageSource):
                 except InputError as error:
                     if not self._names:
                         raise
-                    self._full = error
+                    self._end = str(error)
                     self._end_now()
                     return False
             return True
@@ -257,17 +266,13 @@ class LiveSource(ImageSource):
         self._received.append(arrived)
         self._append(name, self._clock + arrived)
 
-    def _interrupted(self, *_: object) -> None:
-        self._give_back_interrupt()
+    def _interrupted(self) -> bool:
+        """End the recording in a signal handler; return whether it was going on."""
         if self._ended:
-            raise KeyboardInterrupt
+            return False
         # In a separate thread, because the interrupted one may hold the lock.
         threading.Thread(target=self.finish, daemon=True).start()
-
-    def _give_back_interrupt(self) -> None:
-        if self._interrupt is not None and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self._interrupt)
-            self._interrupt = None
+        return True
 
 
 def _shown(stream: int | str) -> str:

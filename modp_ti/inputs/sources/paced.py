@@ -87,6 +87,11 @@ class PacedSource(ImageSource):
             self._wait(float(self._due[self._come]) - now)
 
     @property
+    def recording(self) -> bool:
+        more = self._due is None or self._come < len(self._due)
+        return more and not self._finished.is_set()
+
+    @property
     def arrivals(self) -> Arrivals:
         return self._backlog.arrivals
 

@@ -116,6 +116,11 @@ class ImageSource(ABC):
         """End the recording of a source that follows a clock. Images that have arrived are still delivered."""
 
     @property
+    def recording(self) -> bool:
+        """Whether images still arrive at a source that follows a clock, so that `finish` has an effect."""
+        return False
+
+    @property
     def arrivals(self) -> Arrivals | None:
         """Number of images received so far; None for a source that follows no clock."""
         return None

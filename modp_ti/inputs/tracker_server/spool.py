@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 import tempfile
 import time
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.config.settings import SourceSettings
+from modp_ti.files.disk_room import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.image_header import read_image_header
@@ -22,9 +22,6 @@ from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.tracker_server.messages import POINT, Encoding, Frame, Hello, UnfitError, parse_points
 
 __all__ = ["Spool", "SpoolFullError"]
-
-# Disk space that must stay free [bytes].
-KEPT_FREE = 1 << 30
 
 
 class SpoolFullError(Exception):
@@ -170,7 +167,7 @@ class Spool(ImageSource):
 
     def _write(self, name: str, data: bytes) -> None:
         try:
-            if shutil.disk_usage(self.path).free < KEPT_FREE + len(data):
+            if not has_room(self.path, len(data)):
                 raise SpoolFullError(
                     f"{self.path.parent}: less than 1 GiB is free for the frames that arrive; set TMPDIR"
                 )

@@ -94,6 +94,8 @@ class _Child:
         self._connection.send(Preparing(what, done, total))
 
     def _publish(self) -> None:
+        if self._images is not None:
+            self._board.recording = self._images.recording
         if self._tracker is not None:
             self._board.write(self._tracker.live, self._tracker.frame_count)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import tempfile
 from collections.abc import Iterator
 from typing import IO
@@ -31,19 +33,23 @@ class DeliveredLog:
     def __init__(self) -> None:
         self.records: list[FrameRecord] = []
         self._counts: list[int] = []
-        self._points: IO[bytes] = tempfile.TemporaryFile()
+        # Without a buffer, so that what a full disk refuses is known at once.
+        self._points: IO[bytes] = tempfile.TemporaryFile(buffering=0)
+        self._size = 0  # bytes of the points
         self._moved: dict[int, NDArray[np.float64]] = {}
 
     def __len__(self) -> int:
         return len(self.records)
 
     def add(self, record: FrameRecord) -> None:
-        """Add a delivered frame."""
+        """Add a delivered frame. Raises OSError if the disk is full."""
         points = record.points
         table = np.zeros(len(points), POINT)
         table["id"], table["xyz"], table["pixel"] = points.ids, points.xyz, points.pixels
-        self._points.seek(0, 2)
-        self._points.write(table.tobytes())
+        self._points.seek(self._size)
+        if self._points.write(table.tobytes()) < table.nbytes:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._size += table.nbytes
         self.records.append(record.with_pose(record.T_camera_world, SparsePoints()))
         self._counts.append(len(points))
 

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["CountsBoard", "FrameRing", "SlotLayout", "anonymous_memory"]
 
+# Numbers of a `CountsBoard`: the counts, the number of frames, the wish to finish, and whether the stream goes on.
+NUMBERS = 8
+
 
 def anonymous_memory() -> int:
     """Return the descriptor of a new empty memory without a name.
@@ -132,7 +135,7 @@ class FrameRing:
 
 
 class CountsBoard:
-    """Counts of the stream in shared memory, written by the child, and the wish of the parent that it ends.
+    """Counts of the stream in shared memory and whether it goes on, written by the child; the parent's wish to end it.
 
     Each number is read and written at once, without locks.
 
@@ -141,8 +144,8 @@ class CountsBoard:
     """
 
     def __init__(self, memory: int) -> None:
-        os.ftruncate(memory, 8 * 7)
-        self._numbers = np.frombuffer(mmap.mmap(memory, 8 * 7), np.float64)
+        os.ftruncate(memory, 8 * NUMBERS)
+        self._numbers = np.frombuffer(mmap.mmap(memory, 8 * NUMBERS), np.float64)
 
     def write(self, counts: LiveCounts | None, frame_count: int | None) -> None:
         if counts is not None:
@@ -157,6 +160,15 @@ class CountsBoard:
     @property
     def frame_count(self) -> int | None:
         return None if self._numbers[5] < 0 else int(self._numbers[5])
+
+    @property
+    def recording(self) -> bool:
+        """Whether images still arrive."""
+        return bool(self._numbers[7])
+
+    @recording.setter
+    def recording(self, goes_on: bool) -> None:
+        self._numbers[7] = goes_on
 
     @property
     def finish(self) -> bool:

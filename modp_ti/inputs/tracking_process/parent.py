@@ -22,6 +22,7 @@ from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import StoredFrames
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
@@ -40,8 +41,9 @@ class TrackingProcess(Tracker):
     beyond the first few. Iterating over this object yields the frames with their latest poses; it reads their images
     again in this process, so the other one need not exist any more.
 
-    The first Ctrl-C ends the recording, if this object is made in the main thread. If the process dies, the recording
-    ends too, with a note. The process ends when this one does.
+    Ctrl-C ends the recording, if this object is made in the main thread; a later one, or one after the end of the
+    stream, goes to the handler that was there before. If the process dies, the recording ends too, with a note. The
+    process ends when this one does.
 
     Args:
         config: The scene; the tracker is `klt`.
@@ -69,10 +71,7 @@ class TrackingProcess(Tracker):
         self._process = _started([theirs.fileno(), self._memory, board])
         theirs.close()
         os.close(board)
-        self._interrupt = None
-        ours = threading.current_thread() is threading.main_thread()
-        if ours and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-            self._interrupt = signal.signal(signal.SIGINT, self._interrupted)
+        self._interrupt = RecordingInterrupt(self._interrupted)
         try:
             self._connection.send(Job(config, None if self._kept is None else Path(self._kept.name)))
             opened = self._wait_for_opening(progress)
@@ -130,7 +129,14 @@ class TrackingProcess(Tracker):
                 self._ring = FrameRing(self._memory, message.layout, self._slots)
                 self._vignette = message.vignette
             elif isinstance(message, Delivered):
-                yield self._delivered(message)
+                try:
+                    frame = self._delivered(message)
+                except OSError as error:
+                    place = f"{tempfile.gettempdir()}: the points of a frame cannot be kept there: {error.strerror}"
+                    self._board.finish = True
+                    self._end(Ended([], {}, failure=place))
+                    return
+                yield frame
             elif isinstance(message, PoseCorrection):
                 self._log.correct(message)
                 yield message
@@ -154,7 +160,7 @@ class TrackingProcess(Tracker):
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._give_back_interrupt()
+        self._interrupt.give_back()
         if self._again is not None:
             self._again.images.close()
         if self._memory >= 0:
@@ -210,18 +216,12 @@ class TrackingProcess(Tracker):
         records = self._log.records
         return StoredFrames(Path(self._kept.name), [r.name for r in records], [r.timestamp for r in records])
 
-    # ---- Ctrl-C ----------------------------------------------------------------------------------------------
-
-    def _interrupted(self, *_: object) -> None:
-        self._give_back_interrupt()
-        if self._ended:
-            raise KeyboardInterrupt
+    def _interrupted(self) -> bool:
+        """End the recording after Ctrl-C; return whether it was going on."""
+        if self._ended or not self._board.recording:
+            return False
         self._board.finish = True
-
-    def _give_back_interrupt(self) -> None:
-        if self._interrupt is not None and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self._interrupt)
-            self._interrupt = None
+        return True
 
 
 def _started(descriptors: list[int]) -> subprocess.Popen[bytes]:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from modp_ti.engine.interruption import Interruption, RunStopped
+from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 
 
 def press() -> None:
@@ -28,6 +29,7 @@ def as_in_a_terminal() -> Iterator[None]:
 def test_the_first_is_noted_until_the_step_is_done_and_the_second_stops_at_once() -> None:
     said: list[str] = []
     with Interruption(lambda: said.append("stopping")) as stop:
+        stop.begin()
         stop.check()
         press()
         assert (stop.asked, said) == (True, ["stopping"])
@@ -41,11 +43,43 @@ def test_the_first_is_noted_until_the_step_is_done_and_the_second_stops_at_once(
 
 def test_it_ends_the_waiting_for_a_frame() -> None:
     with Interruption(lambda: pytest.fail("there is no step to be done")) as stop:
+        stop.begin()
         with pytest.raises(RunStopped), stop.waiting():
             press()
             pytest.fail("it goes on waiting")
         with pytest.raises(RunStopped):
             stop.check()
+
+
+def test_before_there_is_a_map_ctrl_c_interrupts_as_usual() -> None:
+    with Interruption(lambda: pytest.fail("there is no step to be done")) as stop:
+        with pytest.raises(KeyboardInterrupt):
+            press()
+        assert not stop.asked
+
+
+def test_a_recording_that_is_going_on_ends_first() -> None:
+    going_on, said = [True], []
+    with Interruption(lambda: said.append("stopping")) as stop:
+        recording = RecordingInterrupt(lambda: bool(going_on) and going_on.pop())
+        stop.begin()
+        press()
+        stop.check()
+        assert (going_on, said) == ([], [])
+        press()
+        assert stop.asked and said == ["stopping"]
+        with pytest.raises(KeyboardInterrupt):
+            press()
+        recording.give_back()
+
+
+def test_a_recording_that_has_ended_leaves_ctrl_c_to_the_run() -> None:
+    with Interruption(lambda: None) as stop:
+        recording = RecordingInterrupt(lambda: False)
+        stop.begin()
+        press()
+        assert stop.asked
+        recording.give_back()
 
 
 def test_afterwards_it_is_what_it_was() -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -96,6 +99,27 @@ def test_frames_and_corrections_are_read_as_they_were(tmp_path: Path) -> None:
 def test_a_folder_without_a_session_says_how_to_record_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"there is no recorded session; record one with `export\.session: true`"):
         RecordedSession(tmp_path)
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    during, at_the_end = SessionRecorder(), SessionRecorder()
+    for recorder in (during, at_the_end):
+        recorder.add_frame(frame(0))
+    with monkeypatch.context() as patched:
+        patched.setattr(zipfile.ZipFile, "writestr", full)
+        during.add_frame(frame(1))
+        during.add_frame(frame(2))
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "copyfile", full)
+        at_the_end.write(tmp_path / FILE, [], {})
+    during.write(tmp_path / FILE, [], {})
+    for recorder in (during, at_the_end):
+        assert recorder.problem is not None and recorder.problem.endswith("No space left on device")
+        recorder.close()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("damage", ["no zip", "cut off", "no JSON", "other version"])

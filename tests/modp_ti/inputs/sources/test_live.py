@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
+from modp_ti.files import disk_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import live, open_source
 from modp_ti.inputs.sources.live import LiveSource
@@ -85,13 +87,14 @@ def test_frames_arrive_in_order_with_their_times_and_can_be_read_again(camera, o
     assert source.position("live_000004") == 4
     assert source.size("live_000004") == (64, 48)
     assert source.find("x/live_000002.png") == "live_000002" and source.find("2") is None
-    assert len(source.notes) == 1, "nothing was left out"
+    ended = f"the recording ended: {source.path} sends no more frames"
+    assert source.notes[1:] == [ended] and not source.recording
     assert (source.arrivals.arrived, source.arrivals.thinned) == (6, 0)
     arrived = [source.arrived(name) for name in names]
     assert arrived == sorted(arrived) and arrived[-1] == source.arrivals.newest <= time.monotonic()
     assert source.timestamp(names[5]) - source.timestamp(names[0]) == pytest.approx(arrived[5] - arrived[0], abs=1e-5)
     source.add_note("the camera is guessed")
-    assert source.notes[1:] == ["the camera is guessed"]
+    assert source.notes[1:] == ["the camera is guessed", ended]
 
 
 def test_what_is_read_again_is_what_the_decoder_gave(camera, opened):
@@ -144,7 +147,7 @@ def test_a_slow_tracker_gets_frames_that_are_thinned_evenly_and_all_are_counted(
     gaps = np.diff(taken)
     assert len(taken) + source.arrivals.thinned == source.arrivals.arrived == 45
     assert gaps.max() > 1 and (np.diff(gaps) <= 1).all()
-    assert source.notes[-1].startswith(f"{45 - len(taken)} of 45 frames of ")
+    assert source.notes[-2].startswith(f"{45 - len(taken)} of 45 frames of ")
     assert len(list(source._store.folder.iterdir())) == len(taken)
 
 
@@ -155,6 +158,16 @@ def test_stop_lets_the_camera_go(camera, opened):
     camera.send(*range(8, 12))  # the thread may be waiting for one
     wait_until(lambda: not source._thread.is_alive())
     assert len(source) == 3
+    assert len(source.notes) == 1, "the end was asked for"
+
+
+def test_a_pause_beyond_the_patience_ends_the_recording_and_is_told(camera, opened, monkeypatch):
+    monkeypatch.setattr(live, "PATIENCE", 2.0)
+    camera.send(*range(6))
+    source = opened()  # and then the camera sends nothing, but keeps the connection
+    names = list(source.arriving(0, None, 1))
+    assert numbers(source, names) == list(range(len(names))) and len(names) >= 4
+    assert re.fullmatch(rf"the recording ended: {source.path} sent nothing for \d+ s", source.notes[-1])
 
 
 def test_close_ends_the_thread_and_removes_what_was_kept(camera, opened):
@@ -180,6 +193,7 @@ def test_ctrl_c_ends_the_recording_and_a_second_one_interrupts(camera, opened):
     os.kill(os.getpid(), signal.SIGINT)
     taken += arriving  # ends though the stream does not
     assert numbers(source, taken) == list(range(len(taken)))
+    assert len(source.notes) == 1, "the end was asked for"
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(PATIENCE)
@@ -264,7 +278,18 @@ def test_full_disk_is_said_in_one_line(camera, opened, monkeypatch):
     taken = [next(arriving)]
     monkeypatch.setattr(Path, "write_bytes", full)
     assert list(arriving) == [] and list(source.names) == taken, "the recording ends with what it has"
-    assert "the recording ended early: " in source.notes[-1] and "No space left" in source.notes[-1]
+    assert source.notes[-1].startswith("the recording ended: ") and "No space left" in source.notes[-1]
+
+
+def test_room_for_the_map_is_kept_on_the_disk(camera, opened, monkeypatch):
+    camera.send(*range(6))
+    source = opened()
+    arriving = source.arriving(0, None, 1)
+    taken = [next(arriving), next(arriving)]
+    monkeypatch.setattr(disk_room, "KEPT_FREE", 1 << 60)
+    assert list(arriving) == [] and list(source.names) == taken
+    said = f"{source._store.folder.parent}: less than 1 GiB is free for the frames of the live source; "
+    assert source.notes[-1].startswith(f"the recording ended: {said}")
 
 
 @pytest.mark.parametrize(

@@ -43,9 +43,11 @@ def paced(folder: Path, fps: float) -> tuple[PacedSource, Clock]:
 
 def test_images_arrive_at_the_times_of_their_stamps(folder):
     source, clock = paced(folder, fps=10)
+    assert source.recording
     for i, name in enumerate(source.arriving(0, None, 1)):
         assert name == f"{i:03d}.png"
         assert clock.now == pytest.approx(1000.0 + 0.1 * i), "the first at once"
+        assert source.recording == (i < 119)
         assert source.arrived(name) == pytest.approx(clock.now)
         clock.now += 0.06
     assert source.arrivals.arrived == 120 and source.arrivals.thinned == 0

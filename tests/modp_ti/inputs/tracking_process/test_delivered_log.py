@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import resource
+import signal
+
 import numpy as np
+import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
@@ -29,4 +33,24 @@ def test_corrections_move_the_frames_and_points_that_they_list():
         assert second.points.ids.tolist() == []
     log.add(FrameRecord.of(random_frame(3)))
     assert len(log) == 4 and len(list(log)[3].points) == 5
+    log.close()
+
+
+def test_frames_that_a_full_disk_cannot_take_leave_the_others_as_they_were(monkeypatch: pytest.MonkeyPatch):
+    """A limit on a file's size stands for the disk: the system refuses what lies beyond it, in the midst of a write."""
+    log, limits = DeliveredLog(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    frames = [random_frame(i, points=8) for i in range(3)]
+    log.add(FrameRecord.of(frames[0]))
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (700, limits[1]))
+        with pytest.raises(OSError):
+            log.add(FrameRecord.of(frames[1]))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    log.add(FrameRecord.of(frames[2]))
+    first, last = log
+    np.testing.assert_array_equal(first.points.xyz, frames[0].points.xyz)
+    np.testing.assert_array_equal(last.points.xyz, frames[2].points.xyz)
     log.close()

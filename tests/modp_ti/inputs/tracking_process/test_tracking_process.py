@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -142,6 +143,39 @@ def test_ctrl_c_ends_the_recording_and_a_second_one_interrupts(scene, started):
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(PATIENCE)
+
+
+def test_ctrl_c_after_the_end_of_the_stream_goes_to_the_run_though_frames_wait(scene, started):
+    pressed = []
+    before = signal.signal(signal.SIGINT, lambda *_: pressed.append(True))
+    try:
+        tracker = started(scene(realtime=True, fps=20))
+        events = tracker.events()
+        taken = [next(events)]
+        wait_until(lambda: tracker.live.arrived == 60 and not tracker._board.recording)
+        os.kill(os.getpid(), signal.SIGINT)
+        wait_until(lambda: pressed)
+        taken += events
+        frames = [event for event in taken if isinstance(event, TrackedFrame)]
+        assert len(frames) == tracker.live.tracked > 10, "the frames that wait are still there"
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_full_disk_ends_the_recording_with_a_note(scene, started, monkeypatch):
+    tracker = started(scene(realtime=True, fps=20))
+    events = tracker.events()
+    frames = [event for event in (next(events) for _ in range(5)) if isinstance(event, TrackedFrame)]
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tracker._log, "add", full)
+    frames += [event for event in events if isinstance(event, TrackedFrame)]
+    assert tracker.notes[-1].endswith(
+        f"No space left on device; the map is finished with the {len(frames)} frames before"
+    )
+    assert [frame.name for frame in tracker] == [frame.name for frame in frames]
 
 
 def test_input_errors_are_those_of_the_tracker(scene, started, tmp_path, folder):

@@ -1,0 +1,120 @@
+"""Ctrl-C and full disks in a live session: what came so far is saved, and one line says where."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from modp_ti.config.scene_file import load_scene
+from modp_ti.engine import results, session
+from modp_ti.engine.observer import Observer
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.splats_ply import read_splats
+
+if TYPE_CHECKING:
+    from tests.room import Room
+
+SAVED = {"splats.ply", "trajectory.txt", "frames.json", "colmap", "config.yaml"}
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def scene(tmp_path: Path, room: Room) -> Path:
+    """A walk that is played at its own pace, as a camera would."""
+    from tests.room import RoomRecording, pinhole, walk
+
+    camera = pinhole(160, 120)
+    RoomRecording(room, camera, walk(40)).write(tmp_path)
+    file = tmp_path / "scene.yaml"
+    file.write_text(f"""
+source:  {{path: images, realtime: true, fps: 20, intrinsics: {{fx: {camera.fx}, fy: {camera.fy}, cx: 80, cy: 60}}}}
+tracker: {{kind: klt}}
+output:  out
+device:  cpu
+refine:  {{seconds: 600}}
+export:  {{report: false}}
+""")
+    return file
+
+
+@pytest.fixture
+def in_a_terminal():
+    """Where the tests run in a shell's background, Ctrl-C is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler, "the run gave Ctrl-C back"
+
+
+class Presser(Observer):
+    """Presses Ctrl-C after frames of the mapping, and after steps of the refinement."""
+
+    def __init__(self, frames: tuple[int, ...] = (), steps: tuple[int, ...] = ()) -> None:
+        self._frames, self._steps = frames, steps
+        self.seen = 0
+
+    def on_frame(self, *_: object) -> None:
+        self.seen += 1
+        if self.seen in self._frames:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def on_step(self, stage: str, step: int, *_: object) -> None:
+        if step in self._steps:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.usefixtures("in_a_terminal")
+@pytest.mark.parametrize(
+    "observer", [Presser(frames=(3,), steps=(2,)), Presser(frames=(5, 7))], ids=["refining", "catching up"]
+)
+def test_ctrl_c_after_the_recording_has_ended_saves_the_map_so_far(
+    observer: Presser, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session._Session, "_open_observer", lambda _: observer)
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        session.run_scene(load_scene(scene))
+    out = scene.parent / "out"
+    assert str(stopped.value) == f"interrupted after {observer.seen} frames; the map so far is in {out}"
+    assert set(os.listdir(out)) == SAVED | {"renders"}
+    assert len(read_splats(out / "splats.ply")["position"]) > 20
+
+
+def full(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def elsewhere(_: object) -> None:
+    """The disk of the output folder is full."""
+
+
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(results.tempfile, "mkdtemp", full)
+
+
+@pytest.mark.parametrize("room_left", [elsewhere, nowhere])
+def test_a_live_map_that_does_not_fit_on_the_disk_is_saved_elsewhere(
+    room_left: Callable[[pytest.MonkeyPatch], None], scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    monkeypatch.setattr(results.tempfile, "tempdir", None)
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(results, "write_scores", full)
+    config = load_scene(scene, ["source.stop=12", "refine.seconds=null", "refine.steps=2"])
+    room_left(monkeypatch)
+    with pytest.raises(InputError) as error:
+        session.run_scene(config)
+    said, out = str(error.value), scene.parent / "out"
+    assert said.startswith(f"{out}: cannot be written: No space left on device; ")
+    assert not out.exists()
+    if room_left is elsewhere:
+        (kept,) = (tmp_path / "tmp").iterdir()
+        assert said.endswith(f"; the map is in {kept}")
+        assert set(os.listdir(kept)) == SAVED and len(read_splats(kept / "splats.ply")["position"]) > 20
+    else:
+        assert said.endswith(f"; nor can {tmp_path / 'tmp'}: No space left on device, and the map is lost")
