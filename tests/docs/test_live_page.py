@@ -27,6 +27,7 @@ def test_the_options_of_the_script_exist() -> None:
     script = PROJECT / "scripts" / "live.py"
     helped = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=True).stdout
     calls = " ".join(re.findall(r"^scripts/live .*", PAGE, re.MULTILINE))
-    told = set(re.findall(r"(?<![\w-])--[a-z]+", calls)) | {"--stall", "--cut", "--unplug", "--seconds", "--cold"}
+    told = set(re.findall(r"(?<![\w-])--[a-z-]+", calls))
+    told |= {"--stall", "--cut", "--unplug", "--kill-tracker", "--full-disk", "--seconds", "--cold"}
     assert told == {option for option in told if f"{option} " in helped or f"{option}]" in helped}
     assert all(f"`{option}" in PAGE or option in calls for option in told)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,11 @@ class DeliveredTrajectory:
         self._xyz = np.concatenate([self._xyz, np.full((fresh, 3), np.nan)])
         new = np.isnan(self._xyz[points.ids, 0])
         self._xyz[points.ids[new]] = points.xyz[new]
+
+    def forget_points(self, index: int) -> None:
+        """Forget the landmarks of a frame, which `points` then does not know; its pose is still corrected."""
+        frame = self.frames[index]
+        frame.view = replace(frame.view, ids=frame.view.ids[:0].copy(), pixels=frame.view.pixels[:0].copy())
 
     def corrections(self, last: bool = False) -> Iterator[PoseCorrection]:
         """Yield one correction, with the frames of all moved keyframes, if a keyframe has moved notably.

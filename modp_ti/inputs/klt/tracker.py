@@ -218,6 +218,11 @@ class KltTracker(Tracker):
     def undistorter(self) -> Undistorter:
         return self._delivered
 
+    def forget_points(self, index: int) -> None:
+        """Forget which points a delivered frame sees, where the tracker is not iterated over again."""
+        assert self._trajectory is not None, "a frame has been delivered"
+        self._trajectory.forget_points(index)
+
     def close(self) -> None:
         self._reader.images.close()
 

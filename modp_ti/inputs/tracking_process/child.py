@@ -75,6 +75,8 @@ class _Child:
             for event in tracker.events():
                 self._publish()
                 self._outbox.put(event)
+                if isinstance(event, TrackedFrame):  # the parent has the points now
+                    tracker.forget_points(event.index)
         except InputError as caught:
             error = caught
         except Exception as caught:  # told to the parent, which saves its map

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
@@ -24,7 +23,7 @@ class DeliveredLog:
     """Records of the delivered frames in order, with all corrections applied.
 
     Only the frames that a correction lists move: `klt` lists all that it moves. The points are kept in a file without
-    a name.
+    a name. Their ids count from 0, as those of `klt`.
 
     Attributes:
         records: The records without their points.
@@ -36,7 +35,7 @@ class DeliveredLog:
         # Without a buffer, so that what a full disk refuses is known at once.
         self._points: IO[bytes] = tempfile.TemporaryFile(buffering=0)
         self._size = 0  # bytes of the points
-        self._moved: dict[int, NDArray[np.float64]] = {}
+        self._moved = np.zeros((0, 3))  # by id, NaN for points that were not corrected
 
     def __len__(self) -> int:
         return len(self.records)
@@ -58,7 +57,10 @@ class DeliveredLog:
         for index, T in zip(correction.index.tolist(), correction.T_camera_world, strict=True):
             record = self.records[index]
             self.records[index] = record.with_pose(T, record.points)
-        self._moved.update(zip(correction.ids.tolist(), correction.xyz, strict=True))
+        if len(correction.ids) and correction.ids.max() >= len(self._moved):
+            more = max(int(correction.ids.max()) + 1, 2 * len(self._moved)) - len(self._moved)
+            self._moved = np.concatenate([self._moved, np.full((more, 3), np.nan)])
+        self._moved[correction.ids] = correction.xyz
 
     def __iter__(self) -> Iterator[FrameRecord]:
         at = 0
@@ -67,8 +69,11 @@ class DeliveredLog:
             data = self._points.read(count * POINT.itemsize)
             at += len(data)
             table = np.frombuffer(data, POINT)
-            xyz = np.array([self._moved.get(i, old) for i, old in zip(table["id"].tolist(), table["xyz"], strict=True)])
-            points = SparsePoints(xyz.reshape(-1, 3), table["pixel"].copy(), table["id"].copy())
+            xyz, ids = table["xyz"].copy(), table["id"].copy()
+            here = np.flatnonzero(ids < len(self._moved))
+            here = here[~np.isnan(self._moved[ids[here], 0])]
+            xyz[here] = self._moved[ids[here]]
+            points = SparsePoints(xyz, table["pixel"].copy(), ids)
             yield record.with_pose(record.T_camera_world, points)
 
     def close(self) -> None:

@@ -86,6 +86,19 @@ def test_iterating_alone_tracks_too_and_gives_the_same(delivered, box_room, box_
         np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
 
 
+def test_points_of_delivered_frames_may_be_forgotten(delivered, box_room, box_walk, tmp_path):
+    _, expected, last = delivered
+    tracker = known_camera(box_walk.written(tmp_path / "images"), box_room, scale=0.5, holdout=8)
+    for one, other in zip(tracker.events(), expected, strict=True):
+        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
+        if isinstance(one, TrackedFrame):
+            np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
+            tracker.forget_points(one.index)
+    for one, other in zip(tracker, last, strict=True):
+        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
+        assert len(one.points) == 0
+
+
 def test_the_number_of_frames_is_known_from_the_start_and_shrinks_by_those_without_a_pose(box_room, box_walk, tmp_path):
     folder = box_walk.written(tmp_path / "images")
     for i in range(35, 38):
