@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.inputs.tracking_process.messages import FrameRecord
@@ -33,6 +35,7 @@ class DeliveredLog:
         self._counts: list[int] = []
         self._points: IO[bytes] = tempfile.TemporaryFile()
         self._moved: dict[int, NDArray[np.float64]] = {}
+        self._revisions: list[tuple[int, CameraRevision]] = []  # with the number of frames before each
 
     def __len__(self) -> int:
         return len(self.records)
@@ -53,16 +56,24 @@ class DeliveredLog:
             record = self.records[index]
             self.records[index] = record.with_pose(T, record.points)
         self._moved.update(zip(correction.ids.tolist(), correction.xyz, strict=True))
+        if correction.camera is not None:
+            self._revisions.append((len(self), correction.camera))
+            self.records = [replace(record, camera=correction.camera.camera) for record in self.records]
 
     def __iter__(self) -> Iterator[FrameRecord]:
         at = 0
-        for record, count in zip(self.records, self._counts, strict=True):
+        for number, (record, count) in enumerate(zip(self.records, self._counts, strict=True)):
             self._points.seek(at)
             data = self._points.read(count * POINT.itemsize)
             at += len(data)
             table = np.frombuffer(data, POINT)
             xyz = np.array([self._moved.get(i, old) for i, old in zip(table["id"].tolist(), table["xyz"], strict=True)])
-            points = SparsePoints(xyz.reshape(-1, 3), table["pixel"].copy(), table["id"].copy())
+            pixels = table["pixel"].copy()
+            for before, revision in self._revisions:
+                if number < before:
+                    pixels = revision.pixels(pixels)
+            seen = record.camera.contains(pixels)
+            points = SparsePoints(xyz.reshape(-1, 3)[seen], pixels[seen], table["id"][seen])
             yield record.with_pose(record.T_camera_world, points)
 
     def close(self) -> None:
