@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
+from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
 from fields.map.gaussian_motion import GaussianMotion
+from fields.map.gaussians import NO_ANCHOR
 from fields.map.keyframes import NO_MOTION, Keyframe, KeyframeStore
 from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation
@@ -83,7 +86,8 @@ class MapCorrector:
     """Applies the corrections of a tracker to an online map.
 
     Keyframe poses change at once. Gaussians move with the views that placed them as soon as a keyframe's image would
-    otherwise be displaced by more than `corrections.min_pixels`; the voxels are then marked again.
+    otherwise be displaced by more than `corrections.min_pixels`; the voxels are then marked again. With a new camera,
+    they move at once: in addition, each moves onto the new ray of its pixel in the keyframe that placed it.
 
     Args:
         keyframes: The keyframes of the map.
@@ -112,15 +116,24 @@ class MapCorrector:
             Motion of the world as `revise` returns it, and the keyframes (N,) whose Gaussians moved, as places in the
             store.
         """
+        former = self.keyframes[0].camera if len(self.keyframes) else None
         around = revise(self.keyframes, correction)
+        if correction.camera is not None and former is not None and settings.enabled:
+            self._move_gaussians((correction.camera, former))
+            return around, np.arange(len(self.keyframes))
         pending = np.array([pending_motion_in_pixels(view) for view in self.keyframes])
         if more or not (settings.enabled and (pending > settings.min_pixels).any()):
             return around, np.zeros(0, dtype=np.int64)
         self._move_gaussians()
         return around, np.flatnonzero(pending > 0)
 
-    def _move_gaussians(self) -> None:
-        """Move the Gaussians by the pending motion of their anchors, and mark the voxels again."""
+    def _move_gaussians(self, camera: tuple[CameraRevision, PinholeCamera] | None = None) -> None:
+        """Move the Gaussians by the pending motion of their anchors, and mark the voxels again.
+
+        Args:
+            camera: A new camera and the former one, if the Gaussians move onto the rays of the new one as well.
+        """
+        growth = 1.0 if camera is None else camera[1].focal / camera[0].camera.focal
         anchors, voxels = self.densifier.anchors, self.densifier.voxels
         degree = self.densifier.gaussians.sh_degree
         turns = {
@@ -130,18 +143,31 @@ class MapCorrector:
         if anchors:
             S = np.stack([anchor.keyframe.pending_motion for anchor in anchors])
             self.motion.move(S, np.stack([turns[anchor.keyframe.index] for anchor in anchors]))
+            if camera is not None:
+                self.motion.place(self._on_new_rays(*camera), growth)
         for anchor in anchors:
-            anchor.spacing *= float(scale_of(anchor.keyframe.pending_motion))
+            anchor.spacing *= float(scale_of(anchor.keyframe.pending_motion)) * growth
         if voxels is not None:
             first = self.keyframes[0].pending_motion
             origin = moved_points(first, voxels.origin[None])[0]
-            self.densifier.restart_voxels(voxels.coarsest * float(scale_of(first)), origin)
+            self.densifier.restart_voxels(voxels.coarsest * float(scale_of(first)) * growth, origin)
         for view in self.keyframes:
             view.pending_motion = NO_MOTION
 
+    def _on_new_rays(self, revision: CameraRevision, former: PinholeCamera) -> NDArray[np.float64]:
+        """Positions (N, 3) of all Gaussians at their depths on the new rays of their pixels in the anchors' views."""
+        position = self.densifier.gaussians.to_numpy()["position"].astype(np.float64)
+        of = self.densifier.gaussians.anchors()
+        placed = of != NO_ANCHOR
+        T = np.stack([anchor.keyframe.T_camera_world for anchor in self.densifier.anchors])[of[placed]]
+        here = np.einsum("nij,nj->ni", T[:, :3, :3], position[placed]) + T[:, :3, 3]
+        there = revision.points(here, former)
+        position[placed] = np.einsum("nji,nj->ni", T[:, :3, :3], there - T[:, :3, 3])
+        return position
+
 
 def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArray[np.float64]]:
-    """Apply a correction to the tracked poses of all frames, and to the poses, points and depths of the keyframes.
+    """Apply a correction to the tracked poses of all frames, and to the poses, points, depths and camera of keyframes.
 
     Corrected frames take the pose that the correction names, and all others move with the world around them. The
     Gaussians are not moved. Each keyframe's `pending_motion` accumulates the motion that they have to follow.
@@ -169,6 +195,9 @@ def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArra
     around = {i: S for i, (_, S) in after.items()}
     for keyframe in store:
         keyframe.follow(before[keyframe.index], around[keyframe.index])
+    if correction.camera is not None:
+        store.revise_camera(correction.camera)
+    for keyframe in store:
         mine, theirs = _matches(keyframe.points, ids)
         if len(mine):
             moved = keyframe.points.xyz.copy()

@@ -7,20 +7,24 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.camera_revision import CameraRevision
+
 __all__ = ["PoseCorrection"]
 
 
 @dataclass(frozen=True)
 class PoseCorrection:
-    """Revised poses and points after a bundle adjustment or a loop closure.
+    """Revised poses and points after a bundle adjustment or a loop closure, and the camera if it was estimated anew.
 
-    Frames that are not listed follow the listed frames around them.
+    Frames that are not listed follow the listed frames around them. A new camera is that of all frames, those after the
+    correction included.
 
     Attributes:
         index: Indices (N,) int64 of the frames, increasing.
         T_camera_world: Revised tracked poses (N, 4, 4) float64.
         ids: Ids (M,) int64 of the tracked points that moved; may be empty.
         xyz: New positions (M, 3) float64 of these points in the world frame.
+        camera: The new camera; None if it stays the same.
 
     Raises:
         ValueError: If there is no pose, a value is not finite, the shapes disagree, or the indices are negative or not
@@ -34,6 +38,7 @@ class PoseCorrection:
     T_camera_world: NDArray[np.float64]
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     xyz: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    camera: CameraRevision | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.index), len(self.ids)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fields.frames.camera_revision import CameraRevision
 from fields.frames.pyramid import ImageLevel, build_pyramid
 from fields.geometry.camera import PinholeCamera
 
@@ -164,6 +165,20 @@ class TrackedFrame:
         points = _points(name, index, xyz, pixels, ids)
         _check_observations(name, points, T, camera)
         return cls(index, timestamp, name, colours, camera, T, points, mask, held_out=held_out)
+
+    def with_camera(self, revision: CameraRevision) -> TrackedFrame:
+        """Return the frame as it looks with a new camera. Points whose pixels leave the image are dropped."""
+        rgba = revision.image(self.rgba)
+        pixels = revision.pixels(self.points.pixels)
+        kept = revision.camera.contains(pixels)
+        return replace(
+            self,
+            image=np.divide(rgba[..., :3], np.float32(255.0), dtype=np.float32),
+            camera=revision.camera,
+            points=SparsePoints(self.points.xyz[kept], pixels[kept], self.points.ids[kept]),
+            mask=None if rgba[..., 3].all() else rgba[..., 3] > 0,
+            vignette=None if self.vignette is None else revision.vignette(self.vignette),
+        )
 
     @cached_property
     def rgba(self) -> NDArray[np.uint8]:

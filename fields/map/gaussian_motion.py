@@ -57,6 +57,23 @@ class GaussianMotion:
         moves = (S != np.eye(4)).any(axis=(1, 2)).astype(np.int32)
         self._move(g.count, moves, *(np.ascontiguousarray(table, dtype=g.dtype) for table in tables))
 
+    def place(self, position: NDArray[np.float64], growth: float) -> None:
+        """Give the Gaussians new positions, and scale them. Moments stay, and gradients are set to zero.
+
+        Args:
+            position: New means (N, 3) of all Gaussians in the world frame.
+            growth: Factor on their sizes.
+        """
+        self._place(np.ascontiguousarray(position, dtype=self.gaussians.dtype), float(np.log(growth)))
+        self.gaussians.clear_gradients()
+
+    @ti.kernel
+    def _place(self, position: TABLE, growth: ti.f32):
+        for i in range(position.shape[0]):
+            for c in ti.static(range(3)):
+                self.gaussians.position[i][c] = position[i, c]
+                self.gaussians.log_scale[i][c] += growth
+
     @ti.kernel
     def _move(
         self,

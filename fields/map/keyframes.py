@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.pyramid import ImageLevel
+from fields.frames.camera_revision import CameraRevision
+from fields.frames.pyramid import ImageLevel, build_pyramid
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
@@ -131,6 +132,23 @@ class Keyframe:
         self.median_depth *= float(scale_of(S))
         self.pending_motion = S @ self.pending_motion
 
+    def revise_camera(self, revision: CameraRevision, vignette: NDArray[np.float32] | None) -> None:
+        """Take a new camera: the image with its pyramid, the vignette and the tracked points change with it.
+
+        The points keep their depths at the tracked pose. Those whose pixels leave the image are dropped.
+
+        Args:
+            revision: The new camera.
+            vignette: The vignette of its images.
+        """
+        T, points, rgba = self.T_tracked, self.points, revision.image(self.rgba)
+        there = revision.points(points.xyz @ T[:3, :3].T + T[:3, 3], self.camera)
+        pixels = revision.pixels(points.pixels)
+        kept = revision.camera.contains(pixels)
+        self.points = SparsePoints((there[kept] - T[:3, 3]) @ T[:3, :3], pixels[kept], points.ids[kept])
+        self.pyramid = build_pyramid(rgba, revision.camera, len(self.pyramid))
+        self.rgba, self.camera, self.vignette = rgba, revision.camera, vignette
+
     def revise_points(self, points: SparsePoints) -> None:
         """Replace the tracked points by the tracker's revised ones, and update the median depth."""
         self.points = points
@@ -209,6 +227,16 @@ class KeyframeStore:
         self.nbytes += _nbytes(keyframe.pyramid, keyframe.points)
         self._depths.add(keyframe.median_depth)
         return keyframe
+
+    def revise_camera(self, revision: CameraRevision) -> None:
+        """Replace the camera of all keyframes, see `Keyframe.revise_camera`."""
+        revised: dict[int, NDArray[np.float32]] = {}  # vignettes, of which all keyframes mostly share one
+        for keyframe in self._keyframes:
+            vignette = keyframe.vignette
+            if vignette is not None and id(vignette) not in revised:
+                revised[id(vignette)] = revision.vignette(vignette)
+            keyframe.revise_camera(revision, None if vignette is None else revised[id(vignette)])
+        self.nbytes = sum(_nbytes(keyframe.pyramid, keyframe.points) for keyframe in self._keyframes)
 
     def take_in_depths(self) -> None:
         """Recompute `scene_depth` after median depths have changed."""

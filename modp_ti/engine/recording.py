@@ -9,7 +9,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import fields
+from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
@@ -36,6 +37,9 @@ FILE = "session.zip"
 # Version of the file. Others are refused.
 VERSION = 1
 ABOUT = "about.json"
+# Arrays of a correction, and of its camera where it has one.
+CORRECTION = ("index", "T_camera_world", "ids", "xyz")
+REVISION = ("lookup", "covered")
 
 
 class SessionRecorder:
@@ -64,14 +68,14 @@ class SessionRecorder:
     def add_frame(self, frame: TrackedFrame) -> None:
         """Write a frame."""
         _, image = cv2.imencode(".png", frame.rgba, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        c, points = frame.camera, frame.points
+        points = frame.points
         arrays = {
             "index": np.array(frame.index),
             "timestamp": np.array(frame.timestamp),
             "arrived": np.array(np.nan if frame.arrived is None else frame.arrived),
             "name": np.array(frame.name),
             "image": image,
-            "camera": np.array([c.fx, c.fy, c.cx, c.cy, c.width, c.height]),
+            "camera": _numbers(frame.camera),
             "T_camera_world": frame.T_camera_world,
             "xyz": points.xyz,
             "pixels": points.pixels,
@@ -85,7 +89,11 @@ class SessionRecorder:
 
     def add_correction(self, correction: PoseCorrection, more: bool) -> None:
         """Write a correction. `more` is as in `Mapper.correct`."""
-        arrays = {field.name: np.asarray(getattr(correction, field.name)) for field in fields(correction)}
+        arrays = {name: getattr(correction, name) for name in CORRECTION}
+        revision = correction.camera
+        if revision is not None:
+            arrays["camera"] = _numbers(revision.camera)
+            arrays |= {name: array for name in REVISION if (array := getattr(revision, name)) is not None}
         self._write({**arrays, "more": np.array(more)})
 
     def recorded(self, schedule: Schedule) -> Schedule:
@@ -179,11 +187,14 @@ class RecordedSession(Tracker):
             self._names = sorted(name for name in self._zip.namelist() if name != ABOUT)
             self.further: list[int] = []
             self.more: list[bool] = []
+            self._revisions: list[CameraRevision] = []
             for name in self._names:
                 arrays = self._arrays(name)
                 self.further.append(int(arrays["further"]))
                 if "more" in arrays:
                     self.more.append(bool(arrays["more"]))
+                    revision = _correction(arrays).camera
+                    self._revisions += [] if revision is None else [revision]
             self.further.append(int(about["further"]))
         except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, IndexError) as error:
             raise self._damaged(error) from None
@@ -197,7 +208,12 @@ class RecordedSession(Tracker):
         return len(self._names) - len(self.more)
 
     def __iter__(self) -> Iterator[TrackedFrame]:
-        return (event for event in self.events() if isinstance(event, TrackedFrame))
+        later = list(self._revisions)
+        for event in self.events():
+            if isinstance(event, TrackedFrame):
+                yield reduce(TrackedFrame.with_camera, later, event)
+            elif event.camera is not None:
+                del later[0]
 
     def events(self) -> Iterator[Event]:
         vignette = None
@@ -223,15 +239,23 @@ class RecordedSession(Tracker):
         return InputError(f"{self._path}: not a recorded session, or a damaged one ({reason}); record it again")
 
 
+def _numbers(camera: PinholeCamera) -> NDArray[np.float64]:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
+
+
+def _camera(numbers: NDArray[np.float64]) -> PinholeCamera:
+    fx, fy, cx, cy, width, height = numbers.tolist()
+    return PinholeCamera(fx, fy, cx, cy, int(width), int(height))
+
+
 def _frame(arrays: dict[str, NDArray], vignette: NDArray[np.float32] | None) -> TrackedFrame:
     rgba = np.asarray(cv2.imdecode(arrays["image"], cv2.IMREAD_UNCHANGED), dtype=np.uint8)
-    fx, fy, cx, cy, width, height = arrays["camera"].tolist()
     return TrackedFrame(
         index=int(arrays["index"]),
         timestamp=float(arrays["timestamp"]),
         name=str(arrays["name"]),
         image=np.divide(rgba[..., :3], np.float32(255.0), dtype=np.float32),
-        camera=PinholeCamera(fx, fy, cx, cy, int(width), int(height)),
+        camera=_camera(arrays["camera"]),
         T_camera_world=arrays["T_camera_world"],
         points=SparsePoints(arrays["xyz"], arrays["pixels"], arrays["ids"]),
         mask=rgba[..., 3] > 0 if bool(arrays["masked"]) else None,
@@ -241,7 +265,10 @@ def _frame(arrays: dict[str, NDArray], vignette: NDArray[np.float32] | None) -> 
 
 
 def _correction(arrays: dict[str, NDArray]) -> PoseCorrection:
-    return PoseCorrection(**{field.name: arrays[field.name] for field in fields(PoseCorrection)})
+    camera = None
+    if "camera" in arrays:
+        camera = CameraRevision(_camera(arrays["camera"]), arrays.get("lookup"), arrays.get("covered"))
+    return PoseCorrection(**{name: arrays[name] for name in CORRECTION}, camera=camera)
 
 
 class ReplayedRun(Conductor):

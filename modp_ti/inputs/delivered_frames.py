@@ -68,7 +68,7 @@ class DeliveredFrames:
             self.points.leave_out(frame)
 
     def correct(self, correction: PoseCorrection, around: Mapping[int, NDArray[np.float64]], moved: bool) -> None:
-        """Apply a correction to the points. The map has applied it to the trajectory.
+        """Apply a correction to the points and cameras. The map has applied it to the trajectory.
 
         Points named in the correction take the corrected positions. All others move with the world around their frames.
 
@@ -78,5 +78,8 @@ class DeliveredFrames:
             moved: Whether the correction moved the map.
         """
         self.points.correct(correction.ids, correction.xyz, [around[index] for index in self.index])
+        if correction.camera is not None:
+            self.camera = [correction.camera.camera] * len(self)
+            self.points.revise_camera(correction.camera)
         self.corrections["received"] += 1
         self.corrections["moved"] += moved

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.camera_revision import CameraRevision
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.similarity import moved_points
 from modp_ti.inputs.multiview.point_solving import placed_anew
@@ -94,6 +95,14 @@ class TrackedPoints:
             places[seen] = moved_points(motions[frame], places[seen])
         rows = np.array([self._row_of.get(i, -1) for i in ids.tolist()], dtype=np.int64)
         places[rows[rows >= 0]] = xyz[rows >= 0]
+
+    def revise_camera(self, revision: CameraRevision) -> None:
+        """Move all observations to the images of a new camera. Those that leave the image are dropped."""
+        for i, (rows, pixels) in enumerate(zip(self.rows, self.pixels, strict=True)):
+            moved = revision.pixels(pixels)
+            kept = revision.camera.contains(moved)
+            self.rows[i], self.pixels[i] = rows[kept], moved[kept].astype(np.float32)
+            self._observations -= int(np.count_nonzero(~kept))
 
     def state(self) -> dict[str, NDArray]:
         """Return the complete state as arrays, for `restore`."""

@@ -57,6 +57,9 @@ class StreamDigest:
         self.events += 1
         if isinstance(event, PoseCorrection):
             self._take(event.index, event.T_camera_world, event.ids, event.xyz)
+            if event.camera is not None:
+                self._take(event.camera.camera.matrix())
+                self._take(*(array for array in (event.camera.lookup, event.camera.covered) if array is not None))
             return
         camera, points = event.camera, event.points
         self.value = zlib.crc32(event.name.encode("utf-8"), self.value)

@@ -8,24 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from modp_ti.inputs.klt.camera_refinement import BEFORE_TRACKING, FOCAL_FROM, is_plausible
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
-from modp_ti.inputs.klt.tracking import FOCAL_FROM
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
 
-__all__ = ["ENOUGH", "ENOUGH_LIVE", "TYPICAL_FOCAL", "estimated_intrinsics"]
+__all__ = ["TYPICAL_FOCAL", "estimated_intrinsics", "intrinsics_of"]
 
-# Focal length as a share of the image's longer side: typical of phones, webcams and depth cameras, and the accepted
-# range of an estimate.
+# Focal length as a share of the image's longer side that is typical of phones, webcams and depth cameras.
 TYPICAL_FOCAL = 0.85
-LEAST_FOCAL, LARGEST_FOCAL = 0.4, 3.0
-LARGEST_DISTORTION = 0.5
 # Further keyframes change the estimate little.
 ENOUGH = 60
-# Keyframes for which a stream waits, since its frames pile up meanwhile. On redkitchen of 7-Scenes this takes 145
-# instead of 300 frames, for a focal length that is 2.7 % shorter.
-ENOUGH_LIVE = 24
 
 Image = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 
@@ -56,12 +50,12 @@ def estimated_intrinsics(
     Returns:
         The camera of the stored images, or None if it cannot be estimated; and the number of images used.
     """
-    width, height = size
     odometry, used = None, 0
     for grey, valid in images:
         if odometry is None:
-            scale = grey.shape[1] / width
-            odometry = Odometry([Lens.radial(start * scale, 0.0, grey.shape[1], grey.shape[0])], seed, refines=True)
+            scale = grey.shape[1] / size[0]
+            lens = Lens.radial(start * scale, 0.0, grey.shape[1], grey.shape[0])
+            odometry = Odometry([lens], seed, BEFORE_TRACKING)
         odometry.process(used, grey, valid)
         used += 1
         if progress is not None:
@@ -75,9 +69,13 @@ def estimated_intrinsics(
         return None, used
     tracking.refine_camera()
     lens = tracking.map.lens
+    return (intrinsics_of(lens, size) if is_plausible(lens) else None), used
+
+
+def intrinsics_of(lens: Lens, size: tuple[int, int]) -> Intrinsics:
+    """Convert a lens with one radial coefficient to the intrinsics of the stored images of `size` (width, height)."""
+    width, height = size
     focal, _, _, k = (float(value) for value in lens.camera.params)
     focal *= width / lens.width
-    if not LEAST_FOCAL < focal / max(width, height) < LARGEST_FOCAL or not abs(k) < LARGEST_DISTORTION:
-        return None, used
     distortion = Distortion(numerator=(k,)) if k else NO_DISTORTION
-    return Intrinsics(PinholeCamera(focal, focal, width / 2, height / 2, width, height), distortion), used
+    return Intrinsics(PinholeCamera(focal, focal, width / 2, height / 2, width, height), distortion)

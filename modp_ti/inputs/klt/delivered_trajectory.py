@@ -59,6 +59,7 @@ class DeliveredTrajectory:
         self._keyframes: dict[int, NDArray[np.float64]] = {}
         self._keyframes_checked = len(tracking.map.keyframes)
         self._xyz = np.zeros((0, 3))
+        self._remembered = 0  # the first frame that still has its landmarks
 
     def add(self, name: str, view: View) -> DeliveredFrame:
         """Add the next frame."""
@@ -73,8 +74,12 @@ class DeliveredTrajectory:
         xyz = self._map.xyz[ids]
         error = ray_errors(frame.T_camera_world, xyz, lens.rays(frame.view.pixels)) * lens.focal
         good = self._map.known[ids] & (error < MAX_ERROR)
-        to = self._undistorter.camera
-        pixels = frame.view.pixels[good] * np.divide((to.width, to.height), (lens.width, lens.height))
+        to = self._undistorter
+        if lens.is_undistorted:
+            pixels = frame.view.pixels[good] * np.divide((to.camera.width, to.camera.height), (lens.width, lens.height))
+        else:
+            raw = frame.view.pixels[good] * np.divide((to.raw.width, to.raw.height), (lens.width, lens.height))
+            pixels = to.points(raw)
         return points_inside(xyz[good], pixels, ids[good], self._undistorter, frame.T_camera_world)
 
     def record(self, points: SparsePoints) -> None:
@@ -84,10 +89,11 @@ class DeliveredTrajectory:
         new = np.isnan(self._xyz[points.ids, 0])
         self._xyz[points.ids[new]] = points.xyz[new]
 
-    def forget_points(self, index: int) -> None:
-        """Forget the landmarks of a frame, which `points` then does not know; its pose is still corrected."""
-        frame = self.frames[index]
-        frame.view = replace(frame.view, ids=frame.view.ids[:0].copy(), pixels=frame.view.pixels[:0].copy())
+    def forget_points(self) -> None:
+        """Forget the landmarks of all frames. `points` then gives none; poses are still corrected."""
+        for frame in self.frames[self._remembered :]:
+            frame.view = replace(frame.view, ids=frame.view.ids[:0].copy(), pixels=frame.view.pixels[:0].copy())
+        self._remembered = len(self.frames)
 
     def corrections(self, last: bool = False) -> Iterator[PoseCorrection]:
         """Yield one correction, with the frames of all moved keyframes, if a keyframe has moved notably.
@@ -119,6 +125,27 @@ class DeliveredTrajectory:
             T_camera_world=np.stack([self.frames[i].T_camera_world for i in index]),
             ids=ids.astype(np.int64),
             xyz=landmarks.xyz[ids].copy(),
+        )
+
+    def revise_camera(self, undistorter: Undistorter) -> PoseCorrection:
+        """Return the correction of all frames and points, after the map has got another camera.
+
+        Args:
+            undistorter: Undistortion of the delivered images with the new camera.
+        """
+        revision, self._undistorter = undistorter.revising(self._undistorter), undistorter
+        for frame in self.frames:
+            self._tracking.relocalise(frame.view)
+            frame.T_camera_world = self._tracking.pose(frame.view)
+        self._keyframes = {k: self._map.keyframes[k].T_camera_world.copy() for k in self._keyframes}
+        ids = np.flatnonzero(~np.isnan(self._xyz[:, 0]) & self._map.known[: len(self._xyz)])
+        self._xyz[ids] = self._map.xyz[ids]
+        return PoseCorrection(
+            index=np.arange(len(self.frames)),
+            T_camera_world=np.stack([frame.T_camera_world for frame in self.frames]),
+            ids=ids,
+            xyz=self._map.xyz[ids].copy(),
+            camera=revision,
         )
 
     def _depth(self, k: int) -> float:

@@ -211,10 +211,25 @@ class LandmarkMap:
             self.keyframes[k].T_camera_world[:3] = T[:3]
         self.xyz[bundle.points] = bundle.xyz
         if refined:
-            self.lens = Lens(bundle.camera)
-            for keyframe in self.keyframes:
-                keyframe.rays = self.lens.rays(keyframe.pixels)
+            self._take(Lens(bundle.camera))
         return bundle.cost
+
+    def state(self) -> tuple[Lens, NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Camera, landmarks and poses of the keyframes, for `restore`."""
+        return self.lens, self.xyz.copy(), [keyframe.T_camera_world.copy() for keyframe in self.keyframes]
+
+    def restore(self, lens: Lens, xyz: NDArray[np.float64], poses: Sequence[NDArray[np.float64]]) -> None:
+        """Take back what has changed since `state`, without the outliers that were removed meanwhile."""
+        self.xyz[: len(xyz)] = xyz
+        for keyframe, T in zip(self.keyframes, poses, strict=True):
+            keyframe.T_camera_world[:] = T
+        self._take(lens)
+
+    def _take(self, lens: Lens) -> None:
+        """Replace the camera, and with it the rays of all observations."""
+        self.lens = lens
+        for keyframe in self.keyframes:
+            keyframe.rays = lens.rays(keyframe.pixels)
 
 
 def triangulated(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
+from modp_ti.inputs.klt.camera_refinement import CameraRefinement
 from modp_ti.inputs.klt.frame import Frame
 from modp_ti.inputs.klt.initialisation import Initialisation
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
@@ -23,16 +24,17 @@ class Odometry:
     Args:
         lenses: The camera, or several candidates. The initialisation chooses the one that fits best.
         seed: Seed of RANSAC.
-        refines: Refine the camera together with the map, for images whose camera is unknown.
+        refinement: When the camera is refined together with the map, for images whose camera is unknown; None for a
+            known one.
 
     Attributes:
         tracking: The map and the tracking of frames with it; None before the initialisation has succeeded.
     """
 
-    def __init__(self, lenses: Sequence[Lens], seed: int = 0, refines: bool = False) -> None:
+    def __init__(self, lenses: Sequence[Lens], seed: int = 0, refinement: CameraRefinement | None = None) -> None:
         self.tracking: Tracking | None = None
         self._initialisation = Initialisation(lenses, seed)
-        self._refines = refines
+        self._refinement = refinement
         self._seed = seed
 
     def process(self, number: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> list[View]:
@@ -57,7 +59,7 @@ class Odometry:
     def _begin(self, landmarks: LandmarkMap) -> list[View]:
         """Start from the initial map: localise the frames between its keyframes and those before the first one."""
         frames, self._initialisation.frames = self._initialisation.frames, []
-        tracking = self.tracking = Tracking(landmarks, frames[-1].valid, self._seed, self._refines)
+        tracking = self.tracking = Tracking(landmarks, frames[-1].valid, self._seed, self._refinement)
         posed = {keyframe.number: k for k, keyframe in enumerate(landmarks.keyframes)}
         first = next(i for i, frame in enumerate(frames) if frame.number in posed)
         views = list(_earlier_views(tracking, frames[:first]))[::-1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +13,8 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.klt.calibration import ENOUGH, ENOUGH_LIVE, TYPICAL_FOCAL, estimated_intrinsics
+from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics, intrinsics_of
+from modp_ti.inputs.klt.camera_refinement import WHILE_TRACKING
 from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
@@ -30,6 +30,7 @@ FOLLOWED_SIDE = 640  # longer side [px] of the images in which features are trac
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
 DIAGONAL_35MM = 43.27  # mm
+ADVICE = "source.intrinsics or a calibrated camera do better"
 
 
 def open_klt(
@@ -38,7 +39,8 @@ def open_klt(
     """Open the images of a source and return a tracker for them.
 
     If the source has no intrinsics, they are estimated from its first images; the focal length in EXIF, or a typical
-    one, is the initial value.
+    one, is the initial value. Frames of a source that follows a clock do not wait for that: they are delivered with the
+    initial value, and corrections bring the estimates.
 
     Args:
         source: Settings of the images.
@@ -62,6 +64,9 @@ def open_klt(
     intrinsics = None if images.intrinsics is None else require_intrinsics(images)
     blank = Intrinsics(PinholeCamera(max(width, height), max(width, height), width / 2, height / 2, width, height))
     reader.require_fitting([(name, (intrinsics or blank).undistorter(1.0)) for name in there])
+    if intrinsics is None and images.arrivals is not None:
+        intrinsics, note = _guessed(reader, blank)
+        return KltTracker(reader, intrinsics, seed, [note], is_guess=True)
     if intrinsics is None:
         intrinsics, note = _estimated(reader, blank, seed, progress)
         notes.append(note)
@@ -85,38 +90,43 @@ def _arriving(reader: FrameReader) -> Iterator[str]:
     return reader.images.arriving(source.start, source.stop, source.step)
 
 
+def _guessed(reader: FrameReader, blank: Intrinsics) -> tuple[Intrinsics, str]:
+    """Guess the camera from EXIF, or take a typical one. Returns it with a note for the user."""
+    width, height = blank.camera.width, blank.camera.height
+    film = focal_length_35mm(reader.images.path / _there(reader)[0])
+    focal = (
+        TYPICAL_FOCAL * max(width, height) if film is None else film / DIAGONAL_35MM * float(np.hypot(width, height))
+    )
+    origin = "is what EXIF says" if film is not None else "is a guess, for the images do not tell"
+    camera = PinholeCamera(focal, focal, width / 2, height / 2, width, height)
+    return Intrinsics(camera), f"the camera is not known: focal length {focal:.1f} px {origin}; {ADVICE}"
+
+
 def _estimated(reader: FrameReader, blank: Intrinsics, seed: int, progress: Progress | None) -> tuple[Intrinsics, str]:
     """Estimate the camera from EXIF and the images. Returns it with a note for the user."""
     width, height = blank.camera.width, blank.camera.height
     there = _there(reader)
-    film = focal_length_35mm(reader.images.path / there[0])
-    start = (
-        TYPICAL_FOCAL * max(width, height) if film is None else film / DIAGONAL_35MM * float(np.hypot(width, height))
-    )
+    guess, note = _guessed(reader, blank)
     stride = int(np.clip(len(there) // CALIBRATION_FRAMES, 1, CALIBRATION_STRIDE))
-    # Images that have not arrived yet are awaited, and used without a stride.
-    recorded = reader.images.arrivals is None and len(there) >= CALIBRATION_FRAMES
-    names = there[::stride] if recorded else _arriving(reader)
     undistorter = blank.undistorter(_followed_scale(width, height))
 
     def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]:
-        for name in islice(names, CALIBRATION_FRAMES):
+        for name in there[: stride * CALIBRATION_FRAMES : stride]:
             raw = _read(reader.images, name, width, height)
             yield undistorter.grey(raw, reader.valid(name, raw))
 
-    total = min(CALIBRATION_FRAMES, len(there)) if len(there) > 1 else CALIBRATION_FRAMES
-    enough = ENOUGH if reader.images.arrivals is None else ENOUGH_LIVE
-    found, used = estimated_intrinsics(images(), (width, height), start, seed, progress, total, enough)
-    advice = "source.intrinsics or a calibrated camera do better"
-    if found is not None:
-        k = found.distortion.numerator[0] if found.distortion.numerator else 0.0
-        return found, (
-            f"the camera is not known: focal length {found.camera.fx:.1f} px and radial distortion {k:.4f} are "
-            f"estimated from {used} images; {advice}"
-        )
-    camera = PinholeCamera(start, start, width / 2, height / 2, width, height)
-    origin = "is what EXIF says" if film is not None else "is a guess, for the images do not tell"
-    return Intrinsics(camera), f"the camera is not known: focal length {start:.1f} px {origin}; {advice}"
+    total = min(CALIBRATION_FRAMES, len(there))
+    found, used = estimated_intrinsics(images(), (width, height), guess.camera.fx, seed, progress, total)
+    return (guess, note) if found is None else (found, _note(found, used))
+
+
+def _note(found: Intrinsics, used: int) -> str:
+    """Return the note on an estimated camera."""
+    k = found.distortion.numerator[0] if found.distortion.numerator else 0.0
+    return (
+        f"the camera is not known: focal length {found.camera.fx:.1f} px and radial distortion {k:.4f} are "
+        f"estimated from {used} images; {ADVICE}"
+    )
 
 
 def _followed_scale(width: int, height: int) -> float:
@@ -145,23 +155,43 @@ class KltTracker(Tracker):
     yields all frames with their final poses. Frames that cannot be localised are skipped and counted in `notes`, which
     are complete after the last frame. The result depends only on the images, the settings and the seed.
 
+    A guessed camera is estimated while frames are delivered, and each estimate comes with a correction. The undistorter
+    is always that of the last frame or correction.
+
     Args:
         reader: Reads the images with their masks.
         intrinsics: Camera and lens distortion of the stored images.
         seed: Seed of RANSAC.
         notes: Notes to begin with.
+        is_guess: The camera is a guess without lens distortion.
+
+    Attributes:
+        intrinsics: The camera; if it is estimated, the latest estimate.
     """
 
     reads_ahead: ClassVar[bool] = True
 
-    def __init__(self, reader: FrameReader, intrinsics: Intrinsics, seed: int = 0, notes: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        reader: FrameReader,
+        intrinsics: Intrinsics,
+        seed: int = 0,
+        notes: Sequence[str] = (),
+        is_guess: bool = False,
+    ) -> None:
         self._notes = list(notes)
         self.intrinsics = intrinsics
         self._reader = reader
         camera = intrinsics.camera
         self._followed = intrinsics.undistorter(_followed_scale(camera.width, camera.height))
         self._delivered = intrinsics.undistorter(reader.images.scale)
-        self._odometry = Odometry([Lens.pinhole(self._followed.camera)], seed)
+        followed = self._followed.camera
+        if is_guess:
+            self._lens = Lens.radial(followed.fx, 0.0, followed.width, followed.height)
+        else:
+            self._lens = Lens.pinhole(followed)
+        self._odometry = Odometry([self._lens], seed, WHILE_TRACKING if is_guess else None)
+        self._estimated_from = 0  # images, 0 for a camera that has not been estimated
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable = Unreadable()
         self._progress = self._tracked()
@@ -218,10 +248,14 @@ class KltTracker(Tracker):
     def undistorter(self) -> Undistorter:
         return self._delivered
 
-    def forget_points(self, index: int) -> None:
-        """Forget which points a delivered frame sees, where the tracker is not iterated over again."""
-        assert self._trajectory is not None, "a frame has been delivered"
-        self._trajectory.forget_points(index)
+    def forget_points(self) -> None:
+        """Forget which points the delivered frames see, where the tracker is not iterated over again.
+
+        They are kept as long as the camera may be revised.
+        """
+        tracking = self._odometry.tracking
+        if self._trajectory is not None and tracking is not None and tracking.camera_is_final:
+            self._trajectory.forget_points()
 
     def close(self) -> None:
         self._reader.images.close()
@@ -243,7 +277,11 @@ class KltTracker(Tracker):
                 continue
             if self._trajectory is None:
                 self._trajectory = DeliveredTrajectory(tracking, self._delivered)
-            yield from self._trajectory.corrections()
+            if tracking.map.lens is self._lens:
+                yield from self._trajectory.corrections()
+            else:
+                self._estimated_from = len(names)
+                yield self._take_lens(tracking.map.lens, self._trajectory)
             self._skipped = len(names) - len(self._trajectory.frames) - len(views)
             for view in views:
                 delivered = self._trajectory.add(names[view.number], view)
@@ -257,12 +295,22 @@ class KltTracker(Tracker):
             yield from self._trajectory.corrections(last=True)
         self._sum_up(names)
 
+    def _take_lens(self, lens: Lens, trajectory: DeliveredTrajectory) -> PoseCorrection:
+        """Take a new estimate of the camera. Returns the correction of what was delivered with the former one."""
+        raw = self.intrinsics.camera
+        self._lens = lens
+        self.intrinsics = intrinsics_of(lens, (raw.width, raw.height))
+        self._delivered = self.intrinsics.undistorter(self.scale)
+        return trajectory.revise_camera(self._delivered)
+
     def _sum_up(self, names: Sequence[str]) -> None:
         if self._odometry.tracking is None or self._trajectory is None:
             raise InputError(
                 f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
                 "and a camera that moves sideways and does not only turn"
             )
+        if self._estimated_from:
+            self._notes.append(_note(self.intrinsics, self._estimated_from))
         placed = {frame.name for frame in self._trajectory.frames} | set(self._unreadable)
         without = [name for name in names if name not in placed]
         if self._unreadable:

@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised
+from modp_ti.inputs.klt.camera_refinement import CameraRefinement, is_plausible
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.klt.localisation import FEWEST, localised, realigned, searched
+from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, realigned, searched
 from modp_ti.inputs.klt.relocalisation import alike_keyframes, describe, inherited, place_by_features, thumbnail
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.features import Features
+from modp_ti.inputs.multiview.reprojection import refine_pose
 
-__all__ = ["FOCAL_FROM", "Tracking", "View"]
+__all__ = ["Tracking", "View"]
 
 # A frame becomes a keyframe if the features have moved by KEYFRAME_SHIFT of the image's longer side since the last
 # keyframe, or if less than KEYFRAME_SHARE of its landmarks are still seen.
@@ -27,10 +29,6 @@ WINDOW = 8  # free keyframes of a local bundle adjustment
 HELD = 12  # fixed keyframes of a local bundle adjustment, at most
 WIDE_EVERY = 12  # keyframes between bundle adjustments of WIDE_WINDOW free ones
 WIDE_WINDOW = 30
-# Numbers of keyframes from which focal length and distortion are estimated. Fewer keyframes fit almost any camera.
-FOCAL_FROM = 6
-DISTORTION_FROM = 12
-REFINED_AT = (6, 12, 24, 48)
 # Relocalisation is tried at each of the first EAGER frames after the track was lost, then at every LAZY-th frame.
 EAGER = 10
 LAZY = 5
@@ -62,7 +60,7 @@ class Tracking:
         landmarks: The initial map.
         valid: (H, W), False where no features of the last keyframe may be tracked.
         seed: Seed of RANSAC.
-        refines: Refine the camera together with the map.
+        refinement: When the camera is refined together with the map; None for a known camera.
 
     Attributes:
         map: The map.
@@ -71,13 +69,17 @@ class Tracking:
     """
 
     def __init__(
-        self, landmarks: LandmarkMap, valid: NDArray[np.bool_] | None = None, seed: int = 0, refines: bool = False
+        self,
+        landmarks: LandmarkMap,
+        valid: NDArray[np.bool_] | None = None,
+        seed: int = 0,
+        refinement: CameraRefinement | None = None,
     ) -> None:
         self.map = landmarks
         self.motion = np.eye(4)
         self.recovered = 0
         self._seed = seed
-        self._refines = refines
+        self._refinement = refinement
         self._thumbnails: list[NDArray[np.float32]] = []  # of the first keyframes, made when they are needed
         self._lost_for = 0
         start = landmarks.keyframes[-1]
@@ -162,7 +164,7 @@ class Tracking:
         if self.map.known[share].sum() < KEYFRAME_SHARE * self.map.known[last.ids].sum():
             return True
         shift = float(np.median(np.linalg.norm(last.pixels[a] - frame.pixels[b], axis=1)))
-        return shift > (0.6 if self._refines else 1.0) * KEYFRAME_SHIFT * max(frame.grey.shape)
+        return shift > (1.0 if self._refinement is None else 0.6) * KEYFRAME_SHIFT * max(frame.grey.shape)
 
     def _make_keyframe(self, frame: LocalisedFrame) -> View:
         """Make the last frame a keyframe: realign its landmarks, search for more, and adjust the map."""
@@ -193,8 +195,8 @@ class Tracking:
 
     def _adjust(self) -> None:
         count = len(self.map.keyframes)
-        if self._refines and count in REFINED_AT:
-            self.refine_camera()
+        if self._refinement is not None and count in self._refinement.at:
+            self._refine_camera_in_use() if self._refinement.settles else self.refine_camera()
             return
         free = list(range(max(0, count - (WIDE_WINDOW if count % WIDE_EVERY == 0 else WINDOW)), count))
         held = self._companions(free)
@@ -205,12 +207,39 @@ class Tracking:
 
     def refine_camera(self) -> None:
         """Bundle adjust the whole map and the focal length, and with enough keyframes the distortion."""
+        assert self._refinement is not None, "the camera is known"
         count = len(self.map.keyframes)
         every = range(count)
-        refined: list[Refinable] = ["focal", "distortion"] if count >= DISTORTION_FROM else ["focal"]
+        with_distortion = count >= self._refinement.distortion_from
+        refined: list[Refinable] = ["focal", "distortion"] if with_distortion else ["focal"]
         for _ in range(2):
             self.map.adjust(every, steps=15, refined=refined)
             self.map.discard_outliers(every)
+
+    @property
+    def camera_is_final(self) -> bool:
+        """Whether the camera is known, or has been refined for the last time."""
+        return self._refinement is None
+
+    def _refine_camera_in_use(self) -> None:
+        """Refine the camera, and undo that if the result is implausible. The last refinement makes it final."""
+        assert self._refinement is not None
+        before = self.map.state()
+        self.refine_camera()
+        if not is_plausible(self.map.lens):
+            self.map.restore(*before)
+        if len(self.map.keyframes) >= self._refinement.at[-1]:
+            self._refinement = None
+
+    def relocalise(self, view: View) -> None:
+        """Refine the pose of an earlier view, after the map and its camera have changed."""
+        keyframe = self.map.keyframes[view.keyframe]
+        known = self.map.known[view.ids]
+        if view.number == keyframe.number or known.sum() < FEWEST:
+            return
+        rays = self.map.lens.rays(view.pixels[known])
+        T = refine_pose(self.pose(view), self.map.xyz[view.ids[known]], rays, SIGMA / self.map.lens.focal)
+        view.T_camera_keyframe = T @ inverse_se3(keyframe.T_camera_world)
 
     def _companions(self, free: list[int]) -> list[int]:
         """Other keyframes that share the most landmarks with `free`, at most HELD of them."""

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.camera_revision import CameraRevision
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 
@@ -109,6 +110,23 @@ class Undistorter:
         resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         return self._remapped(resized, cv2.INTER_LINEAR)
 
+    def revising(self, before: Undistorter) -> CameraRevision:
+        """Return the revision that turns the results of `before` into those of this undistorter.
+
+        Args:
+            before: Undistorter of the same images to the same size, with another camera or distortion.
+        """
+        if self.distortion.is_identity and before.distortion.is_identity:
+            return CameraRevision(self.camera)  # both only scale the images
+        source, covered = self._sources()
+        if not before.distortion.is_identity:
+            ideal = before.distortion.undistort(_normalised(before.camera, source).reshape(-1, 2), before._limit)
+            source = _pixels(before.camera, ideal).reshape(source.shape)
+            known = np.isfinite(source).all(axis=-1)
+            covered &= known
+            source[~known] = -1.0  # outside the image
+        return CameraRevision(self.camera, source, None if covered.all() else covered)
+
     def _resampled(self, image: NDArray) -> NDArray:
         """Scale a stored image, or a single channel of it, to the working size and undistort it."""
         import cv2
@@ -137,16 +155,21 @@ class Undistorter:
         """Lookup maps x and y (H, W) into the scaled image, in cv2's coordinates, and the mask."""
         if self.distortion.is_identity:
             return None
+        source, inside = self._sources()
+        inside.flags.writeable = False  # shared by all frames
+        lookup = (source - 0.5).astype(np.float32)
+        x, y = np.ascontiguousarray(lookup[..., 0]), np.ascontiguousarray(lookup[..., 1])
+        return x, y, None if inside.all() else inside
+
+    def _sources(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Position (H, W, 2) of each pixel of the result in the scaled image, and whether the lens has seen it."""
         camera = self.camera
         columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
         ideal = _normalised(camera, np.stack(np.meshgrid(columns, rows), axis=-1))
         source = _pixels(camera, self.distortion.distort(ideal))
         inside = np.linalg.norm(ideal, axis=-1) <= self.distortion.valid_radius(self._limit)
         inside &= camera.contains(source.reshape(-1, 2)).reshape(inside.shape)
-        inside.flags.writeable = False  # shared by all frames
-        lookup = (source - 0.5).astype(np.float32)
-        x, y = np.ascontiguousarray(lookup[..., 0]), np.ascontiguousarray(lookup[..., 1])
-        return x, y, None if inside.all() else inside
+        return source, inside
 
 
 def both_valid(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:

@@ -13,12 +13,22 @@ from pathlib import Path
 
 import cv2
 
+from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt.tracker import KltTracker, open_klt
-from modp_ti.inputs.sources import FrameReader, ImageSource, open_source
+from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout
-from modp_ti.inputs.tracking_process.messages import Delivered, Ended, FrameRecord, Job, Opened, Preparing, RingMade
+from modp_ti.inputs.tracking_process.messages import (
+    CameraRevised,
+    Delivered,
+    Ended,
+    FrameRecord,
+    Job,
+    Opened,
+    Preparing,
+    RingMade,
+)
 from modp_ti.inputs.tracking_process.outbox import Outbox
 
 __all__ = ["main", "remove_folder"]
@@ -70,13 +80,14 @@ class _Child:
             self._tracker = tracker = open_klt(source, self._job.config.seed, self._prepare, self._images)
             self._publish()
             self._connection.send(Opened(tracker.notes, tracker.scale, tracker.intrinsics))
-            sender = threading.Thread(target=self._send, name="sender", daemon=True)
+            sender = threading.Thread(target=self._send, args=(tracker.undistorter,), name="sender", daemon=True)
             sender.start()
             for event in tracker.events():
                 self._publish()
+                if isinstance(event, PoseCorrection) and event.camera is not None:
+                    self._outbox.put(CameraRevised(tracker.intrinsics))
                 self._outbox.put(event)
-                if isinstance(event, TrackedFrame):  # the parent has the points now
-                    tracker.forget_points(event.index)
+                tracker.forget_points()  # the parent has them now
         except InputError as caught:
             error = caught
         except Exception as caught:  # told to the parent, which saves its map
@@ -103,11 +114,14 @@ class _Child:
 
     # ---- the sending thread ----------------------------------------------------------------------------------
 
-    def _send(self) -> None:
-        """Send the events in order, each frame as soon as a slot is free."""
+    def _send(self, undistorter: Undistorter) -> None:
+        """Send the events in order, each frame as soon as a slot is free.
+
+        Args:
+            undistorter: Undistorter of the first frame. The tracker may have a newer one already.
+        """
         assert self._tracker is not None and self._images is not None
         reader = FrameReader(self._images, self._job.config.source)
-        undistorter = self._tracker.undistorter
         ring: FrameRing | None = None
         while True:
             event = self._outbox.get()
@@ -122,6 +136,9 @@ class _Child:
                     ring.write(slot, event)
                     self._connection.send(Delivered(slot, FrameRecord.of(event), event.mask is not None))
                 else:
+                    if isinstance(event, CameraRevised):
+                        undistorter = event.intrinsics.undistorter(self._tracker.scale)
+                        ring = None  # the vignette is another one
                     self._connection.send(event)
                     if isinstance(event, Ended):
                         return

@@ -6,10 +6,12 @@ import errno
 import os
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import IO
 
 import numpy as np
 
+from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.inputs.tracking_process.messages import FrameRecord
@@ -36,6 +38,7 @@ class DeliveredLog:
         self._points: IO[bytes] = tempfile.TemporaryFile(buffering=0)
         self._size = 0  # bytes of the points
         self._moved = np.zeros((0, 3))  # by id, NaN for points that were not corrected
+        self._revisions: list[tuple[int, CameraRevision]] = []  # with the number of frames before each
 
     def __len__(self) -> int:
         return len(self.records)
@@ -61,19 +64,26 @@ class DeliveredLog:
             more = max(int(correction.ids.max()) + 1, 2 * len(self._moved)) - len(self._moved)
             self._moved = np.concatenate([self._moved, np.full((more, 3), np.nan)])
         self._moved[correction.ids] = correction.xyz
+        if correction.camera is not None:
+            self._revisions.append((len(self), correction.camera))
+            self.records = [replace(record, camera=correction.camera.camera) for record in self.records]
 
     def __iter__(self) -> Iterator[FrameRecord]:
         at = 0
-        for record, count in zip(self.records, self._counts, strict=True):
+        for number, (record, count) in enumerate(zip(self.records, self._counts, strict=True)):
             self._points.seek(at)
             data = self._points.read(count * POINT.itemsize)
             at += len(data)
             table = np.frombuffer(data, POINT)
-            xyz, ids = table["xyz"].copy(), table["id"].copy()
+            xyz, pixels, ids = table["xyz"].copy(), table["pixel"].copy(), table["id"].copy()
             here = np.flatnonzero(ids < len(self._moved))
             here = here[~np.isnan(self._moved[ids[here], 0])]
             xyz[here] = self._moved[ids[here]]
-            points = SparsePoints(xyz, table["pixel"].copy(), ids)
+            for before, revision in self._revisions:
+                if number < before:
+                    pixels = revision.pixels(pixels)
+            seen = record.camera.contains(pixels)
+            points = SparsePoints(xyz[seen], pixels[seen], ids[seen])
             yield record.with_pose(record.T_camera_world, points)
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources import Intrinsics, Picture
 from modp_ti.inputs.tracking_process.frame_ring import SlotLayout
 
-__all__ = ["Delivered", "Ended", "FrameRecord", "Job", "Opened", "Preparing", "RingMade"]
+__all__ = ["CameraRevised", "Delivered", "Ended", "FrameRecord", "Job", "Opened", "Preparing", "RingMade"]
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,19 @@ class Opened:
 
 
 @dataclass(frozen=True)
+class CameraRevised:
+    """The correction that follows, and all frames after it, have another camera.
+
+    Attributes:
+        intrinsics: The camera of the stored images.
+    """
+
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True)
 class RingMade:
-    """The ring has its size, which the first frame determines. The vignette is that of all frames."""
+    """The ring has its size, which the first frame determines. The vignette is that of all frames of a camera."""
 
     layout: SlotLayout
     vignette: NDArray[np.float32] | None

@@ -7,12 +7,14 @@ from threading import Condition
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.inputs.tracking_process.messages import Ended, FrameRecord
+from modp_ti.inputs.tracking_process.messages import CameraRevised, Ended, FrameRecord
 
 __all__ = ["LIMIT", "Outbox"]
 
 # Events that may wait for the mapper. A frame without its image takes some 15 KB.
 LIMIT = 2000
+
+_Message = PoseCorrection | CameraRevised | Ended
 
 
 class Outbox:
@@ -28,10 +30,10 @@ class Outbox:
     def __init__(self, pictures: int) -> None:
         self._pictures = pictures
         self._with_picture = 0
-        self._events: deque[TrackedFrame | FrameRecord | PoseCorrection | Ended] = deque()
+        self._events: deque[TrackedFrame | FrameRecord | _Message] = deque()
         self._changed = Condition()
 
-    def put(self, event: TrackedFrame | PoseCorrection | Ended) -> None:
+    def put(self, event: TrackedFrame | _Message) -> None:
         """Append an event; wait while the queue is full."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._events) < LIMIT)
@@ -44,7 +46,7 @@ class Outbox:
                 self._events.append(FrameRecord.of(event))
             self._changed.notify_all()
 
-    def get(self) -> TrackedFrame | FrameRecord | PoseCorrection | Ended:
+    def get(self) -> TrackedFrame | FrameRecord | _Message:
         """Take the first event; wait for it."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._events) > 0)

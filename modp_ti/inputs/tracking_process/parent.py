@@ -26,7 +26,15 @@ from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import StoredFrames
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
-from modp_ti.inputs.tracking_process.messages import Delivered, Ended, Job, Opened, Preparing, RingMade
+from modp_ti.inputs.tracking_process.messages import (
+    CameraRevised,
+    Delivered,
+    Ended,
+    Job,
+    Opened,
+    Preparing,
+    RingMade,
+)
 
 __all__ = ["TrackingProcess"]
 
@@ -137,6 +145,8 @@ class TrackingProcess(Tracker):
                     self._end(Ended([], {}, failure=place))
                     return
                 yield frame
+            elif isinstance(message, CameraRevised):
+                self._undistorter = message.intrinsics.undistorter(self._scale)
             elif isinstance(message, PoseCorrection):
                 self._log.correct(message)
                 yield message

@@ -93,7 +93,7 @@ def test_points_of_delivered_frames_may_be_forgotten(delivered, box_room, box_wa
         np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
         if isinstance(one, TrackedFrame):
             np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
-            tracker.forget_points(one.index)
+            tracker.forget_points()
     for one, other in zip(tracker, last, strict=True):
         np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
         assert len(one.points) == 0
