@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from math import ceil
+from collections.abc import Collection
+from math import floor
 
 import numpy as np
 
@@ -11,10 +12,13 @@ __all__ = ["Thinning"]
 
 # Time [s] within which the tracker should have worked off the frames that wait for it.
 HORIZON = 4.0
-# The stride is reduced only if the smaller one would leave the tracker this much idle time.
-ROOM = 1.1
+# Largest time between two tracked frames [s], unless the tracker is too slow for it or the lag is longer than LONG_LAG.
+LARGEST_GAP = 0.15
+LONG_LAG = 1.25
+# The tracker gets this much more time than it takes on average, because its costs vary.
+ROOM = 1.05
 # Numbers of intervals between frames, and of tracked frames, over which the means are taken.
-INTERVALS, COSTS = 256, 32
+INTERVALS, COSTS, RECENT_COSTS = 256, 128, 32
 # Nothing is thinned before so many frames were tracked.
 FEWEST_COSTS = 6
 # A value counts at most this multiple of the mean: one pause of the stream or the tracker hardly changes the rates.
@@ -22,11 +26,14 @@ CLIP = 5.0
 
 
 class Thinning:
-    """Policy that decides that every n-th frame of a stream is tracked.
+    """Policy that decides which frames of a stream are tracked.
 
-    The stride n is the smallest that lets the tracker keep up on average and work off the waiting frames within
-    `HORIZON`. It is 1 for a tracker that keeps up: short pauses are absorbed by the frames that wait. It changes by
-    at most one at a time, and is at most twice the stride at which the tracker just keeps up.
+    The mean stride is the smallest with which the tracker keeps up and works off the waiting frames within `HORIZON`.
+    It need not be whole: with 2.5, every second and every third frame are tracked in turn. It is 1 for a tracker that
+    keeps up: the frames that wait absorb short pauses.
+
+    A larger stride makes the tracker's frames more expensive, because keyframes come at the same times as before. To
+    work off waiting frames, strides therefore grow no further than to `LARGEST_GAP`, unless the lag is a long one.
 
     The policy is told times, and never reads a clock.
     """
@@ -35,7 +42,7 @@ class Thinning:
         self._newest: float | None = None
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._costs: deque[float] = deque(maxlen=COSTS)
-        self._stride = 1
+        self._rest = 0.0  # by which the strides so far are smaller than their means
 
     def arrived(self, time: float) -> None:
         """Take note that a frame has arrived at `time` [s]."""
@@ -47,12 +54,19 @@ class Thinning:
         """Take note that the tracker took `seconds` for a frame."""
         self._costs.append(seconds)
 
-    @property
-    def load(self) -> float:
-        """Time that the tracker takes for a frame, divided by the interval between frames; 0 while it is unknown."""
+    def load(self, costs: int = RECENT_COSTS) -> float:
+        """Time that the tracker takes for a frame, divided by the interval between frames; 0 while it is unknown.
+
+        Args:
+            costs: Number of the last tracked frames over which the mean is taken.
+        """
         if len(self._costs) < FEWEST_COSTS or not self._intervals:
             return 0.0
-        return _usual(self._costs) / max(_usual(self._intervals), 1e-6)
+        return _usual(list(self._costs)[-costs:]) / self._interval
+
+    @property
+    def _interval(self) -> float:
+        return max(_usual(self._intervals), 1e-6)
 
     def stride(self, lag: float) -> int:
         """Decide on the next frame: the n-th after the last one.
@@ -60,20 +74,22 @@ class Thinning:
         Args:
             lag: Age of the oldest waiting frame [s]; 0 if none waits.
         """
-        load = self.load
-        most = 2 * max(1, ceil(load))
+        load = ROOM * self.load()
+        if load == 0.0:
+            return 1
         # The share of the tracker's time that is left for new frames while the waiting ones are worked off.
         share = max(1.0 - lag / HORIZON, 1.0 / HORIZON)
-        if min(most, ceil(load / share)) > self._stride:
-            self._stride += 1
-        elif self._stride > 1 and min(most, ceil(ROOM * load / share)) < self._stride:
-            self._stride -= 1
-        return self._stride
+        most = max(1.0, ROOM * self.load(COSTS), floor(LARGEST_GAP / self._interval))
+        most *= min(max(lag / LONG_LAG, 1.0), 2.0)
+        self._rest += max(1.0, min(load / share, most))
+        stride = floor(self._rest)
+        self._rest -= stride
+        return stride
 
 
-def _usual(values: deque[float]) -> float:
+def _usual(values: Collection[float]) -> float:
     """Mean of the values, each of them at most about `CLIP` times that mean."""
-    array = np.array(values)
+    array = np.array(list(values))
     mean = array.mean()
     for _ in range(3):
         mean = np.minimum(array, CLIP * mean).mean()
