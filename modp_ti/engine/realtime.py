@@ -68,8 +68,7 @@ class RealtimeRun(Conductor):
         self._clock = clock
         self._ahead: FramesAhead[Event]
         self._done: float | None = None  # end of the previous event's work
-        self._first: float | None = None  # arrival of the first frame
-        self._last = 0.0  # arrival of the last one
+        self._arrived: list[float] = []  # arrival of each frame
         self._saved: float | None = None
         self._recent: deque[tuple[float, int, int]] = deque()  # newest arrival, frames arrived, frames tracked
 
@@ -126,8 +125,7 @@ class RealtimeRun(Conductor):
             self._recorder.add_frame(frame)
         began = self._clock()
         arrived = began if frame.arrived is None else frame.arrived
-        self._first = arrived if self._first is None else self._first
-        self._last = arrived
+        self._arrived.append(arrived)
         self.waiting.append(self._waiting())
         decisions = len(self.pace.decisions)
         self.pace.begin_frame(arrived, began)
@@ -194,8 +192,10 @@ class RealtimeRun(Conductor):
     def metrics(self) -> dict[str, Any]:
         """Return the entry `live` of `metrics.json`."""
         counts = self._counts()
-        seconds = max(counts.newest - (self._first or 0.0), 1e-9)
+        seconds = max(counts.newest - self._arrived[0], 1e-9)
         lag = np.array(self.lag)
+        minute = ((np.array(self._arrived) - self._arrived[0]) // 60.0).astype(int)
+        of_minutes = [lag[minute == m] for m in range(int(minute.max()) + 1)]
         live = {
             "arrived": counts.arrived,
             "tracked": counts.tracked,
@@ -209,6 +209,7 @@ class RealtimeRun(Conductor):
                 "median": round(float(np.median(lag)), 3),
                 "p95": round(float(np.quantile(lag, 0.95)), 3),
                 "max": round(float(lag.max()), 3),
+                "p95_by_minute": [round(float(np.quantile(of, 0.95)), 3) if len(of) else None for of in of_minutes],
             },
             "seconds_to_map": None if self._saved is None else round(self._saved - counts.newest, 3),
             "rate_arrived": round((counts.arrived - 1) / seconds, 2),
@@ -225,4 +226,4 @@ class RealtimeRun(Conductor):
         live = self._tracker.live
         if live is not None:
             return live
-        return LiveCounts(len(self.lag), len(self.lag), 0, 0, 0, self._last)
+        return LiveCounts(len(self.lag), len(self.lag), 0, 0, 0, self._arrived[-1] if self._arrived else 0.0)

@@ -107,6 +107,17 @@ def test_lag_and_rates_are_those_of_the_frames_times() -> None:
     assert status.lag == realtime.lag[-1] and status.waiting == 3
 
 
+def test_the_lag_is_told_by_minute_of_arrival() -> None:
+    clock = Clock()
+    frames = [replace(frame(i), arrived=at) for i, at in enumerate((97.0, 98.0, 99.9, 230.0))]
+    realtime = RealtimeRun(SETTINGS, tracker := WallTracker(list(frames)), clock=clock)
+    clock.now = 240.0
+    mapped(realtime, tracker)
+    first, second, third = realtime.metrics()["live"]["lag_seconds"]["p95_by_minute"]
+    assert first == pytest.approx(np.quantile(realtime.lag[:3], 0.95), abs=1e-3) and second is None
+    assert third == pytest.approx(10.0, abs=1e-3)
+
+
 def test_late_frames_get_no_steps_but_their_points() -> None:
     def late(seconds: float) -> tuple[RealtimeRun, Mapper]:
         tracker = WallTracker([replace(frame(i), arrived=100.0 - seconds) for i in range(5)])
