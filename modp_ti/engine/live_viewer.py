@@ -275,6 +275,8 @@ class LiveViewer(Observer):
 
     def _show(self, update: Update) -> None:
         page = self.page
+        if update.numbers is not None:  # first, as they are out of date soonest
+            page.show_numbers(update.numbers)
         if update.keyframes is not None:
             page.show_keyframes(*update.keyframes)
         if update.frame is not None:
@@ -286,5 +288,3 @@ class LiveViewer(Observer):
         if update.picture is not None:
             client, paint = update.picture
             page.show_picture(client, paint())
-        if update.numbers is not None:
-            page.show_numbers(update.numbers)
