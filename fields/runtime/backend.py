@@ -26,6 +26,8 @@ __all__ = [
     "without_waiting",
 ]
 
+answer_quickly()  # at import, since most of the time that it saves goes into the definitions of kernels
+
 # Size of the arrays in Taichi's runtime, which does not check their bounds.
 MAX_SNODES = 1024
 # Taichi's own memory pool on a CUDA device, for the nodes of sparse fields [GB]. Only the voxels use it; dense fields
@@ -57,7 +59,6 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
     """
     options = {"offline_cache": True, "log_level": ti.ERROR, "random_seed": seed, "default_fp": ti.f32}
     torch.set_num_threads(1)
-    answer_quickly()
     if threads is not None:
         options["cpu_max_num_threads"] = threads
     if device in ("cuda", "auto") and _has_cuda_driver() and torch.cuda.is_available():
