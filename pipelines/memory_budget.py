@@ -85,6 +85,10 @@ class MemoryBudget:
         self.safeguards.keyframes_without_room += not fits
         return fits
 
+    def takes_between(self, frame: TrackedFrame) -> bool:
+        """Whether a frame between keyframes fits into half of the limit; the other half is for what the map needs."""
+        return self.limit is None or self.held() + self.keyframes.bytes_of(frame) <= 0.5 * self.limit
+
     def takes_observations(self, count: int) -> bool:
         """Whether `count` more observations of tracked points fit. Rejections are counted."""
         fits = self.limit is None or self.held() + count * OBSERVATION <= self.limit

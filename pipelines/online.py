@@ -57,24 +57,29 @@ class OnlineMapper(OnlineMap):
         if self.frame_count % self.settings.densify.prune_every == 0:
             self.prune()
         with self.stopwatch.measure("select"):
-            last = self.keyframes[-1] if len(self.keyframes) else None
+            last = self.keyframes.selected[-1] if len(self.keyframes) else None
             if self.gate.refuses(frame, last, self.renderer, self.near):
-                return FrameReport(frame.index, False, len(self.keyframes), len(self.gaussians), None)
+                return FrameReport(frame.index, False, len(self.keyframes.selected), len(self.gaussians), None)
             is_wanted = self.selector.is_keyframe(frame, last) and self.pace.takes_keyframe()
             is_keyframe = is_wanted and self.budget.takes_keyframe(frame)
         psnr, steps = None, 0
         if is_keyframe:
             psnr, steps = self._add_keyframe(frame)
         elif len(self.keyframes):
-            # Other frames only add their tracked points, at a pose corrected by the neighbouring keyframes.
-            self.densifier.add_tracked_points(self.keyframes.view(frame))
+            # Other frames only add their tracked points, at a pose corrected by the neighbouring keyframes. Some
+            # become views: the more directions the map is optimised from, the better it looks from new ones.
+            if self.selector.is_between(frame, self.keyframes) and self.budget.takes_between(frame):
+                view = self.keyframes.append(frame, is_between=True)
+            else:
+                view = self.keyframes.view(frame)
+            self.densifier.add_tracked_points(view)
             if is_wanted:
                 # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them,
                 # every frame is selected as a keyframe; each therefore gets only 1 / max_gap of the steps.
                 steps = -(-self.pace.plan(level=0).steps // self.settings.keyframes.max_gap)
                 count = 1 + self.settings.views.local_views + self.settings.views.global_views
                 psnr = self._optimise_evenly(np.arange(len(self.keyframes)), steps, count)
-        return FrameReport(frame.index, is_keyframe, len(self.keyframes), len(self.gaussians), psnr, steps)
+        return FrameReport(frame.index, is_keyframe, len(self.keyframes.selected), len(self.gaussians), psnr, steps)
 
     def _add_keyframe(self, frame: TrackedFrame) -> tuple[float | None, int]:
         """Add a keyframe, add Gaussians from it, and optimise. Returns the last step's mean PSNR, and the steps."""

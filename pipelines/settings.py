@@ -61,6 +61,12 @@ class KeyframeSettings(StrictModel):
         default=0.75, ge=0, le=1, description="sharpness, as a factor on the last keyframe's, below which it is"
     )
     min_points: int = Field(default=10, ge=0, description="tracked points that a keyframe needs")
+    between: int = Field(
+        default=2,
+        ge=0,
+        description="frames after a keyframe of which the first sharp one becomes a view of optimisation too, without "
+        "work of its own; 0 for none",
+    )
 
 
 class EpipolarSettings(StrictModel):

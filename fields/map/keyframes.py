@@ -1,4 +1,4 @@
-"""Keyframes: the frames that the map is optimised on."""
+"""Keyframes, and frames between them: the views that the map is optimised on."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NO_EXPOSURE_MOMENT = _unchanging(np.zeros((3, 4)))
 
 @dataclass(slots=True)
 class Keyframe:
-    """One keyframe. Images stay in host memory with 8 bits per channel.
+    """One keyframe, or a frame between keyframes. Images stay in host memory with 8 bits per channel.
 
     Arrays are replaced and never modified in place, since views may share them.
 
@@ -59,6 +59,8 @@ class Keyframe:
         exposure_steps: Number of Adam steps of the exposure.
         pending_motion: Similarity (4, 4) of the world around the keyframe, by the tracker's corrections, that its
             Gaussians have not followed yet.
+        is_between: Whether it is a frame between keyframes. The map is optimised on it as on a keyframe, but gets only
+            its tracked points.
     """
 
     index: int
@@ -79,6 +81,7 @@ class Keyframe:
     exposure_v: NDArray[np.float64] = field(default_factory=lambda: NO_EXPOSURE_MOMENT)
     exposure_steps: int = 0
     pending_motion: NDArray[np.float64] = field(default_factory=lambda: NO_MOTION)
+    is_between: bool = False
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -167,13 +170,15 @@ def _nbytes(pyramid: tuple[ImageLevel, ...], points: SparsePoints) -> int:
 
 
 class KeyframeStore:
-    """The keyframes in the order of their frames.
+    """The keyframes, and frames between them, in the order of their frames.
 
     The cost of the per-frame operations does not grow with the number of keyframes, except for `errors`, which takes a
     few microseconds.
 
     Attributes:
         trajectory: The tracked poses of all frames, those of the keyframes included.
+        selected: The keyframes without the frames between them.
+        latest: Place of the last of these in the store; -1 without keyframes.
         nbytes: Bytes of the keyframes' images and points.
     """
 
@@ -189,6 +194,8 @@ class KeyframeStore:
         self.min_side = min_side
         self.trajectory = Trajectory() if trajectory is None else trajectory
         self._keyframes: list[Keyframe] = []
+        self.selected: list[Keyframe] = []
+        self.latest = -1
         self._depths = RunningMedian()
         self.nbytes = 0
 
@@ -219,11 +226,20 @@ class KeyframeStore:
         first, *others = frame.pyramid[:levels]
         return (first, *(o for o in others if min(o.camera.width, o.camera.height) >= self.min_side))
 
-    def append(self, frame: TrackedFrame) -> Keyframe:
-        """Add a frame as a keyframe. Its error starts at the mean of the others (1 for the first keyframe)."""
+    def append(self, frame: TrackedFrame, is_between: bool = False) -> Keyframe:
+        """Add a frame as a keyframe. Its error starts at the mean of the others (1 for the first keyframe).
+
+        Args:
+            frame: The frame.
+            is_between: Whether it is a frame between keyframes.
+        """
         self.trajectory.add(frame)
         keyframe = self.view(frame, self.levels)
+        keyframe.is_between = is_between
         self._keyframes.append(keyframe)
+        if not is_between:
+            self.selected.append(keyframe)
+            self.latest = len(self._keyframes) - 1
         self.nbytes += _nbytes(keyframe.pyramid, keyframe.points)
         self._depths.add(keyframe.median_depth)
         return keyframe

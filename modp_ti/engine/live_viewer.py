@@ -217,9 +217,8 @@ class LiveViewer(Observer):
         store, gaussians = self._mapper.pipeline.keyframes, self._mapper.pipeline.gaussians
         cost = 100.0 * self.cost / max(self._clock() - self._began - self.waited, 1e-9)
         paused = "  \n**paused**" if self._gate.paused else ""
-        numbers = (
-            f"{self._state}  \n{len(store)} keyframes, {len(gaussians):,} Gaussians  \nviewer: {cost:.1f} %{paused}"
-        )
+        counts = f"{len(store.selected)} keyframes, {len(gaussians):,} Gaussians"
+        numbers = f"{self._state}  \n{counts}  \nviewer: {cost:.1f} %{paused}"
         frame = self._frame
         if frame is None or len(store) == 0:
             return Update(numbers=numbers)
@@ -229,7 +228,7 @@ class LiveViewer(Observer):
             numbers,
             ShownFrame(T, frame.camera, level.rgba[..., :3]),
             frame.points.xyz,
-            (np.stack([view.T_camera_world for view in store]), store[0].camera),
+            (np.stack([view.T_camera_world for view in store.selected]), store[0].camera),
         )
 
     def _show_map(self) -> None:

@@ -120,7 +120,7 @@ class Results:
         Returns:
             None, or one line that says why there is no report.
         """
-        mapped = {keyframe.index for keyframe in keyframes}
+        mapped = {keyframe.index for keyframe in keyframes.selected}
         try:
             last = [score for score in scores if score.stage == list(versions)[-1]]
             run = ReportedRun(

@@ -228,7 +228,7 @@ class _Session:
         if self.conductor.pace is not None or report is None or not report.is_keyframe or report.psnr is None:
             return None
         with pipeline.stopwatch.measure("evaluate"):
-            return keyframe_psnr(pipeline, pipeline.keyframes[-1])
+            return keyframe_psnr(pipeline, pipeline.keyframes.selected[-1])
 
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Callback after a step of the offline optimisation."""
@@ -333,7 +333,8 @@ class _Session:
         if warning := caught.warning():
             self._say(warning)
         metrics = {
-            "keyframes": len(pipeline.keyframes),
+            "keyframes": len(pipeline.keyframes.selected),
+            "views_between": len(pipeline.keyframes) - len(pipeline.keyframes.selected),
             "gaussians": len(pipeline.gaussians),
             "backend": self.backend,
             "seed": self.config.seed,

@@ -99,8 +99,7 @@ class Densifier:
             column, row = np.floor(pixels).astype(int).T
             depth = self.settings.depth
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
-            last = len(self.keyframes) - 1
-            neighbours = [self.keyframes[j] for j in range(max(0, last - depth.neighbours), last)]
+            neighbours = self.keyframes.selected[:-1][-depth.neighbours :] if depth.neighbours else []
             seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit, depth.max_misplacement)
         self._grow(seeds, view)
 

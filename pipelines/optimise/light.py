@@ -44,7 +44,7 @@ def light_changes(store: KeyframeStore) -> bool:
     """
     latest = store[-1]
     here = _colours(latest, store.levels)
-    for earlier in list(store)[-COMPARED - 1 : -1]:
+    for earlier in store.selected[-COMPARED - 1 : -1]:
         p = earlier.points.xyz @ latest.T_camera_world[:3, :3].T + latest.T_camera_world[:3, 3]
         front = (p[:, 2] > 0) & earlier.camera.contains(earlier.points.pixels)
         pixels, there = latest.camera.project(p[front]), earlier.points.pixels[front]

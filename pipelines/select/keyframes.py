@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.se3 import inverse_se3
 from fields.map.covisibility import SeenPoints, covisibility
-from fields.map.keyframes import Keyframe
+from fields.map.keyframes import Keyframe, KeyframeStore
 from fields.map.trajectory import Trajectory
 from pipelines.select.sharpness import sharpness
 from pipelines.settings import KeyframeSettings
@@ -54,6 +54,16 @@ class KeyframeSelector:
         if moved > self.settings.baseline * last.median_depth:
             return True
         return covisibility(SeenPoints.of(frame), SeenPoints.of(last)) < self.settings.covisibility
+
+    def is_between(self, frame: TrackedFrame, store: KeyframeStore) -> bool:
+        """Whether a frame that does not become a keyframe becomes a view between two of them.
+
+        Each keyframe is followed by one at most, so that the views take twice the keyframes' memory at most.
+        """
+        wanted, last = self.settings.between, store[-1]
+        if not wanted or last.is_between or frame.index - last.index < wanted:
+            return False
+        return not self._is_blurred(frame, last)
 
     def _is_blurred(self, frame: TrackedFrame, last: Keyframe) -> bool:
         return sharpness(frame.rgba) < self.settings.min_sharpness * sharpness(last.rgba)

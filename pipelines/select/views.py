@@ -36,7 +36,7 @@ def global_probabilities(store: KeyframeStore, error_weight: float, recency_weig
 
 
 class LocalGlobalViews:
-    """Selects the current keyframe, up to `local_views` recent ones and `global_views` from all keyframes.
+    """Selects the latest keyframe, up to `local_views` recent ones and `global_views` from all keyframes.
 
     Local views come from a bank of the latest keyframes before the current one. They are drawn without replacement,
     in proportion to their covisibility with the current view. Global views are drawn by Eq. 2. Both draws are repeated
@@ -50,19 +50,19 @@ class LocalGlobalViews:
         self._overlap = np.zeros(0)
 
     def begin(self, store: KeyframeStore) -> None:
-        last = len(store) - 1
+        last = store.latest
         self._bank = list(range(max(0, last - self.settings.bank), last))
         current = SeenPoints.of(store[last])
         self._overlap = np.array([covisibility(current, SeenPoints.of(store[j])) for j in self._bank])
 
     def select(self, store: KeyframeStore) -> list[int]:
-        last = len(store) - 1
+        last = store.latest
         views = [last]
         if self._bank and self.settings.local_views:
             n = min(self.settings.local_views, len(self._bank))
             p = self._overlap + 1e-6
             views += list(self._rng.choice(self._bank, n, replace=False, p=p / p.sum()))
-        if last and self.settings.global_views:
+        if len(store) > 1 and self.settings.global_views:
             p = global_probabilities(store, self.settings.error_weight, self.settings.recency_weight)
             views += list(self._rng.choice(len(store), self.settings.global_views, p=p))
         return [int(v) for v in views]

@@ -111,3 +111,19 @@ def test_a_frame_without_room_is_no_keyframe(free: Mapped) -> None:
     tight = mapped(2.5 * (64 * 48 * 4 + 120 * (24 + 16 + 8)) / 1e9)
     assert tight.keyframes == list(range(len(tight.keyframes))) and len(tight.keyframes) in (1, 2)
     assert tight.safeguards.keyframes_without_room == FRAMES - len(tight.keyframes)
+
+
+def test_frames_between_keyframes_leave_half_of_the_memory_to_the_map(free: Mapped) -> None:
+    taken = []
+    for memory in (None, free.held / 1e9, free.held / 4e9):
+        initialise("cpu")
+        keyframes = {"covisibility": 0.0, "baseline": 9.0, "between": 1}
+        settings = MappingSettings(sh_degree=0, optimise={"steps": 1}, keyframes=keyframes, memory=memory)
+        mapper = OnlineMapper(settings, 64, 48, seed=1)
+        mapper.process(frame(0))
+        held, fits = mapper.budget.held(), mapper.keyframes.bytes_of(frame(1))
+        mapper.process(frame(1))
+        taken.append(len(mapper.keyframes) == 2)
+        assert taken[-1] == (memory is None or held + fits <= 0.5e9 * memory)
+        assert mapper.caught().keyframes_without_room == 0
+    assert taken == [True, True, False]

@@ -70,13 +70,14 @@ def write_map(
         keyframes: The map's keyframes.
         near: Depth below which nothing is drawn [scene units].
     """
-    indices = {keyframe.index for keyframe in keyframes}
+    selected = {keyframe.index for keyframe in keyframes.selected}
     write_splats(folder / "splats.ply", version.gaussians)
     write_trajectory(folder / "trajectory.txt", frames.timestamp, version.trajectory)
     write_colmap(folder / "colmap", names, frames.camera, version.trajectory, frames.points)
-    lines = [line for line, index in enumerate(frames.index) if index in indices]
+    lines = [line for line, index in enumerate(frames.index) if index in selected]
     held_out = [line for line, held in enumerate(frames.held_out) if held]
     write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out)
     if len(keyframes) and keyframes[0].exposure is not None:
         exposures = [exposure for exposure in version.exposures if exposure is not None]
-        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, exposures, indices)
+        estimated = {keyframe.index for keyframe in keyframes}
+        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, exposures, estimated)

@@ -23,7 +23,11 @@ from fields.geometry.se3 import (
 def tangents() -> list[NDArray[np.float64]]:
     rng = np.random.default_rng(0)
     scales = (1.0, 1e-3, 1e-5, 1e-9, 0.0)
-    return [np.concatenate([rng.normal(size=3), scale * rng.normal(size=3)]) for scale in scales]
+    direction = [axis / np.linalg.norm(axis) for axis in rng.normal(size=(len(scales), 3))]
+    # Turns of less than half a circle, which the logarithm gives back as they were.
+    return [
+        np.concatenate([rng.normal(size=3), 2.5 * scale * axis]) for scale, axis in zip(scales, direction, strict=True)
+    ]
 
 
 @pytest.mark.parametrize("xi", tangents())

@@ -7,6 +7,7 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
 from fields.geometry.similarity import motion_around
+from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
 from fields.map.keyframes import KeyframeStore
 
 CAMERA = PinholeCamera(10.0, 40.0, 4.0, 3.0, 8, 6)
@@ -121,3 +122,20 @@ def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
     np.testing.assert_allclose(keyframe.pending_motion, S)
     keyframe.revise_points(SparsePoints(now @ T[:3, :3], points.pixels, points.ids))
     assert keyframe.median_depth == pytest.approx(np.median(now[:, 2]) + T[2, 3])
+
+
+def test_frames_between_keyframes_are_told_apart_also_after_they_were_saved() -> None:
+    store, again, old = KeyframeStore(), KeyframeStore(), KeyframeStore()
+    for index in range(5):
+        store.append(frame(index), is_between=index in (1, 3, 4))
+    arrays = keyframe_arrays(store)
+    rows = KeyframeRows(arrays)
+    for index in range(5):
+        rows.put(frame(index), again)
+    for one in (store, again):
+        assert [view.index for view in one.selected] == [0, 2] and one.latest == 2
+        assert [view.is_between for view in one] == [False, True, False, True, True]
+    rows = KeyframeRows({name: array for name, array in arrays.items() if name != "is_between"})
+    for index in range(5):
+        rows.put(frame(index), old)
+    assert len(old.selected) == 5 and old.latest == 4

@@ -88,3 +88,21 @@ def test_a_steady_camera_may_blur() -> None:
     sharp = rng.uniform(0, 1, (20, 20, 3)).astype(np.float32)
     frames = [replace(frame(0), image=sharp), replace(frame(1, x=0.1, yaw=5), image=cv2.blur(sharp, (5, 5)))]
     assert decisions(frames) == [True, True]
+
+
+def test_each_keyframe_is_followed_by_one_sharp_frame_at_most() -> None:
+    rng = np.random.default_rng(5)
+    sharp = rng.uniform(0, 1, (20, 20, 3)).astype(np.float32)
+    blurred = cv2.GaussianBlur(sharp, (0, 0), 2.0)
+    images = dict.fromkeys(range(12), sharp) | {2: blurred}
+    for between, expected in ((0, []), (1, [1, 7]), (2, [3, 8]), (9, [])):
+        trajectory = Trajectory()
+        store = KeyframeStore(trajectory=trajectory)
+        selector = KeyframeSelector(KeyframeSettings(between=between), trajectory)
+        for i in range(12):
+            f = replace(frame(i), image=images[i])
+            if i % 6 == 0:
+                store.append(f)
+            elif selector.is_between(f, store):
+                store.append(f, is_between=True)
+        assert [view.index for view in store if view.is_between] == expected

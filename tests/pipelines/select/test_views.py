@@ -78,3 +78,13 @@ def test_the_same_seed_draws_the_same_views() -> None:
         views.begin(keyframes)
         draws.append([views.select(keyframes) for _ in range(20)])
     assert draws[0] == draws[1]
+
+
+def test_a_frame_after_the_latest_keyframe_is_a_global_view_only() -> None:
+    keyframes = store([0.1] * 4)
+    T, image = np.eye(4), np.zeros((20, 20, 3), dtype=np.float32)
+    keyframes.append(TrackedFrame(9, 0.3, "9", image, CAMERA, T, keyframes[0].points), is_between=True)
+    views = LocalGlobalViews(ViewSettings(local_views=1, global_views=2), np.random.default_rng(3))
+    views.begin(keyframes)
+    draws = np.array([views.select(keyframes) for _ in range(100)])
+    assert (draws[:, 0] == 3).all() and set(draws[:, 1]) == {0, 1, 2} and set(draws[:, 2:].ravel()) == set(range(5))

@@ -70,12 +70,13 @@ def wait_until(condition) -> None:
         time.sleep(0.01)
 
 
-def test_it_delivers_what_the_tracker_delivers_in_this_process(scene, started, tmp_path, box_walk):
-    masks = box_walk.written(tmp_path / "masks")  # dark parts of the images are masked
-    config = scene(masks=masks, stop=40)
+@pytest.mark.parametrize("masked", [False, True])
+def test_it_delivers_what_the_tracker_delivers_in_this_process(scene, started, tmp_path, box_walk, masked):
+    # Dark parts of the images are masked.
+    config = scene(masks=box_walk.written(tmp_path / "masks")) if masked else scene()
     here, there = open_klt(config.source, config.seed), started(config)
     expected, got = list(here.events()), list(there.events())
-    assert sum(isinstance(event, PoseCorrection) for event in expected) > 0
+    assert masked or sum(isinstance(event, PoseCorrection) for event in expected) > 0
     for one, other in zip(got, expected, strict=True):
         if isinstance(one, TrackedFrame):
             assert isinstance(other, TrackedFrame)
