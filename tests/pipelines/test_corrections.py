@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
@@ -17,7 +18,7 @@ from pipelines.offline import OfflineMapper
 from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
-from tests.pipelines.wall import CAMERA, frame, pose
+from tests.pipelines.wall import CAMERA, NORMAL, OFFSET, frame, pose
 
 pytestmark = pytest.mark.slow
 
@@ -263,3 +264,48 @@ def test_the_corrected_world_is_mapped_on(mapped: OnlineMapper) -> None:
     report = mapped.process(replace(f, T_camera_world=moved_pose(world, f.T_camera_world), points=points))
     assert report.is_keyframe and report.psnr > 20
     assert len(mapped.gaussians) - count < 0.3 * count
+
+
+# ---- the camera ------------------------------------------------------------------------------------------------------
+
+
+def test_a_map_of_a_guessed_camera_becomes_that_of_the_camera_that_is_found() -> None:
+    """The guess has a longer focal length. The tracker places its points on the guess's rays, at their depths."""
+    initialise("cpu")
+    guess = replace(CAMERA, fx=1.15 * CAMERA.fx, fy=1.15 * CAMERA.fy)
+
+    def guessed(i: int):
+        f = frame(i)
+        T = f.T_camera_world
+        local = f.points.xyz @ T[:3, :3].T + T[:3, 3]
+        there = guess.unproject(f.points.pixels, local[:, 2])
+        return replace(f, camera=guess, points=replace(f.points, xyz=(there - T[:3, 3]) @ T[:3, :3]))
+
+    settings = MappingSettings(optimise={"steps": 10, "last_steps": 10}, densify={"warm_up": 2})
+    mapper = OnlineMapper(settings, 64, 48, seed=1)
+    for i in range(5):
+        mapper.process(guessed(i))
+    before = mapper.gaussians.to_numpy()
+
+    def off_the_wall(state: dict[str, np.ndarray]) -> np.ndarray:
+        return np.abs(state["position"] @ NORMAL - OFFSET)
+
+    right = [frame(i) for i in range(5)]
+    correction = PoseCorrection(
+        np.arange(5),
+        np.stack([f.T_camera_world for f in right]),
+        np.concatenate([f.points.ids for f in right]),
+        np.concatenate([f.points.xyz for f in right]),
+        CameraRevision(CAMERA),
+    )
+    around, moved = mapper.corrector.correct(correction, settings.corrections)
+    after = mapper.gaussians.to_numpy()
+    assert sorted(around) == list(range(5)) and moved.tolist() == list(range(5))
+    assert np.median(off_the_wall(after)) < 0.5 * np.median(off_the_wall(before))
+    np.testing.assert_allclose(after["log_scale"] - before["log_scale"], np.log(1.15), atol=1e-5)
+    for keyframe, f in zip(mapper.keyframes, right, strict=True):
+        assert keyframe.camera == CAMERA and keyframe.pyramid[0].camera == CAMERA
+        np.testing.assert_allclose(keyframe.points.xyz, f.points.xyz)
+        np.testing.assert_array_equal(keyframe.rgba, f.rgba)
+    mapper.process(frame(5))
+    assert mapper.keyframes[-1].camera == CAMERA

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -169,3 +170,27 @@ def test_desk_is_tracked_from_its_images_alone(shared_data):
     error = absolute_trajectory_error([frame.T_camera_world for frame in frames], poses)
     centres = np.array([-T[:3, :3].T @ T[:3, 3] for T in poses])
     assert error < 0.01 * np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()
+
+
+def test_frames_of_a_guessed_camera_are_delivered_at_once_and_corrected_when_it_is_found(box_room, box_walk, tmp_path):
+    folder = box_walk.written(tmp_path / "images")
+    source, images = SourceSettings(path=folder, scale=0.5), ImageFolder(folder)
+    images.scale = 0.5
+    guess = Intrinsics(replace(box_room.camera, fx=1.12 * box_room.camera.fx, fy=1.12 * box_room.camera.fy))
+    tracker = KltTracker(FrameReader(images, source), guess, is_guess=True)
+    events = list(tracker.events())
+    revisions = [n for n, event in enumerate(events) if isinstance(event, PoseCorrection) and event.camera is not None]
+    first = revisions[0]
+    assert isinstance(events[0], TrackedFrame) and events[0].camera.fx == pytest.approx(guess.camera.fx / 2)
+    assert 10 <= first < 60, "frames are delivered before the camera is found"
+    found = tracker.intrinsics.camera.fx
+    assert abs(found / box_room.camera.fx - 1) < 0.5 * 0.12
+    assert events[revisions[-1]].camera.camera.fx == pytest.approx(found / 2)
+    frames = [event for event in events if isinstance(event, TrackedFrame)]
+    assert len(frames) == 60 and frames[-1].camera.fx == pytest.approx(found / 2)
+    assert "estimated from" in tracker.notes[-1]
+    for one in tracker:
+        assert one.camera == frames[-1].camera
+        p = one.points.xyz @ one.T_camera_world[:3, :3].T + one.T_camera_world[:3, 3]
+        error = np.linalg.norm(one.camera.project(p) - one.points.pixels, axis=1)
+        assert np.median(error) < 0.4

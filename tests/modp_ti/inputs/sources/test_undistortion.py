@@ -127,3 +127,35 @@ def test_each_axis_follows_its_exact_ratio():
 def test_image_of_another_size_is_a_mistake_of_the_caller():
     with pytest.raises(ValueError, match="64x48"):
         Undistorter(PinholeCamera(50, 50, 32, 24, 64, 48)).image(np.zeros((64, 48, 3), np.uint8))
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV"])
+def test_an_image_of_a_guessed_camera_becomes_that_of_the_camera_that_is_found(model):
+    found, oracle = made(model, 0.5)
+    guess = Undistorter(PinholeCamera(540.0, 540.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT), scale=0.5)
+    revision = found.revising(guess)
+    photo = photograph(oracle)
+    (seen, _), (wanted, mask) = guess.image(photo), found.image(photo)
+    rgba = np.dstack([np.round(255 * seen), np.full(seen.shape[:2], 255.0)]).astype(np.uint8)
+    got = revision.image(rgba)
+    valid = (got[..., 3] > 0) & (True if mask is None else mask)
+    assert valid.mean() > 0.9
+    inner = cv2.erode(np.pad(valid, 1).astype(np.uint8), np.ones((5, 5)))[1:-1, 1:-1] > 0
+    error = np.abs(got[..., :3] / 255.0 - wanted)[inner]
+    assert error.mean() < 0.004 and np.percentile(error, 99) < 0.02
+    assert revision.camera == found.camera
+    raw = np.random.default_rng(0).uniform([40, 40], [WIDTH - 40, HEIGHT - 40], (500, 2))
+    np.testing.assert_allclose(revision.pixels(guess.points(raw)), found.points(raw), atol=0.05)
+
+
+def test_another_focal_length_alone_leaves_the_image_as_it_is():
+    a, b = (Undistorter(PinholeCamera(f, f, 320.0, 240.5, WIDTH, HEIGHT), scale=0.5) for f in (540.0, 500.0))
+    revision, rgba = b.revising(a), np.random.default_rng(1).integers(0, 255, (4, 5, 4)).astype(np.uint8)
+    assert revision.lookup is None and revision.image(rgba) is rgba
+    pixels = np.array([[3.0, 7.0], [100.0, 20.0]])
+    np.testing.assert_array_equal(revision.pixels(pixels), pixels)
+    points = np.array([[0.3, -0.2, 2.0], [0.1, 0.4, 5.0], [0.1, 0.1, -1.0]])
+    moved = revision.points(points, a.camera)
+    np.testing.assert_allclose(b.camera.project(moved[:2]), a.camera.project(points[:2]), atol=1e-9)
+    np.testing.assert_array_equal(moved[:, 2], points[:, 2])
+    np.testing.assert_array_equal(moved[2], points[2])
