@@ -6,11 +6,13 @@ definition of a kernel it looks through all modules for the line that defines it
 same results; only a note in the code that is compiled has no carets below its line. A run starts two seconds earlier.
 """
 
+import ast
 import functools
 import linecache
 import sys
 import textwrap
 from types import SimpleNamespace
+from typing import Any
 
 from taichi.lang import kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
@@ -20,17 +22,20 @@ __all__ = ["answer_quickly"]
 _with_carets = ASTTransformerContext.get_pos_info
 
 
-def _position(context: ASTTransformerContext, node) -> str:
+def _position(self: Any, node: ast.expr) -> str:
     """Return file, line and source of a node; after an error has been raised, with carets as Taichi does."""
-    if context.raised:
-        return _with_carets(context, node)
-    line = f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n'
-    return f"{line}{context.src[node.lineno - 1]}\n"
+    if self.raised:
+        return _with_carets(self, node)
+    line = f'File "{self.file}", line {node.lineno + self.lineno_offset}, in {self.func.func.__name__}:\n'
+    return f"{line}{self.src[node.lineno - 1]}\n"
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
     """Return whether the frame so many levels above is just defining a class."""
-    frame = sys._getframe(level_of_class_stackframe)
+    try:
+        frame = sys._getframe(level_of_class_stackframe)
+    except ValueError:  # a kernel of the main module
+        return False
     line = linecache.getline(frame.f_code.co_filename, frame.f_lineno).strip()
     return any(pattern.match(line) for pattern in kernel_impl._KERNEL_CLASS_STACKFRAME_STMT_RES)
 

@@ -340,11 +340,7 @@ class _Session:
             "seed": self.config.seed,
             "frames_per_second": round(len(frames) / self.clock.mapping, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-            "snapshots": {
-                "written": checkpointer.written,
-                "failed": checkpointer.failed,
-                "resumed": checkpointer.resumed,
-            },
+            "snapshots": {name: getattr(checkpointer, name) for name in ("written", "failed", "resumed")},
             "guards": caught.counts(),
             "frames_left_out": {"unreadable": len(self.tracker.unreadable), **pipeline.refused},
             "lpips_note": self.no_lpips,
@@ -384,15 +380,14 @@ class _Session:
         """Return the part of an error message that says how to go on, or where the map is."""
         if self.checkpointer.possible:
             return self.checkpointer.way_on()
-        pipeline = self.mapper.pipeline
-        return Results(self.config, self.mapper.frames).elsewhere(version, pipeline.keyframes, pipeline.near)
+        results, pipeline = Results(self.config, self.mapper.frames), self.mapper.pipeline
+        return results.elsewhere(version, pipeline.keyframes, pipeline.near)
 
     def _open_observer(self) -> Observer:
         """Start the live viewer if the settings ask for it."""
         if not self.config.view.enabled:
             return Observer()
-        # Imported here because viser is an optional dependency.
-        from modp_ti.engine.live_viewer import LiveViewer
+        from modp_ti.engine.live_viewer import LiveViewer  # here, because viser is an optional dependency
 
         viewer = LiveViewer(self.config.view, self._say)
         self.held.callback(viewer.close)

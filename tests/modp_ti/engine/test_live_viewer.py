@@ -12,6 +12,7 @@ import pytest
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.se3 import inverse_se3, quaternion_from_matrix
+from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.live_viewer import PATIENCE, LiveViewer
@@ -97,7 +98,7 @@ def viewer():
     now = count(0.0, 1.0)
     viewer = LiveViewer(ViewSettings(port=0), said.append, lambda: next(now))
     viewer.said = said
-    pipeline = SimpleNamespace(keyframes=[], gaussians=[])
+    pipeline = SimpleNamespace(keyframes=KeyframeStore(), gaussians=[])
     viewer.begin(SimpleNamespace(frames=[], pipeline=pipeline), 10)
     yield viewer
     viewer.close()

@@ -134,7 +134,7 @@ def test_frames_that_nobody_takes_wait_on_disk_beyond_a_limit_of_memory(camera, 
     assert sorted(file.name for file in source._store.folder.iterdir()) == [f"{i:06d}.png" for i in range(20)]
 
 
-def test_a_slow_tracker_gets_frames_that_are_thinned_evenly_and_all_are_counted(camera, opened, monkeypatch):
+def test_a_slow_tracker_gets_thinned_frames_and_all_are_counted(camera, opened, monkeypatch):
     monkeypatch.setattr(live, "MEMORY", 3 * 64 * 48 * 3)
     camera.send(*range(45))
     camera.end()
@@ -144,9 +144,8 @@ def test_a_slow_tracker_gets_frames_that_are_thinned_evenly_and_all_are_counted(
     for name in source.arriving(0, None, 1):
         taken += numbers(source, [name])
         time.sleep(0.02)  # the 45 frames came in much less
-    gaps = np.diff(taken)
     assert len(taken) + source.arrivals.thinned == source.arrivals.arrived == 45
-    assert gaps.max() > 1 and (np.diff(gaps) <= 1).all()
+    assert len(taken) < 45 and taken == sorted(set(taken))
     assert source.notes[-2].startswith(f"{45 - len(taken)} of 45 frames of ")
     assert len(list(source._store.folder.iterdir())) == len(taken)
 

@@ -235,6 +235,7 @@ class Keyframes(list):
     """Of a `KeyframeStore` what a report needs."""
 
     scene_depth = 2.0
+    selected = ()
 
 
 @pytest.mark.parametrize("stages", ["all", "none"])
