@@ -3,7 +3,7 @@
 Taichi 1.7.4 parses all kernels at every start of a process. Half of that time goes into notes of the source line of
 every expression, which error messages would show, and into looking up a function's source at every call of it. At each
 definition of a kernel it looks through all modules for the line that defines its class. The replacements here give the
-same results; only a note in the code that is compiled has no carets below its line. A run starts two seconds earlier.
+same results; only a note in the code that is compiled has no carets below its line. A start takes two seconds less.
 """
 
 import ast
