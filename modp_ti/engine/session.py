@@ -85,8 +85,7 @@ class _Session:
         self.config = config
         self.replayed = replayed
         self.held = held
-        self.clock = RunClock()
-        self.record = RunRecord()
+        self.clock, self.record = RunClock(), RunRecord()
         self.line = ProgressLine(console)
         self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
         self.observer = self._open_observer()  # opened first, as what follows may take minutes
