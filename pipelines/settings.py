@@ -62,10 +62,10 @@ class KeyframeSettings(StrictModel):
     )
     min_points: int = Field(default=10, ge=0, description="tracked points that a keyframe needs")
     between: int = Field(
-        default=2,
+        default=0,
         ge=0,
-        description="frames after a keyframe of which the first sharp one becomes a view of optimisation too, without "
-        "work of its own; 0 for none",
+        description="frames after a keyframe from which on the first sharp one becomes a view of optimisation too, "
+        "without work of its own; 0 for none",
     )
 
 

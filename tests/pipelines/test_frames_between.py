@@ -24,7 +24,7 @@ def mapped(**keyframes) -> tuple[OnlineMapper, list[FrameReport]]:
 
 
 def test_frames_between_keyframes_are_views_that_get_tracked_points_alone() -> None:
-    mapper, reports = mapped()
+    mapper, reports = mapped(between=2)
     assert [report.is_keyframe for report in reports] == [i in (0, 4) for i in range(6)]
     assert [report.keyframes for report in reports] == [1, 1, 1, 1, 2, 2]
     assert [(view.index, view.is_between) for view in mapper.keyframes] == [(0, False), (2, True), (4, False)]
@@ -34,6 +34,6 @@ def test_frames_between_keyframes_are_views_that_get_tracked_points_alone() -> N
     assert optimised < 0.2, f"the new view began with an error of 1, the first keyframe ended with {began}"
 
 
-def test_they_can_be_left_out() -> None:
-    mapper, _ = mapped(between=0)
+def test_without_the_setting_keyframes_are_the_only_views() -> None:
+    mapper, _ = mapped()
     assert [view.index for view in mapper.keyframes] == [0, 4]
