@@ -207,7 +207,7 @@ def test_a_stream_that_stalls_goes_on_and_its_frames_can_be_read_again(scene, st
             if i == 30:
                 go_on.wait(PATIENCE)
             camera.send_jpeg(picture)
-            time.sleep(0.05)
+            time.sleep(0.15)  # a tracker that gets a third of a core still finds neighbouring frames
         camera.end()
 
     threading.Thread(target=film, daemon=True).start()
