@@ -22,6 +22,11 @@ from pipelines.warm_up import warm_up
 
 __all__ = ["OnlineMapper"]
 
+# Factor on all rates at the end of `finish`. 0.2 and 0.1 differ by less than 0.1 dB on five recordings; 1 is 0.4 to
+# 1.0 dB worse.
+LAST_RATE = 0.2
+GOLDEN_RATIO = (5**0.5 - 1) / 2
+
 
 class OnlineMapper(OnlineMap):
     """Builds a Gaussian map from a stream of `TrackedFrame`s.
@@ -53,6 +58,7 @@ class OnlineMapper(OnlineMap):
         if frame.held_out:
             raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
         self.frame_count += 1
+        self.settled = 0
         self.trajectory.add(frame)
         if self.frame_count % self.settings.densify.prune_every == 0:
             self.prune()
@@ -170,15 +176,33 @@ class OnlineMapper(OnlineMap):
         return CorrectionReport(around, moved=len(moved) > 0)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
-        """Finish the map after the last frame: further steps on the last keyframe, then a final pruning.
+        """Finish the map after the last frame: passes over all keyframes, then a final pruning.
+
+        While frames arrive, all rates are constant, and large enough for few steps. Here they decay, so that each
+        Gaussian comes to rest. In a pass, every keyframe is a view once; views that follow each other are far apart.
+        After an interruption, `finish` goes on where it was.
 
         Args:
-            progress: Not called by the online loop.
+            progress: Called after every step with (views done, number of Gaussians, mean PSNR of the step's views).
 
         Returns:
             Mean PSNR of the last step; None if nothing was optimised.
         """
-        psnr = self.optimise(self.settings.optimise.last_steps - self.settings.optimise.steps)
+        order = np.argsort(np.arange(len(self.keyframes)) * GOLDEN_RATIO % 1.0)
+        views = np.tile(order, self.settings.optimise.last_passes if len(self.gaussians) else 0)
+        count = 1 + self.settings.views.local_views + self.settings.views.global_views
+        psnr = None
+        while self.settled < len(views):
+            slower = LAST_RATE ** (self.settled / len(views))
+            rates = self.optimiser.rates(self.keyframes.scene_depth, slower, slower, slower)
+            batch = views[self.settled : self.settled + count].tolist()
+            with self.stopwatch.measure("optimise"):
+                psnr = self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
+            self.settled += len(batch)
+            if progress is not None:
+                progress(self.settled, len(self.gaussians), psnr)
+        with self.stopwatch.measure("optimise"):
+            psnr = self.optimiser.settle() if psnr is not None else None
         self.prune()
         return psnr
 

@@ -42,6 +42,7 @@ class OnlineMap(Pipeline):
 
     Attributes:
         frame_count: Number of frames processed so far.
+        settled: Number of views that `finish` has optimised since the last frame.
     """
 
     can_be_refined: ClassVar[bool] = True
@@ -74,7 +75,7 @@ class OnlineMap(Pipeline):
         self.pace = pace or CompletePace(settings)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self.corrector = MapCorrector(self.keyframes, self.densifier)
-        self.frame_count = 0
+        self.frame_count = self.settled = 0
 
     @property
     def near(self) -> float:

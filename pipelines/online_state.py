@@ -35,6 +35,7 @@ def state_of(mapper: OnlineMap) -> MapState:
     }
     numbers: dict[str, Any] = {
         "frames": mapper.frame_count,
+        "settled": mapper.settled,
         "view_renders": mapper.renderer.view_renders,
         "random": mapper.rng.bit_generator.state,
         "gate": mapper.gate.state(),
@@ -83,6 +84,7 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     if previous and mapper.selector.previous not in mapper.trajectory:
         raise ValueError(f"frame {mapper.selector.previous} has no tracked pose")
     mapper.frame_count = int(state.numbers["frames"])
+    mapper.settled = int(state.numbers.get("settled", 0))  # absent in snapshots of earlier commits
     mapper.renderer.view_renders = int(state.numbers["view_renders"])
     mapper.rng.bit_generator.state = state.numbers["random"]
     mapper.gate.restore(state.numbers["gate"])

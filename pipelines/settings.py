@@ -265,7 +265,9 @@ class OptimiseSettings(StrictModel):
     )
 
     steps: int = Field(default=12, ge=0, description="steps per keyframe")
-    last_steps: int = Field(default=20, ge=0, description="steps after the last frame")
+    last_passes: int = Field(
+        default=2, ge=0, description="passes over all keyframes after the last frame, at rates that decay"
+    )
     ssim_weight: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
     aspect_weight: float = Field(default=1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
     position_rate: float = Field(default=2e-4, ge=0, description="Adam step of positions [scene depths]")

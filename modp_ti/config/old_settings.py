@@ -40,8 +40,8 @@ FLAT_TRACKER: Mapping[str, Any] = {
 # What to do instead of a tracker that this version no longer has, by kind.
 REMOVED_KINDS = {"synthetic": "the procedural room was replaced by demo/room.mp4; map demo/scene.yaml"}
 
-# Every `config.yaml` of 0.2.0 has this key. The fit that it belonged to is gone.
-REMOVED_KEY = ("mapping", "exposure", "prior")
+# Every `config.yaml` of 0.2.0 has these keys. What they belonged to is gone.
+REMOVED_KEYS = (("mapping", "exposure", "prior"), ("mapping", "optimise", "last_steps"))
 
 
 def refuse_removed_kind(settings: Mapping[str, Any], where: Mapping[str, str], name: str) -> None:
@@ -63,7 +63,8 @@ def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:
 
     If the tracker's kind is missing or unknown, all keys are kept.
     """
-    settings = _without_removed(settings)
+    for names in REMOVED_KEYS:
+        settings = _without_removed(settings, names)
     tracker = settings.get("tracker")
     kind = tracker.get("kind") if isinstance(tracker, Mapping) else None
     model = variants_of(SceneConfig.model_fields["tracker"]).get(str(kind))
@@ -76,7 +77,7 @@ def without_leftovers(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**settings, "tracker": {key: value for key, value in tracker.items() if says_something(key, value)}}
 
 
-def _without_removed(settings: Mapping[str, Any], names: Sequence[str] = REMOVED_KEY) -> dict[str, Any]:
+def _without_removed(settings: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     """Return a copy of settings without the removed key, whose sections may be absent."""
     name, *deeper = names
     if not deeper:

@@ -27,11 +27,11 @@ class Preset:
 PRESETS: Mapping[str, Preset] = {
     "fast": Preset(
         "a first look, in a fraction of the time",
-        {"mapping.optimise.steps": 4, "mapping.optimise.last_steps": 12, "refine.steps": 200},
+        {"mapping.optimise.steps": 4, "refine.steps": 200},
     ),
     "best": Preset(
         "a map to keep, where time does not matter",
-        {"mapping.optimise.steps": 30, "mapping.optimise.last_steps": 60, "refine.steps": 3000},
+        {"mapping.optimise.steps": 30, "refine.steps": 3000},
     ),
 }
 """All presets by name. `modp-ti run` has an option for each, and the reference lists them."""

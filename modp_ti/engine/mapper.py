@@ -139,11 +139,11 @@ class Mapper:
         """
         if self.finished:
             return
-        self.finished = True
         try:
             self.pipeline.finish(progress)
         except NothingToMapError as error:
             raise InputError(f"`mode: offline` starts from tracked points: {error}") from None
+        self.finished = True
 
     def refine(
         self,

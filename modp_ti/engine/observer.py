@@ -43,12 +43,12 @@ class Observer:
         """Called after each step that a realtime run makes while no frame waits."""
 
     def on_step(self, stage: str, step: int, steps: int | None, psnr: float) -> None:
-        """Called after each step of refinement or offline optimisation.
+        """Called after each step of refinement, of offline optimisation or of the passes that finish an online map.
 
         Args:
-            stage: "refining" or "optimising".
-            step: Number of the step, from 1.
-            steps: Total number of steps, None if it is not known.
+            stage: "refining", "optimising" or "settling".
+            step: Number of the step, from 1; when settling, of views.
+            steps: Total number of them, None if it is not known.
             psnr: Mean PSNR of the step's views [dB].
         """
 

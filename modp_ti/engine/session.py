@@ -29,13 +29,12 @@ from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.trackers import Tracker, open_tracker
-from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, keyframe_psnr, trajectory_errors
+from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord, StepNote
-from modp_ti.outputs.retention import retention
+from modp_ti.outputs.retention import mapped_psnr, retention
 from modp_ti.outputs.time_left import TimeAfterMapping
-from pipelines.pipeline import FrameReport
 from pipelines.settings import RefineSettings
 from pipelines.stopwatch import breakdown_percent
 
@@ -205,7 +204,7 @@ class _Session:
                 line.start("optimising", self.config.offline.steps)
                 mapper.finish(self._optimised)
             else:
-                mapper.finish()
+                self._settle(after)
             self.stop.check()
         finally:
             line.stop()
@@ -215,25 +214,28 @@ class _Session:
         report = self.conductor.add(self.mapper, frame)
         status = self.conductor.status()
         self.line.frame(report, self.tracker.frame_count, status)
-        self.record.frame(frame.index, report, self._mapped_psnr(report), **self.conductor.note())
+        # A realtime run has no time for the PSNR of new keyframes.
+        psnr = mapped_psnr(self.mapper.pipeline, report) if self.conductor.pace is None else None
+        self.record.frame(frame.index, report, psnr, **self.conductor.note())
         self.observer.on_frame(frame, report, status)
 
-    def _mapped_psnr(self, report: FrameReport | None) -> float | None:
-        """Return the PSNR of a keyframe that was just mapped, for `retention`. None for other frames.
-
-        In a realtime run, there is no time for it.
-        """
-        pipeline = self.mapper.pipeline
-        if self.conductor.pace is not None or report is None or not report.is_keyframe or report.psnr is None:
-            return None
-        with pipeline.stopwatch.measure("evaluate"):
-            return keyframe_psnr(pipeline, pipeline.keyframes.selected[-1])
+    def _settle(self, after: TimeAfterMapping) -> None:
+        """Finish an online map. Raises RunStopped between two steps."""
+        pipeline, frames = self.mapper.pipeline, len(self.mapper.frames)
+        keyframes = len(pipeline.keyframes)
+        views = self.config.mapping.optimise.last_passes * keyframes
+        self.line.start("settling", views, later=lambda pace: after.after_passes(pace, keyframes, frames))
+        self.mapper.finish(lambda done, size, psnr: self._after_step("settling", done, views, psnr, size))
 
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:
         """Callback after a step of the offline optimisation."""
-        self.line.step(step, psnr, gaussians)
         self.record.steps.append(StepNote(step, psnr, gaussians))
-        self.observer.on_step("optimising", step, self.config.offline.steps, psnr)
+        self._after_step("optimising", step, self.config.offline.steps, psnr, gaussians)
+
+    def _after_step(self, stage: str, step: int, steps: int | None, psnr: float, size: int | None = None) -> None:
+        """Show a step of a stage after the last frame. Raises RunStopped if Ctrl-C has been pressed."""
+        self.line.step(step, psnr, size)
+        self.observer.on_step(stage, step, steps, psnr)
         self.stop.check()
 
     # ---- the finished map ------------------------------------------------------------------------------------
@@ -271,11 +273,9 @@ class _Session:
     def _refined(self, step: int, psnr: float) -> None:
         """Callback after a step of refinement."""
         steps = self.config.refine.steps if self.config.refine.seconds is None else None
-        self.line.step(step, psnr)
         self.record.steps.append(StepNote(step, psnr))
-        self.observer.on_step("refining", step, steps, psnr)
         self.checkpointer.after_step(step, steps)
-        self.stop.check()
+        self._after_step("refining", step, steps, psnr)
 
     def _write(self, versions: dict[str, MapVersion]) -> None:
         """Write the map, evaluate the map as read back from its file, and write the scores and the report."""

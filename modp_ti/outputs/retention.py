@@ -6,13 +6,27 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from modp_ti.outputs.evaluation import FrameScore
+from modp_ti.outputs.evaluation import FrameScore, keyframe_psnr
 from modp_ti.outputs.report.record import FrameNote
+from pipelines.pipeline import FrameReport, Pipeline
 
-__all__ = ["WINDOW", "retention"]
+__all__ = ["WINDOW", "mapped_psnr", "retention"]
 
 # Keyframes in a row over which the worst change is averaged.
 WINDOW = 20
+
+
+def mapped_psnr(pipeline: Pipeline, report: FrameReport | None) -> float | None:
+    """Return the PSNR [dB] of a keyframe that was just optimised. None for other frames.
+
+    Args:
+        pipeline: The map.
+        report: What the last frame did to the map, None if it was held out.
+    """
+    if report is None or not report.is_keyframe or report.psnr is None:
+        return None
+    with pipeline.stopwatch.measure("evaluate"):
+        return keyframe_psnr(pipeline, pipeline.keyframes.selected[-1])
 
 
 def retention(frames: Sequence[FrameNote], scores: Sequence[FrameScore]) -> dict[str, Mapping[str, float]] | None:

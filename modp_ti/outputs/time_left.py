@@ -77,7 +77,7 @@ class TimeLeft:
 
 
 class TimeAfterMapping:
-    """Estimates the time of what follows the last frame: the last steps, the refinement and the scores of the frames.
+    """Estimates the time of what follows the last frame: the last passes, the refinement and the scores of the frames.
 
     All of it is counted in views. The time of a view is that of the recent ones, since it grows with the map.
 
@@ -110,13 +110,23 @@ class TimeAfterMapping:
         pace = self._views.pace()
         if self._config.mode == "offline" or pace is None or not done or frames is None:
             return None
-        optimise, select, refine = self._config.mapping.optimise, self._config.mapping.views, self._config.refine
-        views = max(optimise.last_steps - optimise.steps, 0) * (1 + select.local_views + select.global_views)
-        if refine.seconds is None:
-            views += refine.steps * refine.views
+        keyframes = len(self._pipeline.keyframes) * frames / done
+        views = self._config.mapping.optimise.last_passes * keyframes
+        return views * pace * FULL_SIZE + self.after_passes(pace * FULL_SIZE, keyframes, frames)
+
+    def after_passes(self, pace: float, keyframes: float, frames: int) -> float:
+        """Return the estimated time of what follows the last passes: the refinement and the scores [s].
+
+        Args:
+            pace: Time of a view of full size [s].
+            keyframes: Number of keyframes.
+            frames: Number of frames.
+        """
+        refine = self._config.refine
+        views = self.scores(frames) + (refine.steps * refine.views if refine.seconds is None else 0)
         if refine.wanted and refine.min_contribution:
-            views += RENDERED * len(self._pipeline.keyframes) * frames / done
-        return pace * FULL_SIZE * (views + self.scores(frames)) + (refine.seconds or 0.0)
+            views += RENDERED * keyframes
+        return pace * views + (refine.seconds or 0.0)
 
     def scores(self, frames: int) -> float:
         """Return the number of views that take as long as the scores of all frames in all versions of the map."""

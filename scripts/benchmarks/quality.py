@@ -148,6 +148,7 @@ def _points(program: Program, scene: Path, steps: int, settings: Mapping[str, st
     overrides = {
         "threads": "1",
         "mapping.optimise.steps": str(steps),
+        # Up to 0.2.0, the last keyframe got so many steps. Later versions ignore the key.
         "mapping.optimise.last_steps": str(steps),
         "refine.steps": str(REFINED * steps),
         "export.report": "false",

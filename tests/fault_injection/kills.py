@@ -28,7 +28,7 @@ source:
 tracker: {{kind: klt}}
 output:  reference
 device:  cpu
-mapping: {{optimise: {{steps: 4, last_steps: 6}}, exposure: {{enabled: true}}}}
+mapping: {{optimise: {{steps: 4}}, exposure: {{enabled: true}}}}
 refine:  {{steps: 40}}
 export:  {{report: false}}
 snapshot_every: 2

@@ -60,7 +60,7 @@ def soak(frames: int, memory: float | None, say: Callable[[str], None]) -> Soak:
     """
     initialise("cpu")
     walked = RoomRecording(Room(), pinhole(WIDTH, HEIGHT), walk(WALK)).frames()
-    settings = MappingSettings(optimise=OptimiseSettings(steps=1, last_steps=1), memory=memory)
+    settings = MappingSettings(optimise=OptimiseSettings(steps=1), memory=memory)
     mapper = Mapper(WIDTH, HEIGHT, settings)
     megabytes: list[float] = []
     kept: list[float] = []

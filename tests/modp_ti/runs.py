@@ -27,7 +27,7 @@ tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
 seed:    3
-mapping: {optimise: {steps: 8, last_steps: 10}, densify: {warm_up: 3}}
+mapping: {optimise: {steps: 8}, densify: {warm_up: 3}}
 refine:  {steps: 20}
 """
 

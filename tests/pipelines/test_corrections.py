@@ -137,9 +137,7 @@ def test_an_offline_map_starts_from_the_corrected_poses_and_points(taichi_on_the
 def mapped() -> OnlineMapper:
     """A map of five frames of the wall."""
     initialise("cpu")
-    settings = MappingSettings(
-        optimise={"steps": 5, "last_steps": 5}, densify={"warm_up": 2, "pixels": 3000}, corrections={"steps": 0}
-    )
+    settings = MappingSettings(optimise={"steps": 5}, densify={"warm_up": 2, "pixels": 3000}, corrections={"steps": 0})
     mapper = OnlineMapper(settings, 64, 48, seed=1)
     for i in range(5):
         mapper.process(frame(i))
@@ -281,7 +279,7 @@ def test_a_map_of_a_guessed_camera_becomes_that_of_the_camera_that_is_found() ->
         there = guess.unproject(f.points.pixels, local[:, 2])
         return replace(f, camera=guess, points=replace(f.points, xyz=(there - T[:3, 3]) @ T[:3, :3]))
 
-    settings = MappingSettings(optimise={"steps": 10, "last_steps": 10}, densify={"warm_up": 2})
+    settings = MappingSettings(optimise={"steps": 10}, densify={"warm_up": 2})
     mapper = OnlineMapper(settings, 64, 48, seed=1)
     for i in range(5):
         mapper.process(guessed(i))

@@ -36,9 +36,7 @@ class Mapped:
 def mapped(memory: float | None, frames: int = FRAMES) -> Mapped:
     """A map of so many frames with so much memory [GB]."""
     initialise("cpu")
-    settings = MappingSettings(
-        sh_degree=0, optimise={"steps": 2, "last_steps": 2}, densify={"warm_up": 2}, memory=memory
-    )
+    settings = MappingSettings(sh_degree=0, optimise={"steps": 2}, densify={"warm_up": 2}, memory=memory)
     mapper = OnlineMapper(settings, 64, 48, seed=1)
     mapper.compile()
     for i in range(frames):

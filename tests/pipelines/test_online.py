@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from fields.geometry.se3 import exp_se3
+from fields.map.keyframes import KeyframeStore
 from pipelines.online import OnlineMapper
+from pipelines.optimise.adam import LearningRates
 from pipelines.refinement import decay, refine
 from pipelines.settings import MappingSettings, RefineSettings
 from tests.pipelines.wall import CAMERA, NORMAL, OFFSET, frame, on_the_plane, pose
 
-SETTINGS = MappingSettings(optimise={"steps": 20, "last_steps": 30}, densify={"warm_up": 2})
+SETTINGS = MappingSettings(optimise={"steps": 20}, densify={"warm_up": 2})
 
 pytestmark = pytest.mark.slow
 
@@ -67,6 +69,31 @@ def test_held_out_frames_are_refused(mapped: OnlineMapper) -> None:
     with pytest.raises(ValueError, match="frame 7 is held out"):
         mapped.process(frame(7, held_out=True))
     np.testing.assert_array_equal(mapped.gaussians.to_numpy()["position"], before["position"])
+
+
+def test_finishing_improves_the_map_from_every_keyframe_alike(
+    mapped: OnlineMapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = mapped.gaussians.to_numpy()
+    mapped.gaussians.load(state | {"sh": 0.95 * state["sh"]})
+    before = [psnr(mapped, i) for i in range(7)]
+    views, rates = [], []
+    step = mapped.optimiser.step
+
+    def recorded(store: KeyframeStore, batch: list[int], of: LearningRates, pose_rate: float) -> float:
+        views.extend(batch)
+        rates.append(of.position)
+        return step(store, batch, of, pose_rate)
+
+    monkeypatch.setattr(mapped.optimiser, "step", recorded)
+    mapped.settled = 0
+    mapped.finish()
+    assert np.bincount(views).tolist() == [SETTINGS.optimise.last_passes] * 7
+    assert rates == sorted(rates, reverse=True) and rates[-1] < 0.5 * rates[0]
+    assert np.mean([psnr(mapped, i) for i in range(7)]) > np.mean(before) + 1
+    mapped.finish()  # nothing new has arrived
+    assert len(views) == SETTINGS.optimise.last_passes * 7
+    mapped.gaussians.load(state)
 
 
 def test_refinement_improves_the_map_and_leaves_the_poses(mapped: OnlineMapper) -> None:

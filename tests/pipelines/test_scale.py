@@ -13,9 +13,7 @@ from tests.pipelines.wall import frame
 pytestmark = pytest.mark.slow
 
 # Few and short steps: a step on a gradient of pure rounding is as long as any other.
-SETTINGS = MappingSettings(
-    optimise={"steps": 2, "last_steps": 2, "batch": 6, "scale_rate": 3e-3}, densify={"warm_up": 2}
-)
+SETTINGS = MappingSettings(optimise={"steps": 2, "batch": 6, "scale_rate": 3e-3}, densify={"warm_up": 2})
 FRAMES = 5
 
 

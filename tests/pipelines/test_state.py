@@ -65,12 +65,14 @@ def restored(state: MapState, settings=SETTINGS) -> OnlineMapper:
 
 @pytest.fixture(scope="module")
 def states() -> dict[str, MapState]:
-    """States of one map, whose colours are exposed: after so many steps, in the middle of refinement, at the end."""
+    """States of one map with exposures: after so many steps, within `finish` and the refinement, at the end."""
     mapper = fresh(5, EXPOSED)
     states = {}
-    for step in STEPS:
+    for step in STEPS[:-1]:
         step(mapper)
         states[str(len(states) + 1)] = copied(mapper.state())
+    mapper.finish(lambda *_: states.setdefault("settling", copied(mapper.state())))
+    states[str(len(STEPS))] = copied(mapper.state())
     refine(mapper, REFINE, lambda s, _: states.update(middle=copied(mapper.state())) if s == MIDDLE else None)
     states["end"] = mapper.state()
     assert len(mapper.gaussians) > 300 and len(mapper.keyframes) > 3
@@ -85,6 +87,13 @@ def test_a_map_restored_at_any_time_ends_as_the_one_that_went_on(states: dict[st
         step(mapper)
     refine(mapper, REFINE)
     assert_same(mapper.state(), states["end"])
+
+
+def test_the_last_passes_go_on_in_their_middle(states: dict[str, MapState]) -> None:
+    assert 0 < states["settling"].numbers["settled"] < states[str(len(STEPS))].numbers["settled"]
+    mapper = restored(states["settling"], EXPOSED)
+    mapper.finish()
+    assert_same(mapper.state(), states[str(len(STEPS))])
 
 
 def test_a_refinement_goes_on_in_its_middle(states: dict[str, MapState]) -> None:

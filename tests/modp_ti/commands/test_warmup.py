@@ -19,7 +19,7 @@ source: {path: images}
 tracker: {kind: colmap}
 output: out
 device: cpu
-mapping: {optimise: {steps: 1, last_steps: 2}, densify: {pixels: 200, warm_up: 2}}
+mapping: {optimise: {steps: 1}, densify: {pixels: 200, warm_up: 2}}
 refine: {steps: 1}
 """
 

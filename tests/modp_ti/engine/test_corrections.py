@@ -27,7 +27,7 @@ from tests.simulated_tracker import drifting, loop, noisy_poses, tracked
 
 pytestmark = pytest.mark.slow
 SIZE = 80, 60
-SETTINGS = MappingSettings(optimise={"steps": 6, "last_steps": 20}, densify={"pixels": 3000})
+SETTINGS = MappingSettings(optimise={"steps": 6}, densify={"pixels": 3000})
 
 
 def loop_frames(room: Room, frames: int, size: tuple[int, int], holdout: int) -> list[TrackedFrame]:
@@ -88,7 +88,7 @@ source:  {holdout: 8, ground_truth: truth.txt}
 tracker: {kind: socket, path: server}
 output:  out
 device:  cpu
-mapping: {optimise: {steps: 2, last_steps: 2}, densify: {warm_up: 3}}
+mapping: {optimise: {steps: 2}, densify: {warm_up: 3}}
 refine:  {steps: 2}
 """
 

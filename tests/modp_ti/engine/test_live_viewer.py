@@ -27,7 +27,7 @@ from tests.pipelines.wall import frame
 if TYPE_CHECKING:
     from tests.room import RoomRecording
 
-SETTINGS = MappingSettings.model_validate({"optimise": {"steps": 3, "last_steps": 4}, "densify": {"warm_up": 3}})
+SETTINGS = MappingSettings.model_validate({"optimise": {"steps": 3}, "densify": {"warm_up": 3}})
 WINDOWS = [(640, 480), (300, 500), (1600, 200)]
 
 

@@ -18,9 +18,7 @@ from modp_ti.outputs.formats.trajectory import read_trajectory
 from pipelines.settings import MappingSettings
 from tests.pipelines.wall import CAMERA, frame
 
-SETTINGS = MappingSettings(
-    optimise={"steps": 10, "last_steps": 15}, densify={"warm_up": 2}, depth={"sources": ["image"]}
-)
+SETTINGS = MappingSettings(optimise={"steps": 10}, densify={"warm_up": 2}, depth={"sources": ["image"]})
 HELD_OUT = 3
 
 

@@ -16,9 +16,7 @@ from tests.pipelines.wall import frame
 
 pytestmark = pytest.mark.slow
 
-SETTINGS = MappingSettings(
-    optimise={"steps": 1, "last_steps": 1}, densify={"warm_up": 1}, depth={"sources": ["image"]}, sh_degree=0
-)
+SETTINGS = MappingSettings(optimise={"steps": 1}, densify={"warm_up": 1}, depth={"sources": ["image"]}, sh_degree=0)
 FRAMES, POINTS = 12, 120
 
 

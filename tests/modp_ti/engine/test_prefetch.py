@@ -131,7 +131,7 @@ def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scen
     scene = plane_scene.folder.parent / "scene.yaml"
     scene.write_text(
         "source: {path: images, holdout: 4}\ntracker: {kind: colmap, path: sparse/0}\noutput: out\ndevice: cpu\n"
-        "mapping: {optimise: {steps: 2, last_steps: 3}, densify: {pixels: 400}}\nrefine: {steps: 2}\n"
+        "mapping: {optimise: {steps: 2}, densify: {pixels: 400}}\nrefine: {steps: 2}\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", RUNS, str(scene)], capture_output=True, text=True, timeout=PATIENCE, check=False

@@ -22,7 +22,7 @@ from pipelines.settings import DensifySettings, MappingSettings, OptimiseSetting
 from tests.patience import PATIENCE
 from tests.pipelines.wall import frame
 
-SETTINGS = MappingSettings(optimise=OptimiseSettings(steps=3, last_steps=3), densify=DensifySettings(pixels=500))
+SETTINGS = MappingSettings(optimise=OptimiseSettings(steps=3), densify=DensifySettings(pixels=500))
 
 pytestmark = pytest.mark.slow
 

@@ -90,12 +90,12 @@ def after_mapping(made: MadeUpMap, **settings: object) -> TimeAfterMapping:
 def test_what_follows_the_last_frame_is_estimated_from_the_views_so_far() -> None:
     """Every second frame a keyframe; 100 of 400 frames done: there will be 200 keyframes."""
     made = MadeUpMap()
-    later = after_mapping(made, mapping={"optimise": {"steps": 4, "last_steps": 14}}, refine={"steps": 200, "views": 4})
+    later = after_mapping(made, mapping={"optimise": {"last_passes": 3}}, refine={"steps": 200, "views": 4})
     assert later.seconds(0, 400) is None
     for done in range(2, 102, 2):
         made.keyframe(24, 0.01)
         found = later.seconds(done, 400)
-    views = 10 * 6 + 200 * 4 + RENDERED * 200 + SCORED * 2 * 400
+    views = 3 * 200 + 200 * 4 + RENDERED * 200 + SCORED * 2 * 400
     assert found == pytest.approx(0.01 * FULL_SIZE * views)
 
 
@@ -103,20 +103,18 @@ def test_views_that_become_slower_count_as_the_recent_ones() -> None:
     made = MadeUpMap()
     later = after_mapping(
         made,
-        mapping={"optimise": {"steps": 25, "last_steps": 40}},
+        mapping={"optimise": {"last_passes": 1}},
         refine={"steps": 100, "views": 1, "min_contribution": 0.0},
     )
     for done, seconds in enumerate([0.01] * 30 + [0.03] * 30, 1):
         made.keyframe(10, seconds)
         found = later.seconds(done, 60)
-    assert found == pytest.approx(0.03 * FULL_SIZE * (15 * 6 + 100 + SCORED * 2 * 60))
+    assert found == pytest.approx(0.03 * FULL_SIZE * (60 + 100 + SCORED * 2 * 60))
 
 
 def test_without_refinement_the_scores_remain() -> None:
     made = MadeUpMap()
-    later = after_mapping(
-        made, mapping={"optimise": {"steps": 40, "last_steps": 40}}, refine={"steps": 0, "min_contribution": 0.5}
-    )
+    later = after_mapping(made, mapping={"optimise": {"last_passes": 0}}, refine={"steps": 0, "min_contribution": 0.5})
     for done in range(1, 21):
         made.keyframe(10, 0.02)
         found = later.seconds(done, 50)

@@ -22,7 +22,7 @@ from tests.pipelines.wall import frame
 SETTINGS = MappingSettings(
     views={"error_weight": 0.0},
     # Smaller rates than the defaults, so that steps do not amplify the rounding in which the devices differ.
-    optimise={"steps": 2, "last_steps": 2, "position_rate": 2.4e-5, "scale_rate": 0.02, "colour_rate": 2.5e-3},
+    optimise={"steps": 2, "position_rate": 2.4e-5, "scale_rate": 0.02, "colour_rate": 2.5e-3},
     densify={"warm_up": 2, "pixels": 3000},
     voxels={"enabled": False},
     exposure={"enabled": True},

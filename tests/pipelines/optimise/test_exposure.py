@@ -101,7 +101,7 @@ GAINS = (1.0, 0.8, 1.15, 0.9, 0.7, 1.0, 0.85)
 
 def mapped(frames: list, **exposure: object) -> OnlineMapper:
     settings = MappingSettings(
-        optimise={"steps": 20, "last_steps": 30},
+        optimise={"steps": 20},
         densify={"warm_up": 2},
         keyframes={"max_gap": 1},
         exposure=exposure,

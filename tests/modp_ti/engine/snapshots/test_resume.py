@@ -34,7 +34,7 @@ tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
 seed:    3
-mapping: {optimise: {steps: 3, last_steps: 4}, densify: {warm_up: 3, prune_every: 4}, exposure: {enabled: true}}
+mapping: {optimise: {steps: 3}, densify: {warm_up: 3, prune_every: 4}, exposure: {enabled: true}}
 refine:  {steps: 9}
 export:  {report: false}
 snapshot_every: 2
@@ -174,7 +174,7 @@ source:  {{path: images, holdout: 8, fps: 10, intrinsics: {{fx: {camera.fx}, fy:
 tracker: {{kind: klt}}
 output:  out
 device:  cpu
-mapping: {{optimise: {{steps: 2, last_steps: 2}}}}
+mapping: {{optimise: {{steps: 2}}}}
 refine:  {{steps: 4}}
 export:  {{report: false}}
 snapshot_every: 3

@@ -22,7 +22,7 @@ source:  {path: images, realtime: true, fps: 8, scale: 0.25, holdout: 8, intrins
 tracker: {kind: klt}
 output:  out
 device:  cpu
-mapping: {optimise: {steps: 1, last_steps: 1}}
+mapping: {optimise: {steps: 1}}
 refine:  {steps: 0}
 export:  {report: false}
 """

@@ -30,7 +30,7 @@ source:  {path: images, fps: 10}
 tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
-mapping: {optimise: {steps: 3, last_steps: 4}}
+mapping: {optimise: {steps: 3}}
 refine:  {steps: 0}
 view:    {port: 0, paused: true}
 """
