@@ -35,8 +35,8 @@ class Thinning:
     keeps up: the frames that wait absorb short pauses.
 
     A larger stride makes the tracker's frames more expensive, because keyframes come at the same times as before. To
-    work off waiting frames, strides therefore grow no further than to `LARGEST_GAP`, unless the tracker cannot keep that
-    up.
+    work off waiting frames, strides therefore grow no further than to `LARGEST_GAP`, unless the tracker cannot keep
+    that up or the lag is longer than `LONGEST_LAG`.
 
     The policy is told times, and never reads a clock.
     """
