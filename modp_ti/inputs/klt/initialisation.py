@@ -153,7 +153,7 @@ class Initialisation:
     @staticmethod
     def _holds(landmarks: LandmarkMap, shared: int) -> bool:
         """Whether the map keeps enough landmarks and has a median reprojection error below 1 px."""
-        ids = landmarks.observations([len(landmarks.keyframes) - 1]).ids
+        _, ids, _ = landmarks.observations([len(landmarks.keyframes) - 1])
         if len(ids) < max(FEWEST_SHARED // 2, 0.5 * shared):
             return False
         errors = []

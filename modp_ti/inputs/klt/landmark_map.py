@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,8 @@ from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
-from modp_ti.inputs.multiview.windowed_adjustment import Window, adjusted_window
 
-__all__ = ["Keyframe", "LandmarkMap", "LandmarkObservations"]
+__all__ = ["Keyframe", "LandmarkMap"]
 
 # Observations with a larger reprojection error [px] are outliers.
 MAX_ERROR = 2.5
@@ -62,26 +60,6 @@ class Keyframe:
         self.ids = np.concatenate([self.ids, ids])
         self.pixels = np.concatenate([self.pixels, pixels])
         self.rays = np.concatenate([self.rays, rays])
-
-
-class LandmarkObservations(NamedTuple):
-    """Observations of landmarks.
-
-    Attributes:
-        keyframe: (M,).
-        ids: (M,) landmarks.
-        pixels: (M, 2).
-        rays: (M, 2) undistorted normalised coordinates.
-    """
-
-    keyframe: NDArray[np.int64]
-    ids: NDArray[np.int64]
-    pixels: NDArray[np.float64]
-    rays: NDArray[np.float64]
-
-    def where(self, kept: NDArray[np.bool_]) -> LandmarkObservations:
-        """Select observations by a mask (M,)."""
-        return LandmarkObservations(self.keyframe[kept], self.ids[kept], self.pixels[kept], self.rays[kept])
 
 
 class LandmarkMap:
@@ -141,19 +119,22 @@ class LandmarkMap:
         late = self.last[ids] <= k
         self.last[ids[late]], self.last_pixel[ids[late]] = k, pixels[late]
 
-    def observations(self, keyframes: Iterable[int]) -> LandmarkObservations:
-        """Observations of landmarks in these keyframes, in the order of the keyframes."""
-        seen = [LandmarkObservations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))]
+    def observations(
+        self, keyframes: Iterable[int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Observations of landmarks in these keyframes.
+
+        Returns:
+            Keyframe (M,), landmark id (M,) and pixel (M, 2) of each observation.
+        """
+        of, ids, pixels = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
         for k in keyframes:
-            each = self.keyframes[k]
-            seen.append(LandmarkObservations(np.full(len(each.ids), k), each.ids, each.pixels, each.rays))
-            seen[-1] = seen[-1].where(self.known[each.ids])
-        return LandmarkObservations(
-            np.concatenate([each.keyframe for each in seen]),
-            np.concatenate([each.ids for each in seen]),
-            np.concatenate([each.pixels for each in seen]),
-            np.concatenate([each.rays for each in seen]),
-        )
+            keyframe = self.keyframes[k]
+            known = self.known[keyframe.ids]
+            ids.append(keyframe.ids[known])
+            pixels.append(keyframe.pixels[known])
+            of.append(np.full(len(ids[-1]), k))
+        return np.concatenate(of), np.concatenate(ids), np.concatenate(pixels)
 
     def triangulate(self, k: int) -> NDArray[np.int64]:
         """Triangulate features of keyframe k with their first observation. Returns the ids of the new landmarks."""
@@ -215,18 +196,15 @@ class LandmarkMap:
             The mean cost per observation [px^2 / 2]; infinite if there are too few observations.
         """
         views = sorted({*free, *held})
-        seen = self.observations(views)
+        of, ids, pixels = self.observations(views)
         wanted = np.zeros(len(self.known), dtype=bool)
-        wanted[seen.ids[np.isin(seen.keyframe, free)]] = True
-        seen = seen.where(wanted[seen.ids] & (np.bincount(seen.ids, minlength=len(wanted))[seen.ids] >= 2))
-        if len(seen.ids) < 12:
+        wanted[ids[np.isin(of, free)]] = True
+        used = wanted[ids] & (np.bincount(ids, minlength=len(wanted))[ids] >= 2)
+        of, ids, pixels = of[used], ids[used], pixels[used]
+        if len(ids) < 12:
             return float("inf")
-        if held and not refined:
-            return self._adjust_window(views, free, seen, steps)
         poses = {k: self.keyframes[k].T_camera_world for k in views}
-        bundle = adjusted_bundle(
-            self.lens.camera, poses, seen.keyframe, seen.ids, seen.pixels, self.xyz, set(free), steps, refined=refined
-        )
+        bundle = adjusted_bundle(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
         if bundle is None:
             return float("inf")
         for k, T in bundle.poses.items():
@@ -235,25 +213,6 @@ class LandmarkMap:
         if refined:
             self._take(Lens(bundle.camera))
         return bundle.cost
-
-    def _adjust_window(
-        self, views: Sequence[int], free: Sequence[int], seen: LandmarkObservations, steps: int
-    ) -> float:
-        """Adjust keyframes beside others with fixed poses. Returns the mean cost per observation [px^2 / 2]."""
-        ids, point = np.unique(seen.ids, return_inverse=True)
-        window = Window(
-            poses=np.array([self.keyframes[k].T_camera_world for k in views]),
-            free=np.searchsorted(views, sorted(free)),
-            xyz=self.xyz[ids],
-            view=np.searchsorted(views, seen.keyframe),
-            point=point,
-            rays=seen.rays,
-            sigma=1.0 / self.lens.focal,
-        )
-        poses, self.xyz[ids], cost = adjusted_window(window, steps)
-        for i in window.free:
-            self.keyframes[views[i]].T_camera_world[:] = poses[i]
-        return cost
 
     def state(self) -> tuple[Lens, NDArray[np.float64], list[NDArray[np.float64]]]:
         """Camera, landmarks and poses of the keyframes, for `restore`."""

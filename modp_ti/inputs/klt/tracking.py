@@ -258,7 +258,7 @@ class Tracking:
     def _companions(self, free: list[int]) -> list[int]:
         """Other keyframes that share the most landmarks with `free`, at most HELD of them."""
         seen = np.zeros(len(self.map.known), dtype=bool)
-        seen[self.map.observations(free).ids] = True
+        seen[self.map.observations(free)[1]] = True
         others = [k for k in range(len(self.map.keyframes)) if k not in set(free)]
         shared = {k: int(seen[self.map.keyframes[k].ids].sum()) for k in others}
         closest = sorted(others, key=lambda k: (-shared[k], -k))[:HELD]
