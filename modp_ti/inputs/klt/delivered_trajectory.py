@@ -70,16 +70,10 @@ class DeliveredTrajectory:
 
     def points(self, frame: DeliveredFrame) -> SparsePoints:
         """Landmarks of a frame whose reprojection error is small, in pixels of the delivered image."""
-        ids, lens = frame.view.ids, self._map.lens
-        xyz = self._map.xyz[ids]
-        error = ray_errors(frame.T_camera_world, xyz, lens.rays(frame.view.pixels)) * lens.focal
-        good = self._map.known[ids] & (error < MAX_ERROR)
-        to = self._undistorter
-        if lens.is_undistorted:
-            pixels = frame.view.pixels[good] * np.divide((to.camera.width, to.camera.height), (lens.width, lens.height))
-        else:
-            raw = frame.view.pixels[good] * np.divide((to.raw.width, to.raw.height), (lens.width, lens.height))
-            pixels = to.points(raw)
+        ids, lens, camera = frame.view.ids, self._map.lens, self._undistorter.camera
+        xyz, rays = self._map.xyz[ids], lens.rays(frame.view.pixels)
+        good = self._map.known[ids] & (ray_errors(frame.T_camera_world, xyz, rays) * lens.focal < MAX_ERROR)
+        pixels = rays[good] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         return points_inside(xyz[good], pixels, ids[good], self._undistorter, frame.T_camera_world)
 
     def record(self, points: SparsePoints) -> None:

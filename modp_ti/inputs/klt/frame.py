@@ -39,7 +39,7 @@ class Frame:
             other: A frame with N features.
             guess: (N, 2) their expected positions in this frame; those in `other` by default.
         """
-        pixels, found = flow(other.grey, self.grey, other.pixels, other.pixels if guess is None else guess)
+        pixels, found = flow(other.grey, self.grey, other.pixels, guess)
         self.ids, self.pixels = other.ids[found], pixels[found]
 
     def append(self, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:

@@ -10,6 +10,11 @@ __all__ = ["corners", "flow"]
 
 WINDOW = (21, 21)
 LEVELS = 4  # pyramid levels above the image itself, at most
+# Levels above the image, forwards and backwards, where the predicted motion is at most SLOW px in the median. The way
+# back starts where it should end. All levels are used if a smaller share of the points than PREDICTED_SHARE is tracked.
+SLOW = 12.0
+SLOW_LEVELS, RETURN_LEVELS = 2, 1
+PREDICTED_SHARE = 0.85
 # Largest forward-backward error [px].
 ROUND_TRIP = 0.7
 # Smallest minimum eigenvalue of a corner's structure tensor, as a share of the best corner's.
@@ -21,7 +26,7 @@ def flow(
     before: NDArray[np.uint8],
     after: NDArray[np.uint8],
     pixels: NDArray[np.float64],
-    guess: NDArray[np.float64],
+    guess: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Track points from one image to the next, with a forward-backward check.
 
@@ -31,26 +36,43 @@ def flow(
         before: (H, W) uint8.
         after: (H, W) uint8.
         pixels: (N, 2) points in `before`.
-        guess: (N, 2) initial positions in `after`.
+        guess: (N, 2) predicted positions in `after`, None to start from `pixels`. Few pyramid levels are enough where a
+            slow motion is predicted, unless that turns out to be wrong.
 
     Returns:
         Positions (N, 2) in `after`, and a mask (N,) of the points that were tracked.
     """
     if len(pixels) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=bool)
-    height, width = before.shape
     before = _lit_alike(before, after)
+    levels = _levels(before)
+    if guess is not None and levels > SLOW_LEVELS and np.median(np.linalg.norm(guess - pixels, axis=1)) <= SLOW:
+        result, found = _flow(before, after, pixels, guess, SLOW_LEVELS, RETURN_LEVELS)
+        if found.mean() >= PREDICTED_SHARE:
+            return result, found
+    return _flow(before, after, pixels, pixels if guess is None else guess, levels, levels)
+
+
+def _flow(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    pixels: NDArray[np.float64],
+    guess: NDArray[np.float64],
+    levels: int,
+    return_levels: int,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Track points with the image and `levels` pyramid levels above it, on the way back `return_levels`; see `flow`."""
+    height, width = before.shape
     # In cv2 the first pixel's centre is 0, and points are float32.
     start = (pixels - 0.5).astype(np.float32)[:, None]
     there = np.clip(guess - 0.5, (-width, -height), (2 * width, 2 * height)).astype(np.float32)[:, None]
     options = {
         "winSize": WINDOW,
-        "maxLevel": _levels(before),
         "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
     }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, there.copy(), **options)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, start.copy(), **options)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, there.copy(), maxLevel=levels, **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, start.copy(), maxLevel=return_levels, **options)
     found = (found[:, 0] > 0) & (returned[:, 0] > 0) & np.isfinite(there).all(axis=(1, 2))
     found &= np.linalg.norm(back - start, axis=(1, 2)) < ROUND_TRIP
     result = there[:, 0].astype(np.float64) + 0.5

@@ -18,8 +18,6 @@ __all__ = ["align_landmarks", "reference_views"]
 TILE = 40  # side [px] of a patch with its search area
 WINDOW = 13  # side [px] of the compared window
 COLUMNS = 16
-# Offsets (TILE, TILE, 2) [px] of the patch's pixels from its centre.
-GRID = np.stack(np.meshgrid(*[np.arange(TILE) - (TILE - 1) / 2] * 2), axis=-1)
 # Smallest correlation of matching patches.
 ALIKE = 0.75
 # Largest change of scale, and of viewing direction [degrees], between a patch and the current view.
@@ -95,15 +93,17 @@ def align_landmarks(
     warp = np.where(usable[:, None, None], warp, np.eye(2))
     guess = np.where(usable[:, None], guess, 0.0)
 
-    reference = _warped_patches(landmarks, keyframe, pixel, warp, usable)
-    shift, aligned = _shifts(reference, _sampled(grey, guess[:, None, None] + GRID))
+    reference = np.zeros((count, TILE, TILE), np.uint8)
+    unwarp = np.linalg.inv(warp)
+    for k in np.unique(keyframe[usable]):
+        mine = np.flatnonzero(usable & (keyframe == k))
+        reference[mine] = _patches(landmarks.keyframes[k].grey, pixel[mine], unwarp[mine], TILE)
+    plain = np.broadcast_to(np.eye(2), (count, 2, 2))
+    shift, aligned = _shifts(reference, _patches(grey, guess, plain, TILE))
     recognised = usable & aligned
     result = guess + np.where(recognised[:, None], shift, 0.0)
     half = WINDOW // 2
-    near = np.stack(np.meshgrid(*[np.arange(-half, half + 1, dtype=np.float64)] * 2), axis=-1)
-    a = _sampled_stack(reference, near)
-    b = _sampled(grey, result[:, None, None] + near)
-    recognised &= _correlation(a, b) > ALIKE
+    recognised &= _correlation(_middles(reference), _patches(grey, result, plain, WINDOW).astype(np.float32)) > ALIKE
     height, width = grey.shape
     recognised &= (result >= half + 1).all(axis=1) & (result <= (width - half - 1, height - half - 1)).all(axis=1)
     return result, recognised
@@ -131,27 +131,29 @@ def _warps(
     return np.stack([moved[1] - moved[0], moved[2] - moved[0]], axis=-1) / step
 
 
-def _warped_patches(
-    landmarks: LandmarkMap,
-    keyframe: NDArray[np.int64],
-    pixel: NDArray[np.float64],
-    warp: NDArray[np.float64],
-    usable: NDArray[np.bool_],
-) -> NDArray[np.float32]:
-    """Patches (N, TILE, TILE) of the keyframes as the current view would see them; zero where not `usable`."""
-    count = len(pixel)
-    unwarped = GRID.reshape(-1, 2) @ np.linalg.inv(warp).transpose(0, 2, 1)  # (N, TILE * TILE, 2)
-    there = pixel[:, None, None] + unwarped.reshape(count, TILE, TILE, 2)
-    patches = np.zeros((count, TILE, TILE), np.float32)
-    for k in np.unique(keyframe[usable]):
-        mine = np.flatnonzero(usable & (keyframe == k))
-        patches[mine] = _sampled(landmarks.keyframes[k].grey, there[mine])
-    return patches
+def _patches(
+    grey: NDArray[np.uint8], centres: NDArray[np.float64], warps: NDArray[np.float64], side: int
+) -> NDArray[np.uint8]:
+    """Patches (N, side, side) of an image, sampled bilinearly.
+
+    Args:
+        grey: (H, W).
+        centres: (N, 2) pixels of the patches' centres, with pixel centres at +0.5.
+        warps: (N, 2, 2) from offsets in the patch to offsets in the image.
+        side: Width and height [px] of the patches.
+    """
+    # In cv2 the first pixel's centre is 0.
+    to_image = np.empty((len(centres), 2, 3))
+    to_image[:, :, :2] = warps
+    to_image[:, :, 2] = centres - 0.5 - (side - 1) / 2 * warps.sum(axis=2)
+    out = np.empty((len(centres), side, side), np.uint8)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    for matrix, patch in zip(to_image, out, strict=True):  # cheaper than one cv2.remap with lookup maps for all pixels
+        cv2.warpAffine(grey, matrix, (side, side), dst=patch, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return out
 
 
-def _shifts(
-    reference: NDArray[np.float32], current: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _shifts(reference: NDArray[np.uint8], current: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Shifts (N, 2) [px] from each reference patch to its current one, and a mask (N,) of those that were found."""
     centre = np.array([((n % COLUMNS) + 0.5, (n // COLUMNS) + 0.5) for n in range(len(reference))]) * TILE - 0.5
     start = centre.astype(np.float32)[:, None]
@@ -169,32 +171,20 @@ def _shifts(
     return shift, (status[:, 0] > 0) & (np.abs(shift) <= room).all(axis=1)
 
 
-def _sampled(grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Bilinear samples (N, a, b) at pixels (N, a, b, 2), whose centres are at +0.5."""
-    n, a, b, _ = pixels.shape
-    x = np.ascontiguousarray(pixels[..., 0] - 0.5, dtype=np.float32).reshape(n * a, b)
-    y = np.ascontiguousarray(pixels[..., 1] - 0.5, dtype=np.float32).reshape(n * a, b)
-    out = np.empty((n * a, b), np.float32)
-    for start in range(0, n * a, 30000):  # cv2.remap accepts at most 32767 rows
-        part = slice(start, start + 30000)
-        out[part] = cv2.remap(grey, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(n, a, b)
-
-
-def _sampled_stack(tiles: NDArray[np.float32], near: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The window (N, a, b) at the centre of each tile. Tiles have an even side, so their centre is between pixels."""
-    half = near.shape[0] // 2
-    middle = TILE // 2
-    block = tiles[:, middle - half - 1 : middle + half + 1, middle - half - 1 : middle + half + 1]
+def _middles(tiles: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The windows (N, WINDOW, WINDOW) at the centre of each tile, which is between pixels: tiles have an even side."""
+    start, stop = TILE // 2 - WINDOW // 2 - 1, TILE // 2 + WINDOW // 2 + 1
+    block = tiles[:, start:stop, start:stop].astype(np.float32)
     return 0.25 * (block[:, :-1, :-1] + block[:, 1:, :-1] + block[:, :-1, 1:] + block[:, 1:, 1:])
 
 
-def _mosaic(tiles: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _mosaic(tiles: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Arrange tiles (N, TILE, TILE) in one image, each normalised to the same brightness and contrast."""
-    inner = tiles[:, 6:-6, 6:-6]
+    bright = tiles.astype(np.float32)
+    inner = bright[:, 6:-6, 6:-6]
     mean = inner.mean(axis=(1, 2), keepdims=True)
     deviation = np.maximum(inner.std(axis=(1, 2), keepdims=True), 3.0)
-    even = np.clip(np.round((tiles - mean) / deviation * 40.0 + 128.0), 0, 255).astype(np.uint8)
+    even = np.clip(np.rint((bright - mean) * (40.0 / deviation) + 128.0), 0, 255).astype(np.uint8)
     rows = -(-len(even) // COLUMNS)
     sheet = np.zeros((rows * COLUMNS, TILE, TILE), np.uint8)
     sheet[: len(even)] = even

@@ -82,6 +82,7 @@ class Tracking:
         self._refinement = refinement
         self._thumbnails: list[NDArray[np.float32]] = []  # of the first keyframes, made when they are needed
         self._lost_for = 0
+        self._wide_is_due = False
         start = landmarks.keyframes[-1]
         last = LocalisedFrame(
             start.number, start.grey, valid, start.ids, start.pixels, T_camera_world=start.T_camera_world
@@ -138,7 +139,12 @@ class Tracking:
         if self._wants_keyframe(located):
             return self._make_keyframe(located)
         self._last = located
-        return self.view(located)
+        view = self.view(located)
+        if self._wide_is_due:
+            self._wide_is_due = False
+            self._adjust_last(WIDE_WINDOW)
+            located.T_camera_world = self.pose(view)
+        return view
 
     def _predicted(self, last: LocalisedFrame, T: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predict the pixels of the tracked features at pose T. Untriangulated ones are given the median depth."""
@@ -198,7 +204,15 @@ class Tracking:
         if self._refinement is not None and count in self._refinement.at:
             self._refine_camera_in_use() if self._refinement.settles else self.refine_camera()
             return
-        free = list(range(max(0, count - (WIDE_WINDOW if count % WIDE_EVERY == 0 else WINDOW)), count))
+        # The wide adjustment comes with the next frame that is no keyframe, because a keyframe costs enough without it;
+        # if the next frame is a keyframe, then with that.
+        self._adjust_last(WIDE_WINDOW if self._wide_is_due else WINDOW)
+        self._wide_is_due = count % WIDE_EVERY == 0
+
+    def _adjust_last(self, window: int) -> None:
+        """Bundle adjust the last `window` keyframes."""
+        count = len(self.map.keyframes)
+        free = list(range(max(0, count - window), count))
         held = self._companions(free)
         if not held:
             held, free = free[:2], free[2:]

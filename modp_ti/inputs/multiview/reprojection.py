@@ -115,21 +115,29 @@ def refine_pose(
     """
     T = np.array(T_camera_world, dtype=np.float64)
     scale = max(float(np.median(np.abs(xyz @ T[2, :3] + T[2, 3]))), 1e-9) if len(xyz) else 1.0
+    # Components come first: NumPy is faster on long contiguous rows.
+    xyz, rays = np.ascontiguousarray(xyz.T, dtype=np.float64), np.ascontiguousarray(rays.T, dtype=np.float64)
     for _ in range(steps):
-        p = xyz @ T[:3, :3].T + T[:3, 3]
-        before = p[:, 2] > 1e-3 * scale
-        p, seen = p[before], rays[before]
-        if len(p) < 3:
+        p, seen = T[:3, :3] @ xyz + T[:3, 3:], rays
+        before = p[2] > 1e-3 * scale
+        if not before.all():
+            p, seen = p[:, before], rays[:, before]
+        if p.shape[1] < 3:
             break
-        z = p[:, 2]
-        u, v = p[:, 0] / z, p[:, 1] / z
-        residual, weight = _cauchy(np.stack([u, v], axis=1), seen, sigma)
-        jacobian = np.zeros((len(p), 2, 6))
-        jacobian[:, 0, 0] = jacobian[:, 1, 1] = scale / z  # translation in units of the scene's depth
-        jacobian[:, 0, 2], jacobian[:, 1, 2] = -scale * u / z, -scale * v / z
-        jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 0, 5] = -u * v, 1 + u * u, -v
-        jacobian[:, 1, 3], jacobian[:, 1, 4], jacobian[:, 1, 5] = -(1 + v * v), u * v, u
-        left, right = _normal_equations(jacobian / sigma, residual, weight)
+        uv = p[:2] / p[2]
+        u, v = uv
+        residual = (uv - seen) / sigma
+        root = 1.0 / np.sqrt(1.0 + residual[0] ** 2 + residual[1] ** 2)  # of the weights under the loss
+        w = root / sigma
+        near = w * (scale / p[2])  # translation in units of the scene's depth
+        jacobian = np.zeros((6, 2, len(u)))
+        jacobian[0, 0] = jacobian[1, 1] = near
+        jacobian[2] = -near * uv
+        uw, vw = u * w, v * w
+        jacobian[3, 0], jacobian[4, 0], jacobian[5, 0] = -u * vw, w + u * uw, -vw
+        jacobian[3, 1], jacobian[4, 1], jacobian[5, 1] = -(w + v * vw), u * vw, uw
+        jacobian = jacobian.reshape(6, -1)
+        left, right = jacobian @ jacobian.T, jacobian @ (root * residual).reshape(-1)
         left[np.diag_indices(6)] *= 1.0 + 1e-6
         left[np.diag_indices(6)] += 1e-12 * np.trace(left) + 1e-300
         step = -np.linalg.solve(left, right)
@@ -207,7 +215,7 @@ def refine_points(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[n
 
 
 def _cauchy(
-    uv: NDArray[np.float64], rays: NDArray[np.float64], sigma: float | NDArray[np.float64]
+    uv: NDArray[np.float64], rays: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Residuals (M, 2) in units of `sigma`, and their weights (M,) under a Cauchy loss."""
     residual = (uv - rays) / sigma
@@ -218,14 +226,10 @@ def _normal_equations(
     jacobian: NDArray[np.float64],
     residual: NDArray[np.float64],
     weight: NDArray[np.float64],
-    point: NDArray[np.int64] | None = None,
-    count: int = 1,
+    point: NDArray[np.int64],
+    count: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """J^T W J and J^T W r of Jacobians (M, 2, K): (count, K, K) and (count, K) by point, or (K, K) and (K,) of all."""
-    if point is None:  # a single matrix product is many times faster than a sum over observations
-        flat = jacobian.reshape(-1, jacobian.shape[2])
-        weighted = flat * np.repeat(weight, 2)[:, None]
-        return weighted.T @ flat, weighted.T @ residual.reshape(-1)
+    """J^T W J (count, K, K) and J^T W r (count, K) of each point, from Jacobians (M, 2, K)."""
     weighted = weight[:, None, None] * jacobian
     left = sum_by_point(point, np.einsum("mki,mkj->mij", weighted, jacobian), count)
     return left, sum_by_point(point, np.einsum("mki,mk->mi", weighted, residual), count)

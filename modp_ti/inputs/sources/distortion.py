@@ -14,6 +14,8 @@ __all__ = ["NO_DISTORTION", "Distortion", "colmap_intrinsics"]
 Points = NDArray[np.float64]
 
 TABLE_SIZE = 4096
+# Newton's method ends for a point whose error in distorted coordinates is smaller. Rounding is some 1e-16.
+CONVERGED = 1e-14
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,14 @@ class Distortion:
         radius = np.linalg.norm(points, axis=1)
         ratio = np.divide(np.interp(radius, distorted, r), radius, out=np.ones_like(radius), where=radius > 1e-12)
         ideal = points * ratio[:, None]
+        going = np.arange(len(points))  # points that have not converged
         for _ in range(8):
-            residual = self.distort(ideal) - points
-            ideal = ideal - np.linalg.solve(self._jacobian(ideal), residual[..., None])[..., 0]
+            residual = self.distort(ideal[going]) - points[going]
+            more = np.abs(residual).max(axis=1) > CONVERGED
+            going, residual = going[more], residual[more]
+            if len(going) == 0:
+                break
+            ideal[going] -= np.linalg.solve(self._jacobian(ideal[going]), residual[..., None])[..., 0]
         error = np.abs(self.distort(ideal) - points).max(axis=1)
         found = (error < 1e-9) & (np.linalg.norm(ideal, axis=1) <= valid)
         return np.where(found[:, None], ideal, np.nan)

@@ -12,9 +12,11 @@ __all__ = ["Thinning"]
 
 # Time [s] within which the tracker should have worked off the frames that wait for it.
 HORIZON = 4.0
-# Largest time between two tracked frames [s], unless the tracker is too slow for it or the lag is longer than LONG_LAG.
+# Largest time between two tracked frames [s], as long as the tracker can keep that up and the lag is below LONGEST_LAG.
 LARGEST_GAP = 0.15
-LONG_LAG = 1.25
+LONGEST_LAG = 4.0
+# For a tracker that is too slow for that, the lag from which strides grow beyond what its costs demand.
+LONG_LAG = 1.0
 # The tracker gets this much more time than it takes on average, because its costs vary.
 ROOM = 1.05
 # Numbers of intervals between frames, and of tracked frames, over which the means are taken.
@@ -33,7 +35,8 @@ class Thinning:
     keeps up: the frames that wait absorb short pauses.
 
     A larger stride makes the tracker's frames more expensive, because keyframes come at the same times as before. To
-    work off waiting frames, strides therefore grow no further than to `LARGEST_GAP`, unless the lag is a long one.
+    work off waiting frames, strides therefore grow no further than to `LARGEST_GAP`, unless the tracker cannot keep
+    that up or the lag is longer than `LONGEST_LAG`.
 
     The policy is told times, and never reads a clock.
     """
@@ -79,8 +82,8 @@ class Thinning:
             return 1
         # The share of the tracker's time that is left for new frames while the waiting ones are worked off.
         share = max(1.0 - lag / HORIZON, 1.0 / HORIZON)
-        most = max(1.0, ROOM * self.load(COSTS), floor(LARGEST_GAP / self._interval))
-        most *= min(max(lag / LONG_LAG, 1.0), 2.0)
+        needed, largest = ROOM * self.load(COSTS), max(1.0, floor(LARGEST_GAP / self._interval))
+        most = max(needed, largest) * min(max(lag / (LONG_LAG if needed > largest else LONGEST_LAG), 1.0), 2.0)
         self._rest += max(1.0, min(load / share, most))
         stride = floor(self._rest)
         self._rest -= stride
