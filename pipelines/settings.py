@@ -11,9 +11,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from fields.frames.pyramid import MAX_LEVELS
+from fields.runtime.engine import engine
 
 __all__ = [
     "CorrectionSettings",
@@ -31,6 +32,7 @@ __all__ = [
     "StrictModel",
     "ViewSettings",
     "VoxelSettings",
+    "within_the_engine",
 ]
 
 
@@ -38,6 +40,13 @@ class StrictModel(BaseModel):
     """Immutable section of the configuration. Unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+def within_the_engine(count: int, most: int) -> int:
+    """Return a pool's size. Raises ValueError if the engine holds only `most` Gaussians."""
+    if count > most:
+        raise ValueError(f"{engine().title} holds at most {most:,} Gaussians here; docs/platforms.md tells the limits")
+    return count
 
 
 class KeyframeSettings(StrictModel):
@@ -288,8 +297,8 @@ class MappingSettings(StrictModel):
     max_gaussians: int = Field(
         default=1_500_000,
         ge=1024,
-        le=1_500_000,
-        description="size of the pool; further Gaussians are not added. Taichi's allocator sets the limit",
+        description="size of the pool; further Gaussians are not added. At most 1,500,000 with Taichi, "
+        "33,554,432 with Quadrants",
     )
     memory: float | None = Field(
         default=None,
@@ -324,6 +333,11 @@ class MappingSettings(StrictModel):
     corrections: CorrectionSettings = CorrectionSettings()
     exposure: ExposureSettings = ExposureSettings()
     optimise: OptimiseSettings = OptimiseSettings()
+
+    @field_validator("max_gaussians")
+    @classmethod
+    def _the_engine_holds_them(cls, count: int) -> int:
+        return within_the_engine(count, engine().max_gaussians)
 
 
 class RefineSettings(StrictModel):

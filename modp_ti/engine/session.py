@@ -15,6 +15,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
+from fields.runtime.engine import engine
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import build_mapper, open_conductor
 from modp_ti.engine.conductor import Conductor, Event
@@ -336,6 +337,7 @@ class _Session:
             "views_between": len(pipeline.keyframes) - len(pipeline.keyframes.selected),
             "gaussians": len(pipeline.gaussians),
             "backend": self.backend,
+            "engine": str(engine()),
             "seed": self.config.seed,
             "frames_per_second": round(len(frames) / self.clock.mapping, 4),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
