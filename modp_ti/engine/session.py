@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +14,6 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
-from fields.runtime.engine import engine
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import build_mapper, open_conductor
 from modp_ti.engine.conductor import Conductor, Event
@@ -25,7 +23,7 @@ from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.results import Results, metrics_of
-from modp_ti.engine.run_clock import RunClock
+from modp_ti.engine.run_clock import RunClock, peak_memory_mb
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
@@ -337,10 +335,9 @@ class _Session:
             "views_between": len(pipeline.keyframes) - len(pipeline.keyframes.selected),
             "gaussians": len(pipeline.gaussians),
             "backend": self.backend,
-            "engine": str(engine()),
             "seed": self.config.seed,
             "frames_per_second": round(len(frames) / self.clock.mapping, 4),
-            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "peak_memory_mb": peak_memory_mb(),
             "snapshots": {name: getattr(checkpointer, name) for name in ("written", "failed", "resumed")},
             "guards": caught.counts(),
             "frames_left_out": {"unreadable": len(self.tracker.unreadable), **pipeline.refused},

@@ -58,7 +58,7 @@ def test_a_run_after_the_warm_up_compiles_nothing(plane_scene, tmp_path) -> None
         command = [sys.executable, "-m", *arguments]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
         assert done.returncode == 0, done.stderr
-        return {file.name for file in cache.iterdir() if file.suffix == engine().cache_suffix}, done.stdout
+        return {file.name for file in cache.rglob("*") if file.suffix == engine().cache_suffix}, done.stdout
 
     compiled, said = kernels_after("modp_ti.commands.warmup", str(scene))
     assert len(compiled) > 30
