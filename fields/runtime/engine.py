@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import taichi as ti
+    import taichi as ti  # noqa: TID251 (this is the one place)
 
 __all__ = [
     "Engine",

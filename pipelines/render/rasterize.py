@@ -22,6 +22,8 @@ __all__ = ["RasterizedView", "rasterize"]
 REAL = {torch.float32: ti.f32, torch.float64: ti.f64}
 # Size of the pool on a GPU, where it is allocated at once. On the CPU, memory follows the Gaussians in use.
 GPU_POOL = 1_500_000
+# Number of sets of fields that are kept, for other types, SH degrees and image sizes.
+MAX_KEPT = engine().max_rasterizers
 # Largest deviation of a pose's entries from a rigid motion. This tolerates rounding and drift, but no scale or shear.
 MAX_DRIFT = 1e-3
 
@@ -207,10 +209,10 @@ def _rasterizer(kind: torch.dtype, sh_count: int, camera: PinholeCamera) -> _Ras
     for found in _rasterizers:
         if found.fits(degree, kind, camera):
             return found
-    if len(_rasterizers) == engine().max_rasterizers:
+    if len(_rasterizers) == MAX_KEPT:
         raise RuntimeError(
-            f"rasterize keeps fields for {engine().max_rasterizers} types, SH degrees or doublings of the image size, "
-            "and this is another: begin with the largest image, or call modp_ti.initialise(), which frees all fields"
+            f"rasterize keeps fields for {MAX_KEPT} types, SH degrees or doublings of the image size, and this is "
+            "another: begin with the largest image, or call modp_ti.initialise(), which frees all fields"
         )
     width, height = max(64, 1 << (camera.width - 1).bit_length()), -(-camera.height // 256) * 256
     _rasterizers.append(_Rasterizer(degree, kind, width, height))
