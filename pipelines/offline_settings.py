@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, field_validator
 
 from fields.runtime.engine import engine
-from pipelines.settings import StrictModel, within_the_engine
+from pipelines.settings import StrictModel
 
 __all__ = ["OfflineSettings"]
 
@@ -69,4 +69,4 @@ class OfflineSettings(StrictModel):
     @field_validator("max_gaussians")
     @classmethod
     def _the_engine_holds_them(cls, count: int) -> int:
-        return within_the_engine(count, engine().max_gaussians_offline)
+        return engine().checked_pool(count, engine().max_gaussians_offline)

@@ -32,7 +32,6 @@ __all__ = [
     "StrictModel",
     "ViewSettings",
     "VoxelSettings",
-    "within_the_engine",
 ]
 
 
@@ -40,13 +39,6 @@ class StrictModel(BaseModel):
     """Immutable section of the configuration. Unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
-
-
-def within_the_engine(count: int, most: int) -> int:
-    """Return a pool's size. Raises ValueError if the engine holds only `most` Gaussians."""
-    if count > most:
-        raise ValueError(f"{engine().title} holds at most {most:,} Gaussians here; docs/platforms.md tells the limits")
-    return count
 
 
 class KeyframeSettings(StrictModel):
@@ -337,7 +329,7 @@ class MappingSettings(StrictModel):
     @field_validator("max_gaussians")
     @classmethod
     def _the_engine_holds_them(cls, count: int) -> int:
-        return within_the_engine(count, engine().max_gaussians)
+        return engine().checked_pool(count, engine().max_gaussians)
 
 
 class RefineSettings(StrictModel):

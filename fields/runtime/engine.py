@@ -98,6 +98,12 @@ class Engine:
         """Return the environment variable that sets an option of the engine, for example `offline_cache_file_path`."""
         return self.prefix + option.upper()
 
+    def checked_pool(self, count: int, most: int) -> int:
+        """Return the size of a pool of Gaussians. Raises ValueError if it exceeds `most`, a limit of the engine."""
+        if count > most:
+            raise ValueError(f"{self.title} holds at most {most:,} Gaussians here; docs/platforms.md tells the limits")
+        return count
+
     def place(self, index: int) -> Any:
         """Return the place of a kernel's argument as the engine's launch context takes it."""
         return (index,) if self.nested_arguments else index
