@@ -1,4 +1,4 @@
-"""A map beyond what Taichi holds. It needs 8 GB of memory and some minutes: MODP_ENGINE=quadrants pytest THIS_FILE."""
+"""A map beyond what Taichi holds. It needs 6.5 GB of memory and two minutes: MODP_ENGINE=quadrants pytest THIS_FILE."""
 
 from __future__ import annotations
 
