@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from fields.runtime.engine import engine
 from pipelines.settings import StrictModel
 
 __all__ = ["OfflineSettings"]
@@ -22,8 +23,8 @@ class OfflineSettings(StrictModel):
     max_gaussians: int = Field(
         default=1_000_000,
         ge=1024,
-        le=1_000_000,
-        description="size of the pool; beyond it only the largest gradients grow. Taichi's allocator sets the limit",
+        description="size of the pool; beyond it only the largest gradients grow. At most 1,000,000 with Taichi, "
+        "33,554,432 with Quadrants",
     )
     near: float = Field(default=0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     image_cache: float = Field(
@@ -64,3 +65,8 @@ class OfflineSettings(StrictModel):
         default=3000, ge=1, description="steps of 30,000 between resets of all opacities, but 1,500 steps at least"
     )
     reset_opacity: float = Field(default=0.01, gt=0, lt=1, description="largest opacity after a reset")
+
+    @field_validator("max_gaussians")
+    @classmethod
+    def _the_engine_holds_them(cls, count: int) -> int:
+        return engine().checked_pool(count, engine().max_gaussians_offline)

@@ -11,9 +11,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from fields.frames.pyramid import MAX_LEVELS
+from fields.runtime.engine import engine
 
 __all__ = [
     "CorrectionSettings",
@@ -290,8 +291,8 @@ class MappingSettings(StrictModel):
     max_gaussians: int = Field(
         default=1_500_000,
         ge=1024,
-        le=1_500_000,
-        description="size of the pool; further Gaussians are not added. Taichi's allocator sets the limit",
+        description="size of the pool; further Gaussians are not added. At most 1,500,000 with Taichi, "
+        "33,554,432 with Quadrants",
     )
     memory: float | None = Field(
         default=None,
@@ -326,6 +327,11 @@ class MappingSettings(StrictModel):
     corrections: CorrectionSettings = CorrectionSettings()
     exposure: ExposureSettings = ExposureSettings()
     optimise: OptimiseSettings = OptimiseSettings()
+
+    @field_validator("max_gaussians")
+    @classmethod
+    def _the_engine_holds_them(cls, count: int) -> int:
+        return engine().checked_pool(count, engine().max_gaussians)
 
 
 class RefineSettings(StrictModel):

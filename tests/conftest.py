@@ -1,4 +1,4 @@
-"""Shared fixtures and hooks: a fresh Taichi per test module, test marks, and data shared by modules and workers."""
+"""Shared fixtures and hooks: a fresh engine per test module, test marks, and data shared by modules and workers."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ import pytest
 from filelock import FileLock
 
 from fields.runtime.backend import initialise
+from fields.runtime.engine import engine
 
 if TYPE_CHECKING:
     from tests.room import Room, RoomRecording
 
 pytest_plugins = ["tests.spread"]
 
-# The tests use their own kernel cache: Taichi's default is limited to 100 MB, which the whole suite exceeds.
+# The tests use their own kernel cache: the default is limited to 100 MB, which the whole suite exceeds.
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modp-ti" / "test-kernels"
-os.environ.setdefault("TI_OFFLINE_CACHE_FILE_PATH", str(CACHE))
-os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(1 << 30))
+os.environ.setdefault(engine().variable("offline_cache_file_path"), str(CACHE))
+os.environ.setdefault(engine().variable("offline_cache_max_size_of_files"), str(1 << 30))
 
 # Two threads for each of two processes wait for one another. Other numbers of threads are the business of `--spread`.
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     share = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-    os.environ.setdefault("TI_CPU_MAX_NUM_THREADS", str(max(share, 1)))
+    os.environ.setdefault(engine().variable("cpu_max_num_threads"), str(max(share, 1)))
 
 HERE = Path(__file__).resolve().parent
 SHARED_DATA = HERE.parents[1] / "shared" / "data"

@@ -27,6 +27,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fields.runtime.engine import engine
+
 __all__ = ["disturbance", "disturbed"]
 
 # Required distance between a bound and the worst draw, in units of the spread.
@@ -67,7 +69,7 @@ def pytest_configure(config: pytest.Config) -> None:
     global _number, _report
     _number, _report = config.getoption("--spread"), config.getoption("--spread-report")
     if _number:
-        os.environ["TI_CPU_MAX_NUM_THREADS"] = str(1 + _number % 3)
+        os.environ[engine().variable("cpu_max_num_threads")] = str(1 + _number % 3)
         np.random.default_rng = _other_stream
     if _report:
         np.testing.assert_allclose = _recording_allclose

@@ -1,9 +1,9 @@
 """`DevicePairs`: the GPU's (tile, Gaussian) pairs, in tensors that grow between renders."""
 
-import taichi as ti
 import torch
 
 from fields.runtime.backend import torch_device
+from fields.runtime.engine import ti
 
 __all__ = ["NO_TILE", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "DevicePairs", "tile_count"]
 

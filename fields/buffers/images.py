@@ -2,13 +2,13 @@
 # pyright: reportInvalidTypeForm=false
 
 import numpy as np
-import taichi as ti
 import torch
 
 from fields.buffers.device_images import DeviceImages
 from fields.buffers.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 from fields.runtime.backend import on_gpu
 from fields.runtime.compiled_kernel import CompiledLoop
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
 __all__ = ["PAD", "SCRATCH_ROWS", "STRIPS", "ImageBuffers"]

@@ -1,8 +1,7 @@
 """`ProjectedGaussians`: the visible Gaussians of one view in image space."""
 
-import taichi as ti
-
 from fields.runtime.backend import growing
+from fields.runtime.engine import ti
 
 __all__ = ["ProjectedGaussians"]
 

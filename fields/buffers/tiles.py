@@ -2,7 +2,8 @@
 # pyright: reportInvalidTypeForm=false
 
 import numpy as np
-import taichi as ti
+
+from fields.runtime.engine import ti
 
 __all__ = ["GROUP", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
 

@@ -2,12 +2,12 @@
 # pyright: reportInvalidTypeForm=false
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike
 
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import without_waiting
 from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.engine import ti
 
 __all__ = ["ViewField"]
 

@@ -4,7 +4,7 @@ Taichi's own `@` and `dot` accumulate into a mutable local variable. Reverse-mod
 such a variable on a stack, which made the gradient of the projection three times slower.
 """
 
-import taichi as ti
+from fields.runtime.engine import ti
 
 __all__ = ["cross", "dot", "rotate", "rotate_back", "rotation_from_quaternion"]
 

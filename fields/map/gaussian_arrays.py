@@ -1,7 +1,7 @@
 """Kernels that copy the values of Gaussians between Taichi fields and arrays."""
 # pyright: reportInvalidTypeForm=false
 
-import taichi as ti
+from fields.runtime.engine import ti
 
 __all__ = ["read_integers", "read_values", "write_integers", "write_values"]
 

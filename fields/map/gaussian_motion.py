@@ -2,12 +2,12 @@
 # pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportOptionalSubscript=false
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import quaternion_from_matrix
 from fields.geometry.similarity import scale_of
 from fields.map.gaussians import GaussianField
+from fields.runtime.engine import ti
 
 __all__ = ["GaussianMotion"]
 

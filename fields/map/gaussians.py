@@ -4,12 +4,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-import taichi as ti
 import torch
 from numpy.typing import NDArray
 
 from fields.map.gaussian_arrays import read_integers, read_values, write_integers, write_values
 from fields.runtime.backend import growing, refuse_too_many_fields
+from fields.runtime.engine import ti
 
 __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
 

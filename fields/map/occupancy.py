@@ -2,10 +2,10 @@
 # pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportOptionalCall=false
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from fields.runtime.backend import on_gpu, program, refuse_too_many_fields
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
 __all__ = ["OccupancyVoxels"]

@@ -1,1 +1,1 @@
-"""The Taichi runtime: start, compilation, launches and readback. All use of Taichi's private API is in this package."""
+"""The engine: start, compilation, launches and readback. All use of its private API is in this package."""

@@ -1,17 +1,15 @@
-"""Start of Taichi and choice of the compute device, which determines the storage layout and the kernels."""
+"""Start of the engine and choice of the compute device, which determines the storage layout and the kernels."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import io
-import os
 
 import numpy as np
-import taichi as ti
 import torch
-from taichi.lang import impl
 
+from fields.runtime.engine import configuration, engine, running_program, ti
 from fields.runtime.kernel_sources import answer_quickly
 from fields.runtime.workers import pin_workers, threads_of_process
 
@@ -28,25 +26,24 @@ __all__ = [
 
 answer_quickly()  # at import, since most of the time that it saves goes into the definitions of kernels
 
-# Size of the arrays in Taichi's runtime, which does not check their bounds.
-MAX_SNODES = 1024
-# Taichi's own memory pool on a CUDA device, for the nodes of sparse fields [GB]. Only the voxels use it; dense fields
-# and PyTorch use the remaining memory.
+MAX_SNODES = engine().max_snodes
+# The engine's own memory pool on a CUDA device, for the nodes of sparse fields [GB]. Only the voxels use it; dense
+# fields and PyTorch use the remaining memory.
 SPARSE_POOL = 1.0
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
-    """Start Taichi on a device.
+    """Start the engine on a device.
 
-    Kernels are stored in Taichi's offline cache, so that only the first process on a machine compiles them. PyTorch is
-    limited to one thread: its problems here are small, and its waiting threads take the cores from Taichi's (a depth
-    estimate took 1.9 s instead of 0.05 s).
+    Kernels are stored in the engine's offline cache, so that only the first process on a machine compiles them. PyTorch
+    is limited to one thread: its problems here are small, and its waiting threads take the cores from the engine's (a
+    depth estimate took 1.9 s instead of 0.05 s).
 
     Args:
         device: "cpu", "cuda", or "auto" for CUDA if it is available and the CPU otherwise. "vulkan" is for the tests,
             which run the GPU kernels on a software driver; it has no sparse fields and hence no voxels.
         threads: Number of CPU threads; None for all.
-        seed: Seed of Taichi's random numbers.
+        seed: Seed of the engine's random numbers.
 
     Returns:
         Name of the backend in use, which is "cpu", "cuda" or "vulkan".
@@ -63,7 +60,7 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
         options["cpu_max_num_threads"] = threads
     if device in ("cuda", "auto") and _has_cuda_driver() and torch.cuda.is_available():
         _start(ti.cuda, options | {"device_memory_GB": SPARSE_POOL})
-        if impl.current_cfg().arch == ti.cuda:
+        if configuration().arch == ti.cuda:
             return "cuda"
     if device == "cuda":
         # PyTorch sorts on the device, in the same memory: a build without CUDA cannot.
@@ -71,17 +68,17 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
         raise RuntimeError(f"device: cuda was asked for, but {missing}; use device: cpu or auto")
     if device == "vulkan":
         _start(ti.vulkan, options)
-        if impl.current_cfg().arch == ti.vulkan:
+        if configuration().arch == ti.vulkan:
             return "vulkan"
         raise RuntimeError("no Vulkan driver starts here")
     before = threads_of_process()
     _start(ti.cpu, options)
-    pin_workers(before, impl.current_cfg().cpu_max_num_threads)
+    pin_workers(before, configuration().cpu_max_num_threads)
     return "cpu"
 
 
 def _has_cuda_driver() -> bool:
-    # Load the driver directly, since Taichi prints a warning if there is none.
+    # Load the driver directly, since the engine prints a warning if there is none.
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -90,8 +87,6 @@ def _has_cuda_driver() -> bool:
 
 
 def _start(arch: object, options: dict) -> None:
-    # `ti.init` asks a server for Taichi's latest version, once a day, and at every start where there is no network.
-    os.environ["TI_SKIP_VERSION_CHECK"] = "ON"
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=arch, **options)
 
@@ -110,34 +105,36 @@ def describe(backend: str) -> str:
 
 
 def program() -> object:
-    """Return the Taichi program that owns all current fields.
+    """Return the engine's program that owns all current fields.
 
     `initialise` replaces the program and invalidates all fields created before.
 
     Raises:
         RuntimeError: If `initialise` has not been called.
     """
-    running = impl.get_runtime().prog
+    running = running_program()
     if running is None:
-        raise RuntimeError('Taichi does not run yet: call modp_ti.initialise("cpu") (or "cuda", "auto") first')
+        raise RuntimeError(
+            f'{engine().title} does not run yet: call modp_ti.initialise("cpu") (or "cuda", "auto") first'
+        )
     return running
 
 
 def on_gpu() -> bool:
     """Whether dense storage and the kernels of `render/gpu` are in use: on CUDA and Vulkan."""
-    return impl.current_cfg().arch in (ti.cuda, ti.vulkan)
+    return configuration().arch in (ti.cuda, ti.vulkan)
 
 
 def torch_device() -> torch.device:
     """Device on which kernels can read and write tensors without a copy."""
-    return torch.device("cuda" if impl.current_cfg().arch == ti.cuda else "cpu")
+    return torch.device("cuda" if configuration().arch == ti.cuda else "cpu")
 
 
 def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
     """Prepare a small array as a read-only kernel argument, so that the launch does not wait for the device.
 
-    On CUDA, Taichi copies NumPy arrays to the device and back and waits for both. Passing the values as scalars takes
-    eight microseconds each.
+    On CUDA, the engine copies NumPy arrays to the device and back and waits for both. Passing the values as scalars
+    takes eight microseconds each.
 
     Args:
         array: The array.
@@ -145,7 +142,7 @@ def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
     Returns:
         A tensor on a CUDA device; otherwise the array itself.
     """
-    if impl.current_cfg().arch != ti.cuda:
+    if configuration().arch != ti.cuda:
         return array
     return torch.from_numpy(array).pin_memory().to("cuda", non_blocking=True)
 
@@ -160,16 +157,16 @@ def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:
 
 
 def refuse_too_many_fields(last_placed: ti.ScalarField | ti.MatrixField) -> None:
-    """Check that the fields placed so far fit into Taichi's runtime.
+    """Check that the fields placed so far fit into the engine's runtime.
 
     Args:
         last_placed: The scalar field that was placed last.
 
     Raises:
-        RuntimeError: If there are more SNodes than a Taichi process supports.
+        RuntimeError: If there are more SNodes than the engine supports in a process.
     """
-    if last_placed.snode.ptr.id >= MAX_SNODES:
+    if MAX_SNODES is not None and last_placed.snode.ptr.id >= MAX_SNODES:
         raise RuntimeError(
-            "more maps and renderers than one Taichi process holds; call initialise() before making another, "
-            "which frees those made so far"
+            f"more maps and renderers than one {engine().title} process holds; call initialise() before making "
+            "another, which frees those made so far"
         )

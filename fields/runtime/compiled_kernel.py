@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from taichi.lang import impl
 
 from fields.runtime.backend import on_gpu
+from fields.runtime.engine import compiled_kernel, engine, owner_of_kernel, running_program
 
 __all__ = ["CompiledKernel", "CompiledLoop"]
 
@@ -18,7 +18,7 @@ ALONE_BELOW = 300_000.0
 
 
 class CompiledKernel:
-    """A kernel of a data-oriented object, launched without Taichi's argument checks.
+    """A kernel of a data-oriented object, launched without the engine's argument checks.
 
     A launch in Taichi 1.7.4 takes about 50 microseconds of Python, and a step has twenty launches per view. That is
     more than many of these kernels take on a GPU. The first call compiles the kernel and fixes the types of its
@@ -37,7 +37,8 @@ class CompiledKernel:
         self._first = kernel.grad if reverse else kernel
         self._kernel = kernel._adjoint if reverse else kernel._primal
         self._constants = constants
-        self._owner = kernel._kernel_owner
+        self._owner = owner_of_kernel(kernel)
+        self._places: list[Any] = []
         self._program: Any = None
         self._make_context: Any = None
         self._compiled: Any = None
@@ -48,34 +49,30 @@ class CompiledKernel:
             self.compile(*arguments)
             return
         context = self._make_context()
-        place: int
         value: Any  # not narrowed by `kind`, whose comparison is faster than isinstance
-        for place, value in enumerate(arguments):
+        for place, value in zip(self._places, arguments, strict=True):
             kind = value.__class__
             if kind is int:
-                context.set_arg_int((place,), value)
+                context.set_arg_int(place, value)
             elif kind is float:
-                context.set_arg_float((place,), value)
+                context.set_arg_float(place, value)
             elif kind is torch.Tensor:
-                context.set_arg_external_array_with_shape((place,), value.data_ptr(), value.nbytes, value.shape, 0)
+                context.set_arg_external_array_with_shape(place, value.data_ptr(), value.nbytes, value.shape, 0)
             elif kind is np.ndarray:
                 address = value.__array_interface__["data"][0]
-                context.set_arg_external_array_with_shape((place,), address, value.nbytes, value.shape, 0)
+                context.set_arg_external_array_with_shape(place, address, value.nbytes, value.shape, 0)
             else:
                 raise TypeError(
-                    f"argument {place} of a kernel is a {kind.__name__}, which CompiledKernel does not hand over"
+                    f"argument {self._places.index(place)} of a kernel is a {kind.__name__}, "
+                    "which CompiledKernel does not hand over"
                 )
         self._program.launch_kernel(self._compiled, context)
 
     def compile(self, *arguments: int | float | np.ndarray | torch.Tensor) -> None:
         """Compile the kernel for arguments of these types, without launching it."""
-        program: Any = impl.get_runtime().prog
-        compiled = self._kernel.compiled_kernels[
-            self._kernel.ensure_compiled(self._owner, *self._constants, *arguments)
-        ]
-        self._program = program
-        self._make_context = compiled.make_launch_context
-        self._compiled = program.compile_kernel(program.config(), program.get_device_caps(), compiled)
+        self._places = [engine().place(index) for index in range(len(arguments))]
+        self._program = running_program()
+        self._make_context, self._compiled = compiled_kernel(self._kernel, (self._owner, *self._constants, *arguments))
 
 
 class CompiledLoop:

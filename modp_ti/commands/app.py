@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from fields.runtime.engine import EngineError, engine
 from modp_ti.commands import cameras, check, export, render, run, view, warmup
 from modp_ti.commands.shared import examples
 from modp_ti.version import __version__
@@ -35,7 +36,11 @@ app = typer.Typer(
 
 def _print_version(asked: bool) -> None:
     if asked:
-        typer.echo(f"modp-ti {__version__}")
+        try:
+            compiler = str(engine())
+        except EngineError as error:
+            compiler = str(error)
+        typer.echo(f"modp-ti {__version__} ({compiler})")
         raise typer.Exit
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fields.runtime.engine import EngineError
 from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
@@ -101,14 +102,14 @@ class Outcome:
 def outcome(as_json: bool) -> Iterator[Outcome]:
     """Run a command's body, which fills in the outcome; print it and exit with the codes of docs/commands.md.
 
-    An InputError is printed in one line, any other exception with its traceback. With `as_json`, the outcome is printed
-    as one JSON object, and everything else goes to standard error.
+    An InputError or EngineError is printed in one line, any other exception with its traceback. With `as_json`, the
+    outcome is printed as one JSON object, and everything else goes to standard error.
     """
     result = Outcome()
     try:
         with _to_standard_error() if as_json else nullcontext():
             yield result
-    except InputError as error:
+    except (InputError, EngineError) as error:
         _end(BAD_INPUT, one_line(error), as_json)
     except KeyboardInterrupt as stop:
         _end(INTERRUPTED, str(stop) or "interrupted", as_json)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframes import KeyframeStore
+from fields.runtime.engine import engine
 from modp_ti.config.scene_file import dump_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text, write_picture
@@ -144,7 +145,7 @@ class Results:
 def metrics_of(
     scores: list[FrameScore], versions: dict[str, MapVersion], frames: DeliveredFrames, seconds: dict[str, float]
 ) -> dict:
-    """Return the entries of `metrics.json` about the maps, the reprojection errors and the time.
+    """Return the entries of `metrics.json` about the engine, the maps, the reprojection errors and the time.
 
     Args:
         scores: Scores of all frames in all versions.
@@ -160,6 +161,7 @@ def metrics_of(
     taken = {stage: seconds.get(stage, 0.0) for stage in STAGES}
     taken = {"total": seconds["total"], **taken, "other": seconds["total"] - sum(taken.values())}
     return {
+        "engine": str(engine()),
         "frames": len(frames),
         "corrections": frames.corrections,
         **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},

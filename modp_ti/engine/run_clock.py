@@ -1,10 +1,11 @@
-"""`RunClock`: the time that a run has taken, summed over all processes of a resumed run."""
+"""`RunClock`: the time that a run has taken, summed over all processes of a resumed run; and its peak memory."""
 
 from __future__ import annotations
 
+import sys
 import time
 
-__all__ = ["RunClock"]
+__all__ = ["RunClock", "peak_memory_mb"]
 
 
 class RunClock:
@@ -39,3 +40,13 @@ class RunClock:
             waited: Time for which a person paused the mapping [s]. It is subtracted.
         """
         self._mapped, self._mapping_since = self.mapping - waited, None
+
+
+def peak_memory_mb() -> float | None:
+    """Return the peak memory of this process so far [MB]; None on Windows."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux kibibytes
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / (1 << 20), 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,7 +23,7 @@ from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.results import Results, metrics_of
-from modp_ti.engine.run_clock import RunClock
+from modp_ti.engine.run_clock import RunClock, peak_memory_mb
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
@@ -338,7 +337,7 @@ class _Session:
             "backend": self.backend,
             "seed": self.config.seed,
             "frames_per_second": round(len(frames) / self.clock.mapping, 4),
-            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "peak_memory_mb": peak_memory_mb(),
             "snapshots": {name: getattr(checkpointer, name) for name in ("written", "failed", "resumed")},
             "guards": caught.counts(),
             "frames_left_out": {"unreadable": len(self.tracker.unreadable), **pipeline.refused},

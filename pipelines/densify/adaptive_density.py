@@ -4,12 +4,12 @@
 from typing import NamedTuple
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.view import ViewField
 from fields.map.gaussians import GaussianField
+from fields.runtime.engine import ti
 from pipelines.offline_settings import OfflineSettings
 
 __all__ = ["Adaptation", "AdaptiveDensity", "GradientStatistics"]

@@ -3,13 +3,13 @@
 
 from collections.abc import Iterable
 
-import taichi as ti
 import torch
 from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe
 from fields.runtime.backend import torch_device
+from fields.runtime.engine import ti
 from pipelines.render.renderer import Renderer
 
 __all__ = ["Contribution"]

@@ -4,10 +4,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
 from fields.map.gaussians import GaussianField
 from fields.runtime.compiled_kernel import CompiledLoop
+from fields.runtime.engine import ti
 
 __all__ = ["Adam", "LearningRates"]
 

@@ -12,12 +12,12 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.buffers.images import PAD, SCRATCH_ROWS, STRIPS, ImageBuffers
 from fields.map.gaussians import GaussianField
 from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
 __all__ = ["AspectPenalty", "LossValues", "PhotometricLoss", "window_weights"]

@@ -5,10 +5,9 @@ The tests compare the two implementations, and `scripts/benchmark` prints the ra
 """
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
-import taichi as ti
-
 from fields.buffers.images import PAD
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
+from fields.runtime.engine import ti
 from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE, Compositing
 from pipelines.render.cpu.projection import ALPHA_MIN
 

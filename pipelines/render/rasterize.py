@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import taichi as ti
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -15,16 +14,16 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import hat, orthonormalised
 from fields.map.gaussians import SH_C0, GaussianField
 from fields.runtime.backend import on_gpu, program, torch_device
+from fields.runtime.engine import engine, ti
 from pipelines.render.renderer import Renderer
 
 __all__ = ["RasterizedView", "rasterize"]
 
 REAL = {torch.float32: ti.f32, torch.float64: ti.f64}
-# Limit of Taichi's allocator (docs/method.md). On the CPU, memory follows the Gaussians in use.
-MAX_GAUSSIANS = 1_500_000
-# Number of sets of fields that Taichi 1.7.4 holds without writing beyond its memory. A third set crashed the process on
-# the CPU.
-MAX_KEPT = 2
+# Size of the pool on a GPU, where it is allocated at once. On the CPU, memory follows the Gaussians in use.
+GPU_POOL = 1_500_000
+# Number of sets of fields that are kept, for other types, SH degrees and image sizes.
+MAX_KEPT = engine().max_rasterizers
 # Largest deviation of a pose's entries from a rigid motion. This tolerates rounding and drift, but no scale or shear.
 MAX_DRIFT = 1e-3
 
@@ -178,13 +177,13 @@ class _Rasterizer:
     """The fields for one type, SH degree and maximum image size.
 
     Attributes:
-        owner: Taichi program that owns the fields.
+        owner: The engine's program that owns the fields.
         drawn: Number of images rendered so far. Only the last one is stored.
     """
 
     def __init__(self, degree: int, kind: torch.dtype, width: int, height: int) -> None:
         self.owner = program()
-        self.gaussians = GaussianField(degree, MAX_GAUSSIANS, REAL[kind])
+        self.gaussians = GaussianField(degree, GPU_POOL if on_gpu() else engine().max_gaussians, REAL[kind])
         self.renderer = Renderer(self.gaussians, width, height)
         self.kind, self.width, self.height = kind, width, height
         self.drawn = 0

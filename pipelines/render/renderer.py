@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import taichi as ti
 
 from fields.buffers.device_pairs import DevicePairs
 from fields.buffers.images import ImageBuffers
@@ -16,6 +15,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import on_gpu, refuse_too_many_fields
+from fields.runtime.engine import ti
 from pipelines.render.cpu.binning import CHUNKS, Binning
 from pipelines.render.cpu.compositing import Compositing
 from pipelines.render.cpu.photometric_model import PhotometricModel

@@ -4,10 +4,10 @@
 from functools import lru_cache
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.map.gaussians import SH_C0
+from fields.runtime.engine import ti
 
 __all__ = ["evaluate_sh", "sh_basis", "sh_rotation"]
 

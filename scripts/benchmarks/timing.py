@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import taichi as ti
+
+from fields.runtime.engine import ti
 
 __all__ = ["milliseconds", "peak_memory_mb", "seconds", "stage_milliseconds"]
 

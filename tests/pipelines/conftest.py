@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-import taichi as ti
 
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
+from fields.runtime.engine import ti
 from pipelines.render.renderer import Renderer
 
 MAX_SIDE = 64

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import taichi as ti
 
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
+from fields.runtime.engine import ti
 from pipelines.online import OnlineMapper
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.settings import MappingSettings

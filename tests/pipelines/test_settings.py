@@ -3,7 +3,9 @@ from __future__ import annotations
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from fields.runtime.engine import engine
 from pipelines import settings
+from pipelines.offline_settings import OfflineSettings
 from pipelines.settings import DensifySettings, MappingSettings, RefineSettings, StrictModel
 
 SECTIONS = [getattr(settings, name) for name in settings.__all__ if name != "StrictModel"]
@@ -39,3 +41,13 @@ def test_values_out_of_bounds_are_errors(section: type[BaseModel], key: str, val
 def test_settings_do_not_change_under_way() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         MappingSettings().near = 1.0
+
+
+@pytest.mark.parametrize(
+    ("section", "most"),
+    [(MappingSettings, engine().max_gaussians), (OfflineSettings, engine().max_gaussians_offline)],
+)
+def test_a_pool_beyond_what_the_engine_holds_is_refused(section: type[StrictModel], most: int) -> None:
+    assert section(max_gaussians=most).max_gaussians == most
+    with pytest.raises(ValueError, match=f"{engine().title} holds at most {most:,} Gaussians"):
+        section(max_gaussians=most + 1)

@@ -4,10 +4,10 @@
 from dataclasses import asdict, replace
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.map.gaussians import SH_C0
+from fields.runtime.engine import ti
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine

@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from fields.runtime.engine import engine
 from fields.runtime.parallel import available_cores
 from modp_ti.config.keys import as_yaml, documented_values
 from modp_ti.config.settings import SceneConfig
@@ -27,7 +28,7 @@ __all__ = [
     "without_credentials",
 ]
 
-PACKAGES = {"Taichi": "taichi", "PyTorch": "torch", "NumPy": "numpy", "OpenCV": "opencv-python-headless"}
+PACKAGES = {"PyTorch": "torch", "NumPy": "numpy", "OpenCV": "opencv-python-headless"}
 STAGES = {
     "compile": "compiling kernels",
     "read": "waiting for frames to be read",
@@ -78,7 +79,7 @@ def machine(device: str) -> dict[str, str]:
     Args:
         device: Description of the backend that the run used.
     """
-    packages = []
+    packages = [str(engine())]
     for name, package in PACKAGES.items():
         try:
             packages.append(f"{name} {version(package)}")

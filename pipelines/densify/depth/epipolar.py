@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
 from fields.map.keyframes import Keyframe
 from fields.runtime.backend import on_gpu
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
 from pipelines.densify.depth.plane_sweep import plane_warp, sub_sample_peak

@@ -6,12 +6,12 @@ slots in them are processed in depth order, and independent of the number of thr
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
 import numpy as np
-import taichi as ti
 
 from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH, TilePairs
 from fields.buffers.view import ViewField
 from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.cpu.projection import ALPHA_MIN
 

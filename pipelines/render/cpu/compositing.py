@@ -10,13 +10,12 @@ are visited.
 """
 # pyright: reportArgumentType=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
-import taichi as ti
-
 from fields.buffers.images import PAD, ImageBuffers
 from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.tiles import GROUP, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TilePairs
 from fields.buffers.view import ViewField
 from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.cpu.fast_exp2 import LOG2E, fast_exp2
 from pipelines.render.cpu.projection import ALPHA_MIN

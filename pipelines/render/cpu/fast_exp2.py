@@ -1,7 +1,7 @@
 """A power of two that LLVM can vectorise. A call to libm would make every compositing loop scalar."""
 # pyright: reportInvalidTypeForm=false
 
-import taichi as ti
+from fields.runtime.engine import ti
 
 __all__ = ["LOG2E", "fast_exp2"]
 

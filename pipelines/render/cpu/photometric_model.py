@@ -8,12 +8,12 @@ gradient g of the loss with respect to the image and h = vignette * g, the gradi
 
 import cv2
 import numpy as np
-import taichi as ti
 import torch
 
 from fields.buffers.images import PAD, ImageBuffers
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import refuse_too_many_fields
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
 __all__ = ["IDENTITY", "PhotometricModel"]

@@ -6,7 +6,6 @@ the camera tangent, come from Taichi's automatic differentiation.
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import numpy as np
-import taichi as ti
 import torch
 
 from fields.buffers.projected import ProjectedGaussians
@@ -15,6 +14,7 @@ from fields.geometry.vec3 import cross, dot, rotate, rotate_back, rotation_from_
 from fields.map.gaussians import SH_C0, GaussianField
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.compiled_kernel import CompiledLoop
+from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.spherical_harmonics import evaluate_sh
 

@@ -3,7 +3,6 @@
 
 from collections import deque
 
-import taichi as ti
 import torch
 
 from fields.buffers.device_pairs import NO_TILE, TILE_HEIGHT, TILE_WIDTH, DevicePairs
@@ -12,6 +11,7 @@ from fields.buffers.view import ViewField
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.engine import ti
 from pipelines.render.cpu.binning import Binning
 
 __all__ = ["DeviceBinning"]

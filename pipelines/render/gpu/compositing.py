@@ -6,7 +6,6 @@ backward pass also goes front to back, in the phases of `compositing_gradient.py
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
 
-import taichi as ti
 import torch
 
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, DevicePairs
@@ -14,6 +13,7 @@ from fields.buffers.images import PAD, ImageBuffers
 from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.view import ViewField
 from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.engine import ti
 from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
 from pipelines.render.cpu.projection import ALPHA_MIN
 from pipelines.render.gpu.compositing_gradient import (

@@ -10,9 +10,8 @@ reduction over the warps, and the order of the sums is fixed.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
 
-import taichi as ti
-
 from fields.buffers.device_pairs import TILE_PIXELS, TILE_WIDTH
+from fields.runtime.engine import ti
 from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
 from pipelines.render.cpu.projection import ALPHA_MIN
 

@@ -2,7 +2,6 @@
 # pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import numpy as np
-import taichi as ti
 import torch
 
 from fields.buffers.projected import ProjectedGaussians
@@ -11,6 +10,7 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.engine import ti
 from pipelines.render.cpu.projection import Projection
 from pipelines.render.gpu.reductions import THREADS, sum_over_block
 

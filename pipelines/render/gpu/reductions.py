@@ -5,10 +5,10 @@ arrays of the same name in a kernel are merged, with the size of either.
 """
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
-import taichi as ti
 import torch
 
 from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.engine import ti
 
 __all__ = ["THREADS", "THREAD_BITS", "BlockSums", "max_over_block", "sum_over_block"]
 

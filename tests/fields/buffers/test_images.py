@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import taichi as ti
 
 from fields.buffers.images import PAD, ImageBuffers
+from fields.runtime.engine import ti
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,8 @@
 import numpy as np
-import taichi as ti
 from numpy.testing import assert_allclose
 
 from fields.geometry.vec3 import cross, dot, rotate, rotate_back
+from fields.runtime.engine import ti
 
 
 def test_products_are_those_of_numpy() -> None:

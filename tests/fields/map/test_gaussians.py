@@ -145,7 +145,9 @@ def test_a_refused_state_leaves_the_content(gaussians: GaussianField) -> None:
     assert_equal(gaussians.to_numpy(), before)
 
 
-def test_fields_beyond_what_taichi_holds_are_refused(gaussians: GaussianField, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_fields_than_the_engine_holds_are_refused(
+    gaussians: GaussianField, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("fields.runtime.backend.MAX_SNODES", gaussians.touched.snode.ptr.id + 1)
     with pytest.raises(RuntimeError, match="call initialise\\(\\) before making another"):
         GaussianField(0, max_gaussians=1024)

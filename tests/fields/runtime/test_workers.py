@@ -1,4 +1,4 @@
-"""Workers of Taichi's CPU backend stay on processors of their own."""
+"""Workers of the engine's CPU backend stay on processors of their own."""
 
 import json
 import os
@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from fields.runtime.engine import engine
 
 pytestmark = [
     pytest.mark.slow,
@@ -20,7 +22,7 @@ from fields.runtime.workers import threads_of_process
 before = threads_of_process()
 from fields.runtime.backend import initialise
 initialise("cpu", int(sys.argv[1]) or None)
-import taichi as ti
+from fields.runtime.engine import ti
 
 x = ti.field(ti.f32, 1 << 20)
 
@@ -49,7 +51,7 @@ def affinities(folder: Path, threads: int, workers: int) -> tuple[list[list[int]
     program.write_text(PROGRAM)
     command = [sys.executable, program, str(threads), str(workers)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    environment.pop("TI_CPU_MAX_NUM_THREADS", None)  # which `--spread` sets
+    environment.pop(engine().variable("cpu_max_num_threads"), None)  # which `--spread` sets
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     placed, first = done.stdout.splitlines()[-2:]
     return json.loads(placed), json.loads(first)

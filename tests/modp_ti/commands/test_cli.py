@@ -17,6 +17,7 @@ import typer
 from typer.testing import CliRunner
 
 import modp_ti
+from fields.runtime.engine import engine
 from modp_ti.commands import app as cli
 from modp_ti.commands import run as run_module
 from modp_ti.commands import shared as command_line
@@ -165,7 +166,7 @@ def python(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, check=True)
 
 
-HEAVY = "('taichi', 'torch', 'open3d', 'cv2', 'pycolmap')"
+HEAVY = "('taichi', 'quadrants', 'torch', 'open3d', 'cv2', 'pycolmap')"
 
 
 def test_help_imports_nothing_heavy():
@@ -187,7 +188,7 @@ def test_readers_need_no_compiler_and_no_torch(scene):
         "from modp_ti.inputs.trackers import open_tracker; "
         f"print(len(list(open_tracker(load_scene({str(scene)!r}))))); "
         "import modp_ti.inputs.trackers.transforms, modp_ti.outputs.formats.trajectory; "
-        "print([name for name in ('taichi', 'torch', 'open3d') if name in sys.modules])"
+        "print([name for name in ('taichi', 'quadrants', 'torch', 'open3d') if name in sys.modules])"
     )
     assert python(code).stdout.split("\n")[:2] == ["7", "[]"]
 
@@ -316,7 +317,10 @@ def test_the_page_of_commands_names_every_command_option_and_exit_code():
 
 def test_version():
     result = CliRunner().invoke(cli.app, ["--version"])
-    assert (result.exit_code, result.stdout) == (0, f"modp-ti {modp_ti.__version__}\n")
+    assert (result.exit_code, result.stdout) == (
+        0,
+        f"modp-ti {modp_ti.__version__} ({engine()})\n",
+    )
 
 
 def completed(line: str) -> tuple[list[str], str]:
@@ -339,7 +343,7 @@ def completed(line: str) -> tuple[list[str], str]:
     return done.stdout.split(), done.stderr.strip()
 
 
-HEAVY_TO_COMPLETE = "('taichi', 'torch', 'open3d', 'pycolmap', 'matplotlib')"
+HEAVY_TO_COMPLETE = "('taichi', 'quadrants', 'torch', 'open3d', 'pycolmap', 'matplotlib')"
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from fields.runtime.engine import engine
 from modp_ti.commands import app as cli
 from tests.patience import PATIENCE
 
@@ -48,13 +49,16 @@ def test_a_run_after_the_warm_up_compiles_nothing(plane_scene, tmp_path) -> None
     scene = plane_scene.folder.parent / "scene.yaml"
     scene.write_text(SCENE)
     cache = tmp_path / "cache"
-    environment = os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(cache), "TORCH_HOME": str(tmp_path / "no-torch")}
+    environment = os.environ | {
+        engine().variable("offline_cache_file_path"): str(cache),
+        "TORCH_HOME": str(tmp_path / "no-torch"),
+    }
 
     def kernels_after(*arguments: str) -> tuple[set[str], str]:
         command = [sys.executable, "-m", *arguments]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
         assert done.returncode == 0, done.stderr
-        return {file.name for file in cache.iterdir() if file.suffix == ".tic"}, done.stdout
+        return {file.name for file in cache.rglob("*") if file.suffix == engine().cache_suffix}, done.stdout
 
     compiled, said = kernels_after("modp_ti.commands.warmup", str(scene))
     assert len(compiled) > 30

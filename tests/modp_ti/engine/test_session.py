@@ -17,6 +17,7 @@ from rich.console import Console
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from fields.runtime.engine import engine
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine import session
 from modp_ti.files.errors import InputError
@@ -56,6 +57,7 @@ def test_the_metrics_say_what_happened(finished: Path) -> None:
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["frames"] == 9
     assert metrics["backend"] == "cpu"
+    assert metrics["engine"] == str(engine())
     assert metrics["seed"] == 3
     assert 1 <= metrics["keyframes"] <= 6
     assert (

@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, matrix_from_quaternion
 from fields.map.gaussians import GaussianField
+from fields.runtime.engine import ti
 from pipelines.densify.adaptive_density import AdaptiveDensity, GradientStatistics
 from pipelines.offline_settings import OfflineSettings
 from pipelines.render.renderer import Renderer

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 import torch
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from fields.buffers.device_pairs import TILE_HEIGHT, TILE_WIDTH, tile_count
 from fields.buffers.tiles import TilePairs
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
+from fields.runtime.engine import ti
 from pipelines.render.cpu.binning import Binning
 from pipelines.render.cpu.compositing import OPAQUE
 from pipelines.render.gpu.binning import MEMORY

@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
 from fields.map.gaussians import GaussianField
+from fields.runtime.engine import ti
 from pipelines.optimise.losses import AspectPenalty, PhotometricLoss, window_weights
 from pipelines.render.renderer import Renderer
 

@@ -4,12 +4,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.se3 import exp_se3
 from fields.map.keyframes import KeyframeStore
+from fields.runtime.engine import ti
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.render.renderer import Renderer
 from pipelines.settings import MappingSettings

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
@@ -12,6 +11,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.pixel_metric import pixel_metric
 from fields.geometry.se3 import exp_se3, inverse_se3, log_se3
 from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.runtime.engine import ti
 from pipelines.optimise.losses import PhotometricLoss
 from pipelines.optimise.pose_refinement import PoseRefinement, reprojection
 from pipelines.render.renderer import Renderer

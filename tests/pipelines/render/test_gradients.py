@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3
+from fields.runtime.engine import ti
 from pipelines.render.compositing_reference import ReferenceCompositing
 from pipelines.render.renderer import Renderer
 from tests.pipelines.differences import STEP, central_differences

@@ -156,7 +156,10 @@ def test_what_does_not_fit_is_told_in_one_line(
 
 
 @pytest.mark.slow
-def test_a_third_set_of_fields_is_refused_with_the_way_out(anew: None, scene: dict[str, Tensor]) -> None:
+def test_more_sets_of_fields_than_are_kept_are_refused_with_the_way_out(
+    anew: None, scene: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.render.rasterize.MAX_KEPT", 2)
     view(scene)
     view(scene, camera=LARGE)
     with pytest.raises(RuntimeError, match=r"begin with the largest image, or call modp_ti\.initialise"):
@@ -164,7 +167,7 @@ def test_a_third_set_of_fields_is_refused_with_the_way_out(anew: None, scene: di
 
 
 @pytest.mark.slow
-def test_a_gradient_outlives_a_new_start_of_taichi(anew: None, scene: dict[str, Tensor]) -> None:
+def test_a_gradient_outlives_a_new_start_of_the_engine(anew: None, scene: dict[str, Tensor]) -> None:
     expected = gradients_of(view(scene), scene)
     picture = view(scene)
     initialise("cpu", threads=1)

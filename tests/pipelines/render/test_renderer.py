@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
 from fields.geometry.camera import PinholeCamera
+from fields.runtime.engine import ti
 from pipelines.render.renderer import RenderedView, Renderer
 from tests.pipelines import reference
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians

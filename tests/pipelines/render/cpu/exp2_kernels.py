@@ -1,8 +1,8 @@
 """Powers of two over an array (kernels need annotations that are no strings)."""
 
 import numpy as np
-import taichi as ti
 
+from fields.runtime.engine import ti
 from pipelines.render.cpu.fast_exp2 import fast_exp2
 
 

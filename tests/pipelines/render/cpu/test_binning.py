@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
+from fields.runtime.engine import ti
 from pipelines.render.cpu.projection import ALPHA_MIN
 from pipelines.render.renderer import Renderer
 from tests.pipelines import reference

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import taichi as ti
 
+from fields.runtime.engine import ti
 from tests.pipelines.render.cpu.exp2_kernels import powers
 
 

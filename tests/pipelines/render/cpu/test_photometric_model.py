@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from fields.runtime.engine import ti
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
 from tests.pipelines.differences import STEP, central_differences
