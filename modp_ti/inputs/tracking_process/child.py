@@ -65,7 +65,7 @@ class _Child:
         self._free: queue.SimpleQueue[int] = queue.SimpleQueue()
         for slot in range(self._slots):
             self._free.put(slot)
-        self._outbox = Outbox(self._slots)
+        self._outbox = Outbox()
         self._images: ImageSource | None = None
         self._tracker: KltTracker | None = None
         threading.Thread(target=self._listen, name="parent", daemon=True).start()

@@ -9,10 +9,13 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.inputs.tracking_process.messages import CameraRevised, Ended, FrameRecord
 
-__all__ = ["LIMIT", "Outbox"]
+__all__ = ["LIMIT", "ROOM", "Outbox"]
 
 # Events that may wait for the mapper. A frame without its image takes some 15 KB.
 LIMIT = 2000
+# Memory of the images of waiting frames [bytes], for example of 140 frames of 320x240. Reading an image again takes a
+# third of the time of tracking it, on the same core: with room for four, a stream of 30 frames a second fell behind.
+ROOM = 128 << 20
 
 _Message = PoseCorrection | CameraRevised | Ended
 
@@ -20,16 +23,16 @@ _Message = PoseCorrection | CameraRevised | Ended
 class Outbox:
     """Queue of frames and corrections, in order.
 
-    Only the first `pictures` waiting frames keep their images. The images of the others are read again when it is their
-    turn. The tracker is not held up before `LIMIT` events wait.
+    Waiting frames keep their images while these fit into `room`. The images of the others are read again when it is
+    their turn. The tracker is not held up before `LIMIT` events wait.
 
     Args:
-        pictures: Number of frames that wait with their images.
+        room: Memory of the images [bytes]. One frame keeps its image in any case.
     """
 
-    def __init__(self, pictures: int) -> None:
-        self._pictures = pictures
-        self._with_picture = 0
+    def __init__(self, room: int = ROOM) -> None:
+        self._room = room
+        self._taken = 0
         self._events: deque[TrackedFrame | FrameRecord | _Message] = deque()
         self._changed = Condition()
 
@@ -39,8 +42,8 @@ class Outbox:
             self._changed.wait_for(lambda: len(self._events) < LIMIT)
             if not isinstance(event, TrackedFrame):
                 self._events.append(event)
-            elif self._with_picture < self._pictures:
-                self._with_picture += 1
+            elif self._taken == 0 or self._taken + event.image.nbytes <= self._room:
+                self._taken += event.image.nbytes
                 self._events.append(event)
             else:
                 self._events.append(FrameRecord.of(event))
@@ -52,6 +55,6 @@ class Outbox:
             self._changed.wait_for(lambda: len(self._events) > 0)
             event = self._events.popleft()
             if isinstance(event, TrackedFrame):
-                self._with_picture -= 1
+                self._taken -= event.image.nbytes
             self._changed.notify_all()
             return event

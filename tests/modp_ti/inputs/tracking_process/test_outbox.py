@@ -17,9 +17,9 @@ from tests.patience import PATIENCE
 
 
 def test_order_is_kept_and_only_the_first_frames_keep_their_images():
-    outbox = Outbox(pictures=2)
     correction = PoseCorrection(np.array([0]), np.eye(4)[None])
     frames = [random_frame(i) for i in range(5)]
+    outbox = Outbox(room=2 * frames[0].image.nbytes)
     for frame in frames[:3]:
         outbox.put(frame)
     outbox.put(correction)
@@ -34,7 +34,7 @@ def test_order_is_kept_and_only_the_first_frames_keep_their_images():
 
 def test_the_tracker_waits_only_at_the_limit(monkeypatch):
     monkeypatch.setattr(module, "LIMIT", 3)
-    outbox = Outbox(pictures=1)
+    outbox = Outbox(room=1)
     put = threading.Semaphore(0)
 
     def track() -> None:
