@@ -189,7 +189,8 @@ class OnlineMapper(OnlineMap):
             Mean PSNR of the last step; None if nothing was optimised.
         """
         order = np.argsort(np.arange(len(self.keyframes)) * GOLDEN_RATIO % 1.0)
-        views = np.tile(order, self.settings.optimise.last_passes if len(self.gaussians) else 0)
+        total = self.settings.optimise.last_views(len(order)) if len(self.gaussians) else 0
+        views = np.resize(order, total)
         count = 1 + self.settings.views.local_views + self.settings.views.global_views
         psnr = None
         while self.settled < len(views):

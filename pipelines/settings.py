@@ -35,6 +35,10 @@ __all__ = [
 ]
 
 
+# Views that a map of a few keyframes gets after the last frame.
+LAST_VIEWS = 48
+
+
 class StrictModel(BaseModel):
     """Immutable section of the configuration. Unknown keys are errors."""
 
@@ -267,7 +271,9 @@ class OptimiseSettings(StrictModel):
 
     steps: int = Field(default=12, ge=0, description="steps per keyframe")
     last_passes: int = Field(
-        default=2, ge=0, description="passes over all keyframes after the last frame, at rates that decay"
+        default=2,
+        ge=0,
+        description="passes over all keyframes after the last frame, at rates that decay; more if they are few",
     )
     ssim_weight: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
     aspect_weight: float = Field(default=1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
@@ -278,6 +284,12 @@ class OptimiseSettings(StrictModel):
     colour_rate: float = Field(
         default=1e-2, ge=0, description="Adam step of the colour's constant harmonic; the others a twentieth"
     )
+
+    def last_views(self, keyframes: int) -> int:
+        """Return the number of views after the last frame: passes over the keyframes, at least `LAST_VIEWS` views."""
+        if keyframes == 0 or self.last_passes == 0:
+            return 0
+        return keyframes * max(self.last_passes, -(-LAST_VIEWS // keyframes))
 
 
 class MappingSettings(StrictModel):

@@ -222,7 +222,7 @@ class _Session:
         """Finish an online map. Raises RunStopped between two steps."""
         pipeline, frames = self.mapper.pipeline, len(self.mapper.frames)
         keyframes = len(pipeline.keyframes)
-        views = self.config.mapping.optimise.last_passes * keyframes
+        views = self.config.mapping.optimise.last_views(keyframes)
         self.line.start("settling", views, later=lambda pace: after.after_passes(pace, keyframes, frames))
         self.mapper.finish(lambda done, size, psnr: self._after_step("settling", done, views, psnr, size))
 

@@ -111,7 +111,7 @@ class TimeAfterMapping:
         if self._config.mode == "offline" or pace is None or not done or frames is None:
             return None
         keyframes = len(self._pipeline.keyframes) * frames / done
-        views = self._config.mapping.optimise.last_passes * keyframes
+        views = self._config.mapping.optimise.last_views(round(keyframes))
         return views * pace * FULL_SIZE + self.after_passes(pace * FULL_SIZE, keyframes, frames)
 
     def after_passes(self, pace: float, keyframes: float, frames: int) -> float:

@@ -88,11 +88,12 @@ def test_finishing_improves_the_map_from_every_keyframe_alike(
     monkeypatch.setattr(mapped.optimiser, "step", recorded)
     mapped.settled = 0
     mapped.finish()
-    assert np.bincount(views).tolist() == [SETTINGS.optimise.last_passes] * 7
+    passes = 7  # two for a map of many keyframes, but 48 views at least
+    assert np.bincount(views).tolist() == [passes] * 7
     assert rates == sorted(rates, reverse=True) and rates[-1] < 0.5 * rates[0]
     assert np.mean([psnr(mapped, i) for i in range(7)]) > np.mean(before) + 1
     mapped.finish()  # nothing new has arrived
-    assert len(views) == SETTINGS.optimise.last_passes * 7
+    assert len(views) == passes * 7
     mapped.gaussians.load(state)
 
 
