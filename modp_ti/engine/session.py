@@ -203,7 +203,7 @@ class _Session:
                 line.start("optimising", self.config.offline.steps)
                 mapper.finish(self._optimised)
             else:
-                self._settle(after)
+                self._settle()
             self.stop.check()
         finally:
             line.stop()
@@ -218,12 +218,11 @@ class _Session:
         self.record.frame(frame.index, report, psnr, **self.conductor.note())
         self.observer.on_frame(frame, report, status)
 
-    def _settle(self, after: TimeAfterMapping) -> None:
+    def _settle(self) -> None:
         """Finish an online map. Raises RunStopped between two steps."""
-        pipeline, frames = self.mapper.pipeline, len(self.mapper.frames)
-        keyframes = len(pipeline.keyframes)
+        keyframes, frames = len(self.mapper.pipeline.keyframes), len(self.mapper.frames)
         views = self.config.mapping.optimise.last_views(keyframes)
-        self.line.start("settling", views, later=lambda pace: after.after_passes(pace, keyframes, frames))
+        self.line.start("settling", views, later=lambda pace: self.after_mapping.after_passes(pace, keyframes, frames))
         self.mapper.finish(lambda done, size, psnr: self._after_step("settling", done, views, psnr, size))
 
     def _optimised(self, step: int, gaussians: int, psnr: float) -> None:

@@ -43,11 +43,6 @@ class Lens:
         return cls(pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", params=parameters, width=width, height=height))
 
     @property
-    def is_undistorted(self) -> bool:
-        """Whether the model has no distortion: the images are those of a pinhole camera."""
-        return str(self.camera.model_name) == "PINHOLE"
-
-    @property
     def width(self) -> int:
         return int(self.camera.width)
 
