@@ -82,9 +82,8 @@ class OnlineMapper(OnlineMap):
             if is_wanted:
                 # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them,
                 # every frame is selected as a keyframe; each therefore gets only 1 / max_gap of the steps.
-                steps = -(-self.pace.plan(level=0).steps // self.settings.keyframes.max_gap)
-                count = 1 + self.settings.views.local_views + self.settings.views.global_views
-                psnr = self._optimise_evenly(np.arange(len(self.keyframes)), steps, count)
+                steps = -(-self.pace.plan(0, *self.counts).steps // self.settings.keyframes.max_gap)
+                psnr = self._optimise_evenly(np.arange(len(self.keyframes)), steps, self.settings.views.per_step)
         return FrameReport(frame.index, is_keyframe, len(self.keyframes.selected), len(self.gaussians), psnr, steps)
 
     def _add_keyframe(self, frame: TrackedFrame) -> tuple[float | None, int]:
@@ -95,7 +94,7 @@ class OnlineMapper(OnlineMap):
         with self.stopwatch.measure("optimise"):
             self.optimiser.exposure.begin(self.keyframes, self.renderer, self.near)
         level = self._draw_level(view)
-        plan = self.pace.plan(level)
+        plan = self.pace.plan(level, *self.counts)
         image = view.at_level(level)
         self.densifier.add_tracked_points(image)
         if self.settings.densify.error_compensation and plan.pixels > 0:
@@ -172,7 +171,7 @@ class OnlineMapper(OnlineMap):
             self.optimiser.settle()
             around, moved = self.corrector.correct(correction, settings, more)
         if len(moved):
-            self._optimise_evenly(moved, self.pace.steps_after_correction(), settings.views)
+            self._optimise_evenly(moved, self.pace.steps_after_correction(*self.counts), settings.views)
         return CorrectionReport(around, moved=len(moved) > 0)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
@@ -191,7 +190,7 @@ class OnlineMapper(OnlineMap):
         order = np.argsort(np.arange(len(self.keyframes)) * GOLDEN_RATIO % 1.0)
         total = self.settings.optimise.last_views(len(order)) if len(self.gaussians) else 0
         views = np.resize(order, total)
-        count = 1 + self.settings.views.local_views + self.settings.views.global_views
+        count = self.settings.views.per_step
         psnr = None
         while self.settled < len(views):
             slower = LAST_RATE ** (self.settled / len(views))

@@ -82,6 +82,11 @@ class OnlineMap(Pipeline):
         """Depth [scene units] below which nothing is drawn."""
         return self.settings.near * self.keyframes.scene_depth
 
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Number of keyframes and of frames so far, as `Pace.plan` takes them."""
+        return len(self.keyframes.selected), self.frame_count
+
     def prune(self) -> int:
         """Remove Gaussians whose opacity is below `densify.prune_opacity`.
 

@@ -182,6 +182,11 @@ class ViewSettings(StrictModel):
     )
     recency_weight: float = Field(default=0.001, ge=0, description="sigma of the age in keyframes in that draw")
 
+    @property
+    def per_step(self) -> int:
+        """Number of views of a step, with the current one."""
+        return 1 + self.local_views + self.global_views
+
 
 class PoseSettings(StrictModel):
     """SE(3) refinement of keyframe poses (Section 3.3.3)."""
@@ -270,6 +275,12 @@ class OptimiseSettings(StrictModel):
     )
 
     steps: int = Field(default=12, ge=0, description="steps per keyframe")
+    budget: int | None = Field(
+        default=170,
+        ge=1,
+        description="keyframes up to which each gets all its steps; if a recording of known length has more, they "
+        "share the steps of so many. Empty: all get all",
+    )
     last_passes: int = Field(
         default=2,
         ge=0,

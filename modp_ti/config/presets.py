@@ -31,7 +31,7 @@ PRESETS: Mapping[str, Preset] = {
     ),
     "best": Preset(
         "a map to keep, where time does not matter",
-        {"mapping.optimise.steps": 30, "refine.steps": 3000},
+        {"mapping.optimise.steps": 30, "mapping.optimise.budget": None, "refine.steps": 3000},
     ),
 }
 """All presets by name. `modp-ti run` has an option for each, and the reference lists them."""

@@ -12,7 +12,7 @@ from modp_ti.engine.realtime import RealtimeRun
 from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
-from pipelines.pace import Pace
+from pipelines.pace import CompletePace, Pace
 
 __all__ = ["build_mapper", "open_conductor"]
 
@@ -49,7 +49,9 @@ def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Co
     if isinstance(tracker, RecordedSession):
         return ReplayedRun(tracker)
     if not config.is_realtime:
-        return Conductor()
+        frames, every = tracker.frame_count, config.source.holdout
+        held_out = 0 if frames is None or every is None else -(-frames // every)
+        return Conductor(CompletePace(config.mapping, None if frames is None else frames - held_out))
     recorder = None
     if config.export.session:
         recorder = SessionRecorder()

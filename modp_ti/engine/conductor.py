@@ -24,12 +24,19 @@ Event = TrackedFrame | PoseCorrection
 
 
 class Conductor:
-    """Takes frames and corrections to the mapper, each as soon as the mapper is done with the previous one."""
+    """Takes frames and corrections to the mapper, each as soon as the mapper is done with the previous one.
+
+    Args:
+        pace: Pace of the mapper.
+    """
+
+    def __init__(self, pace: Pace) -> None:
+        self._pace = pace
 
     @property
-    def pace(self) -> Pace | None:
-        """Pace of the mapper, None for all the work of the settings."""
-        return None
+    def pace(self) -> Pace:
+        """Pace of the mapper."""
+        return self._pace
 
     def events(
         self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]

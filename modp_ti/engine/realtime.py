@@ -58,7 +58,8 @@ class RealtimeRun(Conductor):
         recorder: SessionRecorder | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._pace = RealtimePace(settings)
+        self._realtime = RealtimePace(settings)
+        super().__init__(self._realtime)
         self.lag: list[float] = []
         self.waiting: list[int] = []
         self.steps: list[int] = []
@@ -74,7 +75,7 @@ class RealtimeRun(Conductor):
 
     @property
     def pace(self) -> RealtimePace:
-        return self._pace
+        return self._realtime
 
     def events(
         self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]

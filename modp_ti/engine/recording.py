@@ -279,13 +279,9 @@ class ReplayedRun(Conductor):
     """
 
     def __init__(self, session: RecordedSession) -> None:
+        super().__init__(RecordedPace(session.plans))
         self._session = session
-        self._pace = RecordedPace(session.plans)
         self._more = iter(session.more)
-
-    @property
-    def pace(self) -> RecordedPace:
-        return self._pace
 
     def events(
         self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]

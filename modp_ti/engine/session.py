@@ -22,6 +22,7 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.recording import RecordedSession
+from modp_ti.engine.remarks import remarks
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
@@ -34,6 +35,7 @@ from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import mapped_psnr, retention
 from modp_ti.outputs.time_left import TimeAfterMapping
+from pipelines.pace import CompletePace
 from pipelines.settings import RefineSettings
 from pipelines.stopwatch import breakdown_percent
 
@@ -104,9 +106,7 @@ class _Session:
     def run(self, resumed: Snapshot | None) -> Path:
         """Run all stages and return the output folder."""
         self._map_the_stream(resumed)
-        refused = [f"{count} {why}" for why, count in self.mapper.pipeline.refused.items() if count]
-        if refused:
-            self._say(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
+        self._say(*remarks(self.mapper.pipeline))
         self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
         versions = self._versions()
         self.observer.on_stage("evaluating the saved map")
@@ -214,7 +214,7 @@ class _Session:
         status = self.conductor.status()
         self.line.frame(report, self.tracker.frame_count, status)
         # A realtime run has no time for the PSNR of new keyframes.
-        psnr = mapped_psnr(self.mapper.pipeline, report) if self.conductor.pace is None else None
+        psnr = mapped_psnr(self.mapper.pipeline, report) if isinstance(self.conductor.pace, CompletePace) else None
         self.record.frame(frame.index, report, psnr, **self.conductor.note())
         self.observer.on_frame(frame, report, status)
 

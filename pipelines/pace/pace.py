@@ -9,6 +9,11 @@ from pipelines.settings import MappingSettings
 
 __all__ = ["CompletePace", "Pace", "Plan"]
 
+# Number of keyframes that are assumed before the first one, in the estimate of how many there will be.
+BEFORE = 4
+# Steps that every keyframe gets, however long the recording is.
+LEAST_STEPS = 2
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -30,35 +35,56 @@ class Pace(Protocol):
         """Return whether a frame that should become a keyframe does. Otherwise it only adds its tracked points."""
         ...
 
-    def plan(self, level: int) -> Plan:
+    def plan(self, level: int, keyframes: int, frames: int) -> Plan:
         """Return the work of a new keyframe.
 
         Args:
             level: Pyramid level on which it is optimised.
+            keyframes: Number of keyframes so far, with this one.
+            frames: Number of frames so far, with this one.
         """
         ...
 
-    def steps_after_correction(self) -> int:
-        """Return the number of optimisation steps after a correction that moved Gaussians."""
+    def steps_after_correction(self, keyframes: int, frames: int) -> int:
+        """Return the number of optimisation steps after a correction that moved Gaussians.
+
+        Args:
+            keyframes: Number of keyframes so far.
+            frames: Number of frames so far.
+        """
         ...
 
 
 class CompletePace:
-    """Gives every keyframe all the work of the settings, however long it takes.
+    """Gives every keyframe the work of the settings, however long it takes.
+
+    The keyframes of a long recording share the steps of `optimise.budget` keyframes evenly. Their number is expected
+    from those so far: with k keyframes in the first f of n frames, n k / f. Nothing else is remembered, so that a
+    resumed run decides the same.
 
     Args:
         settings: Settings of the mapping.
+        frames: Number of frames of the whole recording, without the held-out ones; None if unknown, for no budget.
     """
 
-    def __init__(self, settings: MappingSettings) -> None:
-        self._plan = Plan(1.0, settings.optimise.steps)
-        self._after_correction = settings.corrections.steps
+    def __init__(self, settings: MappingSettings, frames: int | None = None) -> None:
+        self._settings = settings
+        self._frames = frames
 
     def takes_keyframe(self) -> bool:
         return True
 
-    def plan(self, level: int) -> Plan:
-        return self._plan
+    def plan(self, level: int, keyframes: int, frames: int) -> Plan:
+        return Plan(1.0, round(self.share(keyframes, frames) * self._settings.optimise.steps))
 
-    def steps_after_correction(self) -> int:
-        return self._after_correction
+    def steps_after_correction(self, keyframes: int, frames: int) -> int:
+        return round(self.share(keyframes, frames) * self._settings.corrections.steps)
+
+    def share(self, keyframes: int, frames: int) -> float:
+        """Return the share of the settings' steps for which the budget suffices, as far as the frames so far tell."""
+        budget, steps = self._settings.optimise.budget, self._settings.optimise.steps
+        if budget is None or self._frames is None or steps == 0:
+            return 1.0
+        # As if a few keyframes at the largest distance came first: the first frames tell little.
+        rate = (keyframes + BEFORE) / (frames + BEFORE * self._settings.keyframes.max_gap)
+        return min(1.0, max(budget / (rate * self._frames), LEAST_STEPS / steps))

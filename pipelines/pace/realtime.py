@@ -130,7 +130,7 @@ class RealtimePace:
             self.decisions.append(None)
         return taken
 
-    def plan(self, level: int) -> Plan:
+    def plan(self, level: int, keyframes: int, frames: int) -> Plan:
         plan = self._plan(self._time(), self._cost("depth", level, DEPTH), self._cost("step", level, STEP))
         self._planned = plan, level
         if plan.steps == 0 and self.most_steps > 0:
@@ -141,7 +141,7 @@ class RealtimePace:
         self.decisions.append(plan)
         return plan
 
-    def steps_after_correction(self) -> int:
+    def steps_after_correction(self, keyframes: int, frames: int) -> int:
         """Return 0: the ordinary steps mend the seams, by the same clock as everything else."""
         return 0
 

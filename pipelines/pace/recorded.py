@@ -32,9 +32,9 @@ class RecordedPace:
             raise ValueError("the recorded decisions end before the frames: these are other frames") from None
         return self._next is not None
 
-    def plan(self, level: int) -> Plan:
+    def plan(self, level: int, keyframes: int, frames: int) -> Plan:
         assert self._next is not None, "takes_keyframe comes first, and was True"
         return self._next
 
-    def steps_after_correction(self) -> int:
+    def steps_after_correction(self, keyframes: int, frames: int) -> int:
         return 0

@@ -100,8 +100,7 @@ def test_frames_without_room_go_on_optimising_the_map(free: Mapped) -> None:
     kept = len(tight.keyframes)
     assert tight.keyframes == list(range(kept)) and 0 < kept < FRAMES
     # The fifth part of two steps, but one at least, for as many views.
-    views = 1 + VIEWS.local_views + VIEWS.global_views
-    assert tight.renders - mapped(memory, kept).renders == (FRAMES - kept) * views
+    assert tight.renders - mapped(memory, kept).renders == (FRAMES - kept) * VIEWS.per_step
 
 
 def test_a_frame_without_room_is_no_keyframe(free: Mapped) -> None:

@@ -53,7 +53,7 @@ class SimulatedMapper:
             if n % self.every == 0:
                 if pace.takes_keyframe():
                     level = int(rng.choice(len(LEVELS), p=LEVELS))
-                    plan = pace.plan(level)
+                    plan = pace.plan(level, 1, 1)
                     seconds, depth, optimise = self.costs_of(plan, level, rng)
                 session.plans.append(plan)
             seconds += depth + optimise

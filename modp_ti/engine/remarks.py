@@ -1,0 +1,25 @@
+"""Remarks of a run about its map, for the user."""
+
+from __future__ import annotations
+
+from pipelines.online import OnlineMapper
+from pipelines.pace import CompletePace
+from pipelines.pipeline import Pipeline
+
+__all__ = ["remarks"]
+
+
+def remarks(pipeline: Pipeline) -> list[str]:
+    """Return one-line remarks about a map after its last frame: frames left out, and steps that a budget took away."""
+    said = []
+    refused = [f"{count} {why}" for why, count in pipeline.refused.items() if count]
+    if refused:
+        said.append(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
+    if isinstance(pipeline, OnlineMapper) and isinstance(pipeline.pace, CompletePace):
+        optimise, plan = pipeline.settings.optimise, pipeline.pace.plan(0, *pipeline.counts)
+        if plan.steps < optimise.steps:
+            said.append(
+                f"the recording is long: its keyframes got about {plan.steps} instead of {optimise.steps} steps each "
+                "(mapping.optimise.budget; --best has no limit)"
+            )
+    return said
