@@ -44,6 +44,11 @@ class Program:
         """Whether finished runs can be used again: those of a commit, but not those of a changed working tree."""
         return not self.label.endswith("+")
 
+    @property
+    def has_last_steps(self) -> bool:
+        """Whether the last keyframe gets steps of its own, as up to 0.2.0. Later versions refuse the setting."""
+        return "last_steps: int = Field(" in (self.root / "pipelines" / "settings.py").read_text(encoding="utf-8")
+
 
 @dataclass(frozen=True)
 class Point:
@@ -148,12 +153,12 @@ def _points(program: Program, scene: Path, steps: int, settings: Mapping[str, st
     overrides = {
         "threads": "1",
         "mapping.optimise.steps": str(steps),
-        # Up to 0.2.0, the last keyframe got so many steps. Later versions ignore the key.
-        "mapping.optimise.last_steps": str(steps),
         "refine.steps": str(REFINED * steps),
         "export.report": "false",
         **settings,
     }
+    if program.has_last_steps:
+        overrides["mapping.optimise.last_steps"] = str(steps)
     if program.keeps and kept.is_file():
         record = json.loads(kept.read_text(encoding="utf-8"))
         if record["scene"] == scene.read_text(encoding="utf-8") and record["overrides"] == overrides:

@@ -49,6 +49,8 @@ def test_programs_run_interleaved_and_finished_runs_of_commits_are_kept(
 
     def run(program: Program, job: Job) -> float:
         started.append(program.label)
+        # Only the older version knows the setting.
+        assert job.overrides.get("mapping.optimise.last_steps") == {"new": None, "old+": "4"}[program.label]
         job.folder.mkdir(parents=True)
         metrics = make_metrics(20.0 + int(job.overrides["mapping.optimise.steps"]), refined=30.0)
         (job.folder / "metrics.json").write_text(json.dumps(metrics))
@@ -57,7 +59,12 @@ def test_programs_run_interleaved_and_finished_runs_of_commits_are_kept(
     monkeypatch.setattr(quality, "_run", run)
     scene = tmp_path / "scene.yaml"
     scene.write_text("output: out")
-    programs = [Program("new", tmp_path), Program("old+", tmp_path)]
+    programs = []
+    for label, setting in (("new", "last_passes: int = Field("), ("old+", "last_steps: int = Field(")):
+        settings = tmp_path / label / "pipelines" / "settings.py"
+        settings.parent.mkdir(parents=True)
+        settings.write_text(setting)
+        programs.append(Program(label, tmp_path / label))
 
     def measure() -> dict[str, dict[str, list[Point]]]:
         return quality.curves({"room": scene}, programs, [4], 3, {}, tmp_path / "runs")
