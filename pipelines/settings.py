@@ -153,6 +153,12 @@ class DensifySettings(StrictModel):
     )
     scale_offset: float = Field(default=0.5, description="added to the log of that size (epsilon of Eq. 1)")
     initial_opacity: float = Field(default=0.5, gt=0, lt=1, description="opacity of a new Gaussian")
+    min_contribution: float = Field(
+        default=0.5,
+        ge=0,
+        description="pixels covered where it shows most, below which a Gaussian is removed, each time that the "
+        "keyframes have become half as many again, from 64 on; 0 for never. Not in a realtime run",
+    )
     prune_every: int = Field(default=100, ge=1, description="frames between removals of transparent Gaussians")
     prune_opacity: float = Field(default=0.01, ge=0, lt=1, description="opacity below which a Gaussian is removed")
 

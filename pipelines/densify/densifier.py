@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,6 +111,11 @@ class Densifier:
                 self.voxels.settle(self.settings.voxels.coarsest * view.view_scale, view.centre)
             spacing, anchor = self.anchors[-1].spacing, len(self.anchors) - 1
             grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, anchor)
+
+    def placed_since(self, keyframe: Keyframe) -> NDArray[np.bool_]:
+        """Return whether each Gaussian (N,) was placed in this keyframe or in a frame after it."""
+        first = bisect_left(self.anchors, keyframe.index, key=lambda anchor: anchor.keyframe.index)
+        return self.gaussians.anchors() >= first
 
     def restart_voxels(self, coarsest: float, origin: NDArray[np.float64]) -> None:
         """Clear the voxels and mark those of all Gaussians, each down to the level of its anchor's spacing.

@@ -11,6 +11,8 @@ __all__ = ["CompletePace", "Pace", "Plan"]
 
 # Number of keyframes that are assumed before the first one, in the estimate of how many there will be.
 BEFORE = 4
+# Number of keyframes at which Gaussians that hardly show are removed first, and the factor to the next number.
+FIRST_REMOVAL, UNTIL_NEXT = 64, 1.5
 # Steps that every keyframe gets, however long the recording is.
 LEAST_STEPS = 2
 
@@ -22,10 +24,12 @@ class Plan:
     Attributes:
         pixels: Share of `densify.pixels` whose depth is estimated, from 0 to 1.
         steps: Number of optimisation steps.
+        removes_hidden: Whether Gaussians that hardly show in any keyframe are then removed.
     """
 
     pixels: float
     steps: int
+    removes_hidden: bool = False
 
 
 class Pace(Protocol):
@@ -58,6 +62,9 @@ class Pace(Protocol):
 class CompletePace:
     """Gives every keyframe the work of the settings, however long it takes.
 
+    Gaussians that hardly show are removed each time that the number of keyframes has grown by a half, so that rendering
+    all keyframes for it takes a few views per keyframe, however many there are.
+
     The keyframes of a long recording share the steps of `optimise.budget` keyframes evenly. Their number is expected
     from those so far: with k keyframes in the first f of n frames, n k / f. Nothing else is remembered, so that a
     resumed run decides the same.
@@ -75,7 +82,8 @@ class CompletePace:
         return True
 
     def plan(self, level: int, keyframes: int, frames: int) -> Plan:
-        return Plan(1.0, round(self.share(keyframes, frames) * self._settings.optimise.steps))
+        steps = round(self.share(keyframes, frames) * self._settings.optimise.steps)
+        return Plan(1.0, steps, _is_due(keyframes))
 
     def steps_after_correction(self, keyframes: int, frames: int) -> int:
         return round(self.share(keyframes, frames) * self._settings.corrections.steps)
@@ -88,3 +96,11 @@ class CompletePace:
         # As if a few keyframes at the largest distance came first: the first frames tell little.
         rate = (keyframes + BEFORE) / (frames + BEFORE * self._settings.keyframes.max_gap)
         return min(1.0, max(budget / (rate * self._frames), LEAST_STEPS / steps))
+
+
+def _is_due(keyframes: int) -> bool:
+    """Whether Gaussians that hardly show are removed after this number of keyframes."""
+    at = float(FIRST_REMOVAL)
+    while round(at) < keyframes:
+        at *= UNTIL_NEXT
+    return round(at) == keyframes

@@ -15,6 +15,11 @@ def test_the_complete_pace_gives_what_the_settings_say() -> None:
     assert pace.steps_after_correction(keyframes=1, frames=1) == 3
 
 
+def test_what_hardly_shows_is_removed_each_time_that_the_keyframes_are_half_as_many_again() -> None:
+    pace = CompletePace(MappingSettings())
+    assert [n for n in range(1, 400) if pace.plan(0, n, n).removes_hidden] == [64, 96, 144, 216, 324]
+
+
 @pytest.mark.parametrize(("every", "steps"), [(1, 4), (3, 12), (5, 20)])
 def test_the_keyframes_of_a_long_recording_share_its_budget_evenly(every: int, steps: int) -> None:
     """133 keyframes' 30 steps are 4,000 steps, for 1,000 frames and a keyframe every first, third or fifth."""
