@@ -261,7 +261,7 @@ class _Session:
         """Refine the map for the settings' steps or time. Raises RunStopped between two steps."""
         done, steps = self.checkpointer.refined, settings.steps if settings.seconds is None else None
         scores = self.after_mapping.scores(len(self.mapper.frames)) / settings.views  # in steps
-        self.line.start("refining", steps, done, lambda step: step * scores)
+        self.line.start("refining", steps, done, lambda step: step * scores, prepares=True)
         schedule = self.conductor.schedule(settings)
         try:
             self.mapper.refine(settings.steps, settings, self._refined, done, schedule)

@@ -64,7 +64,12 @@ class ProgressLine:
             self.stop()
 
     def start(
-        self, what: str, total: int | None, done: int = 0, later: Callable[[float], float | None] | None = None
+        self,
+        what: str,
+        total: int | None,
+        done: int = 0,
+        later: Callable[[float], float | None] | None = None,
+        prepares: bool = False,
     ) -> None:
         """Begin the line of a stage.
 
@@ -74,9 +79,11 @@ class ProgressLine:
             done: Number of items that are done already.
             later: Returns the time that the following stages will take [s], given the recent time of an item [s].
                 While it returns None, no time is shown. None if nothing follows.
+            prepares: Whether the time of the first item includes preparations.
         """
         self.stop()
-        self._left, self._later = TimeLeft(total, done, clock=time.monotonic), later or _nothing
+        self._left = TimeLeft(total, done, clock=time.monotonic, prepares=prepares)
+        self._later = later or _nothing
         self._state = ""
         self._logged = time.monotonic()
         self._progress = Progress(

@@ -37,17 +37,25 @@ class TimeLeft:
         done: Number of items that are done already.
         clock: Returns the time [s].
         earliest: Time before the first estimate [s].
+        prepares: Whether the time of the first item includes preparations; it is then left out.
 
     Attributes:
         total: As the argument. It may be changed.
     """
 
     def __init__(
-        self, total: int | None, done: int = 0, *, clock: Callable[[], float], earliest: float = EARLIEST
+        self,
+        total: int | None,
+        done: int = 0,
+        *,
+        clock: Callable[[], float],
+        earliest: float = EARLIEST,
+        prepares: bool = False,
     ) -> None:
         self.total = total
         self._clock = clock
         self._earliest = earliest
+        self._prepares = prepares
         self._began = clock()
         self._done = done
         # Times and counts, oldest first. The first one is the latest that lies before the recent third.
@@ -56,6 +64,9 @@ class TimeLeft:
     def update(self, done: int) -> None:
         """Set the number of items that are done."""
         now = self._clock()
+        if self._prepares and done > self._done:
+            self._prepares, self._began = False, now
+            self._history = deque([(now, done)])
         self._done = done
         self._history.append((now, done))
         since = now - RECENT * (now - self._began)

@@ -42,6 +42,15 @@ def test_the_pace_is_that_of_the_last_third() -> None:
     assert left.seconds() == pytest.approx(60 * 2.0)
 
 
+def test_preparations_are_not_extrapolated() -> None:
+    clock = Clock()
+    left = TimeLeft(1000, clock=clock, prepares=True)
+    after(left, clock, [60.0])
+    assert left.seconds() is None
+    after(left, clock, [0.2] * 60, done=1)
+    assert left.seconds() == pytest.approx(0.2 * (1000 - 61))
+
+
 def test_a_resumed_run_counts_only_its_own_items() -> None:
     clock = Clock()
     left = TimeLeft(100, done=80, clock=clock)
