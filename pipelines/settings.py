@@ -282,7 +282,7 @@ class OptimiseSettings(StrictModel):
 
     steps: int = Field(default=12, ge=0, description="steps per keyframe")
     budget: int | None = Field(
-        default=170,
+        default=140,
         ge=1,
         description="keyframes up to which each gets all its steps; if a recording of known length has more, they "
         "share the steps of so many. Empty: all get all",
