@@ -11,6 +11,8 @@ __all__ = ["HashedBricks"]
 
 # Number of bricks that there is room for at first.
 FIRST_ROOM = 1 << 12
+# Number of bricks that one launch inserts: drivers end a launch that takes seconds, and one thread inserts them all.
+MOST_INSERTED = 1 << 14
 # A place of the table without a brick.
 EMPTY = -1
 
@@ -79,7 +81,7 @@ class HashedBricks(Bricks):
         corners = corners[missing != 0]
         if self._count + len(corners) > self._corners.shape[0]:
             self._grow(self._count + len(corners))
-        _insert(self._table, self._corners, corners, self._count)
+        self._insert(corners, self._count)
         self._count += len(corners)
 
     def _grow(self, count: int) -> None:
@@ -87,7 +89,12 @@ class HashedBricks(Bricks):
         corners, halves = self._corners.to_numpy()[: self._count], self._halves
         self._allocate(1 << (count - 1).bit_length())
         _copy(halves, self._halves)
-        _insert(self._table, self._corners, corners, 0)
+        self._insert(corners, 0)
+
+    def _insert(self, corners: NDArray[np.int32], first: int) -> None:
+        """Add bricks, none of which is in the table, as the rows from `first` on."""
+        for start in range(0, max(len(corners), 1), MOST_INSERTED):
+            _insert(self._table, self._corners, corners[start : start + MOST_INSERTED], first + start)
 
     def _allocate(self, room: int) -> None:
         self._table = dense_array(ti.i32, (2 * room,))
@@ -128,7 +135,6 @@ def _find_missing(table: ROWS, corners: CORNERS, asked: CORNERS, missing: ROWS):
 
 @ti.kernel
 def _insert(table: ROWS, corners: CORNERS, added: CORNERS, first: ti.i32):
-    """Add bricks, none of which is in the table, as the rows from `first` on."""
     # One thread for all, since Taichi has no compare-and-swap.
     for _ in range(1):
         for i in range(added.shape[0]):
