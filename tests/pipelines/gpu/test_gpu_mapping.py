@@ -15,6 +15,7 @@ from pipelines.offline import OfflineMapper
 from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
+from pipelines.state import MapState
 from tests.pipelines.wall import frame
 
 # Few steps: a software driver takes a quarter of a second for a view. The draw of views must not follow the errors,
@@ -74,6 +75,28 @@ def test_a_map_made_on_the_gpu_is_the_same_on_every_run(mapped: tuple, gpu: str)
     again = online()
     for name, value in mapped[1].items():
         np.testing.assert_array_equal(again[name], value, err_msg=name)
+
+
+def test_the_state_of_one_device_is_restored_on_the_other(on_both: Callable) -> None:
+    saved: list[MapState] = []
+
+    def resumed() -> tuple[MapState, float]:
+        mapper = OnlineMapper(SETTINGS, 64, 48, seed=1)
+        mapper.compile()
+        if saved:
+            mapper.restore(saved[0], [frame(0), frame(1)])
+        else:
+            for i in range(2):
+                mapper.process(frame(i))
+            saved.append(mapper.state())
+        return mapper.state(), mapper.process(frame(2)).psnr
+
+    (_, psnr), (state, gpu_psnr) = on_both(resumed)
+    assert state.numbers == saved[0].numbers
+    assert state.arrays.keys() == saved[0].arrays.keys()
+    for name, value in saved[0].arrays.items():
+        np.testing.assert_array_equal(state.arrays[name], value, err_msg=name)
+    assert gpu_psnr == pytest.approx(psnr, abs=1e-3)
 
 
 def seeds(points: SparsePoints, sh_count: int) -> dict[str, NDArray]:
