@@ -13,7 +13,7 @@ LEVELS = 9
 
 
 def answers() -> list[NDArray]:
-    """All answers to questions about some 20,000 bricks, which do not fit into the first hash table, and the marks."""
+    """All answers to questions about 12,000 bricks, which do not fit into the first hash table, and the marks."""
     voxels = OccupancyVoxels(1.0, LEVELS, resolution=64)
     rng = np.random.default_rng(5)
     found = []
