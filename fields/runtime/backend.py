@@ -5,17 +5,21 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import io
+import os
+import sys
 
 import numpy as np
 import torch
 
-from fields.runtime.engine import configuration, engine, running_program, ti
+from fields.runtime.engine import configuration, engine, forget_arrays, running_program, ti
 from fields.runtime.kernel_sources import answer_quickly
+from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
 from fields.runtime.workers import pin_workers, threads_of_process
 
 __all__ = [
     "describe",
     "growing",
+    "has_sparse_fields",
     "initialise",
     "on_gpu",
     "program",
@@ -40,16 +44,18 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
     depth estimate took 1.9 s instead of 0.05 s).
 
     Args:
-        device: "cpu", "cuda", or "auto" for CUDA if it is available and the CPU otherwise. "vulkan" is for the tests,
-            which run the GPU kernels on a software driver; it has no sparse fields and hence no voxels.
+        device: "cpu", "cuda", "vulkan", "metal", or "auto" for the first that is available of CUDA, a GPU through Metal
+            (on macOS) or Vulkan (elsewhere), and the CPU. "vulkan" takes a software driver where there is no GPU,
+            "auto" never does. With several Vulkan devices, TI_VISIBLE_DEVICE (with Quadrants, QD_VISIBLE_DEVICE)
+            chooses one by its number.
         threads: Number of CPU threads; None for all.
         seed: Seed of the engine's random numbers.
 
     Returns:
-        Name of the backend in use, which is "cpu", "cuda" or "vulkan".
+        Name of the backend in use, which is "cpu", "cuda", "vulkan" or "metal".
 
     Raises:
-        RuntimeError: If "cuda" or "vulkan" was requested and does not start.
+        RuntimeError: If a GPU was requested and does not start.
 
     Example:
         backend = modp_ti.initialise("auto", seed=1)
@@ -66,11 +72,13 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
         # PyTorch sorts on the device, in the same memory: a build without CUDA cannot.
         missing = "no CUDA device starts here" if torch.version.cuda else "this PyTorch is built without CUDA"
         raise RuntimeError(f"device: cuda was asked for, but {missing}; use device: cpu or auto")
-    if device == "vulkan":
-        _start(ti.vulkan, options)
-        if configuration().arch == ti.vulkan:
-            return "vulkan"
-        raise RuntimeError("no Vulkan driver starts here")
+    for gpu in ("metal", "vulkan"):
+        if device == gpu or (device == "auto" and _has_gpu(gpu)):
+            missing = _start_on(gpu, options)
+            if missing is None:
+                return gpu
+            if device == gpu:
+                raise RuntimeError(f"device: {gpu} was asked for, but {missing}; use device: cpu or auto")
     before = threads_of_process()
     _start(ti.cpu, options)
     pin_workers(before, configuration().cpu_max_num_threads)
@@ -86,7 +94,38 @@ def _has_cuda_driver() -> bool:
     return True
 
 
+def _vulkan_device() -> VulkanDevice | None:
+    return choose(vulkan_devices(), os.environ.get(engine().variable("visible_device")))
+
+
+def _has_gpu(device: str) -> bool:
+    """Whether there is a GPU for "metal" or "vulkan", and not just a software driver."""
+    if device == "metal":
+        return sys.platform == "darwin"
+    chosen = _vulkan_device()
+    return chosen is not None and chosen.is_gpu
+
+
+def _start_on(device: str, options: dict) -> str | None:
+    """Start the engine on "metal" or "vulkan". Return what is missing, or None if it has started there."""
+    if device == "metal":
+        if sys.platform != "darwin":
+            return "only macOS has Metal"
+        _start(ti.metal, options)
+        return None if configuration().arch == ti.metal else f"{engine().title} does not start on this machine's GPU"
+    chosen = _vulkan_device()
+    if chosen is None:
+        return "no Vulkan driver starts here"
+    if not chosen.has_int64:
+        return f"{chosen.name} has no 64-bit integers"
+    # The engine has to take the same device, whose features and kind were asked for and which `describe` names.
+    os.environ[engine().variable("visible_device")] = str(chosen.index)
+    _start(ti.vulkan, options)
+    return None if configuration().arch == ti.vulkan else f"{engine().title} does not start on {chosen.name}"
+
+
 def _start(arch: object, options: dict) -> None:
+    forget_arrays()
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=arch, **options)
 
@@ -99,6 +138,9 @@ def describe(backend: str) -> str:
     """
     if backend == "cuda":
         return f"CUDA ({torch.cuda.get_device_name()})"
+    chosen = _vulkan_device() if backend == "vulkan" else None
+    if chosen is not None:
+        return f"Vulkan ({chosen.name})"
     if backend == "cpu" and _has_cuda_driver() and not torch.cuda.is_available():
         return "CPU (there is a CUDA driver, but this PyTorch cannot use it)"
     return backend.upper() if backend == "cpu" else backend.capitalize()
@@ -121,8 +163,13 @@ def program() -> object:
 
 
 def on_gpu() -> bool:
-    """Whether dense storage and the kernels of `render/gpu` are in use: on CUDA and Vulkan."""
-    return configuration().arch in (ti.cuda, ti.vulkan)
+    """Whether dense storage and the kernels of `render/gpu` are in use: on CUDA, Vulkan and Metal."""
+    return configuration().arch in (ti.cuda, ti.vulkan, ti.metal)
+
+
+def has_sparse_fields() -> bool:
+    """Whether the backend has sparse SNodes: the CPU and CUDA."""
+    return configuration().arch not in (ti.vulkan, ti.metal)
 
 
 def torch_device() -> torch.device:
@@ -151,7 +198,7 @@ def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:
     """Create an SNode of `blocks` blocks, for dense children.
 
     On the CPU, the node is sparse, so that memory follows what is written. On a GPU it is dense, because the allocator
-    of sparse nodes would run inside the kernels of a step, and Vulkan has none.
+    of sparse nodes would run inside the kernels of a step, and Vulkan and Metal have none.
     """
     return builder.dense(ti.i, blocks) if on_gpu() else builder.pointer(ti.i, blocks)
 

@@ -13,6 +13,7 @@ import atexit
 import functools
 import importlib
 import os
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -28,8 +29,10 @@ __all__ = [
     "EngineError",
     "compiled_kernel",
     "configuration",
+    "dense_array",
     "engine",
     "error_class",
+    "forget_arrays",
     "owner_of_kernel",
     "part",
     "running_program",
@@ -200,6 +203,33 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()["ti"] = module = _load()
     return module
+
+
+# ---- arrays ----------------------------------------------------------------------------------------------------
+
+_arrays: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def dense_array(dtype: Any, shape: tuple[int, ...]) -> Any:
+    """Return an array of zeros on the device, which kernels take as an argument. It is freed with its last reference.
+
+    Args:
+        dtype: Type of the engine, for example `ti.i32`.
+        shape: Shape of the array.
+    """
+    array = ti.ndarray(dtype, shape)
+    _arrays.add(array)
+    return array
+
+
+def forget_arrays() -> None:
+    """Let go of all arrays, just before the engine is started anew, which frees them.
+
+    Taichi asks the running program to free an array by its address, where that program may have another one.
+    """
+    for array in list(_arrays):
+        array.arr = None
+    _arrays.clear()
 
 
 # ---- private parts ---------------------------------------------------------------------------------------------

@@ -49,6 +49,8 @@ class Device(str, Enum):
     auto = "auto"
     cpu = "cpu"
     cuda = "cuda"
+    vulkan = "vulkan"
+    metal = "metal"
 
 
 def matching_settings(incomplete: str) -> list[tuple[str, str]]:

@@ -299,8 +299,8 @@ class SceneConfig(StrictModel):
     source: SourceSettings = SourceSettings()
     tracker: AnyTrackerSettings
     output: Path = Field(description="output folder, which is created if it does not exist")
-    device: Literal["cpu", "cuda", "auto"] = Field(
-        default="auto", description="`auto`: CUDA if there is a GPU, otherwise the CPU"
+    device: Literal["cpu", "cuda", "vulkan", "metal", "auto"] = Field(
+        default="auto", description="`auto`: the GPU by CUDA, by Metal (macOS) or by Vulkan, otherwise the CPU"
     )
     mode: Literal["online", "offline"] = Field(
         default="online",

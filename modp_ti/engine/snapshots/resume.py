@@ -19,8 +19,8 @@ from modp_ti.files.errors import InputError
 
 __all__ = ["load_resumed", "replay"]
 
-# Settings that may change on resuming, since the map does not depend on them.
-FREE = ("output", "threads", "snapshot_every", "source.prefetch", "evaluation", "export", "view")
+# Settings that may change on resuming: the map does not depend on them, but for the device, in the last digits.
+FREE = ("output", "device", "threads", "snapshot_every", "source.prefetch", "evaluation", "export", "view")
 
 
 def load_resumed(

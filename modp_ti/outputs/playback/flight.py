@@ -109,7 +109,7 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
         flight: The planned flight.
         output: A video file or a folder.
         depth: Render depth instead of colour.
-        device: "cpu", "cuda" or "auto".
+        device: "cpu", "cuda", "vulkan", "metal" or "auto".
         line: Shows the progress.
 
     Raises:

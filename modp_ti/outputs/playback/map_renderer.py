@@ -26,7 +26,7 @@ def start_device(device: str) -> str:
     """Start Taichi.
 
     Args:
-        device: "cpu", "cuda" or "auto".
+        device: "cpu", "cuda", "vulkan", "metal" or "auto".
 
     Returns:
         The backend in use.

@@ -33,7 +33,7 @@ def surface_views(run: FinishedRun, device: str, line: ProgressLine) -> Iterator
 
     Args:
         run: The finished run.
-        device: "cpu", "cuda" or "auto".
+        device: "cpu", "cuda", "vulkan", "metal" or "auto".
         line: Shows the progress.
     """
     chosen = run.spread(SURFACE_VIEWS)

@@ -40,7 +40,7 @@ class FinishedViewer:
     Args:
         run: The finished run.
         settings: The viewer's settings.
-        device: "cpu", "cuda" or "auto".
+        device: "cpu", "cuda", "vulkan", "metal" or "auto".
 
     Raises:
         InputError: If the page cannot be served, or the run is damaged.

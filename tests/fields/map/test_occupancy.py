@@ -6,21 +6,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.map import occupancy
+from fields.map import hashed_bricks, occupancy, sparse_bricks
 from fields.map.occupancy import OccupancyVoxels
 from fields.runtime.backend import initialise
 
+FORMS = ["cpu", "gpu", "hashed"]
 
-@pytest.fixture(params=[False, True], ids=["cpu", "gpu"])
+
+def use(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the voxels of a form from here on: the kernels of all forms run on the CPU as well."""
+    monkeypatch.setattr(occupancy, "has_sparse_fields", lambda: form != "hashed")
+    monkeypatch.setattr(sparse_bricks, "on_gpu", lambda: form == "gpu")
+    # The hash table grows in every test with more than two bricks.
+    monkeypatch.setattr(hashed_bricks, "FIRST_ROOM", 2)
+
+
+@pytest.fixture(params=FORMS)
 def voxels(
     taichi_on_the_cpu: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., OccupancyVoxels]:
-    """Fresh voxels: Taichi is started anew for each test, since fields cannot be freed one by one.
-
-    They admit in the CPU's form, and in the GPU's, whose kernels run on the CPU as well.
-    """
+    """Fresh voxels of each form: Taichi is started anew, since fields cannot be freed one by one."""
     initialise("cpu")
-    monkeypatch.setattr(occupancy, "on_gpu", lambda: request.param)
+    use(request.param, monkeypatch)
     return OccupancyVoxels
 
 
@@ -178,6 +185,35 @@ def test_cleared_voxels_are_as_good_as_fresh_ones(voxels: Callable[..., Occupanc
     points = rng.uniform(-2, 2, (500, 3))
     assert not v.query(points, 5.0).any()
     assert v.admit(points, 0.1).tolist() == [plain.admit(p, 0.1) for p in points]
+
+
+def test_marks_saved_in_one_form_are_restored_in_any_other(
+    taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    initialise("cpu")
+    forms = []
+    for form in FORMS:
+        use(form, monkeypatch)
+        forms.append(OccupancyVoxels(1.0, levels=9, resolution=64))
+    rng = np.random.default_rng(4)
+    # Some beyond the range of the finest stack of levels.
+    points = rng.normal(size=(900, 3)) * 10 ** rng.uniform(-2, 4, (900, 1))
+    sizes = 2.0 ** -rng.integers(0, 9, 900)
+    marks = []
+    for one in forms:
+        one.update(points[:300], 2.0)
+        one.clear()  # bricks stay and count on
+        one.update(points, sizes)
+        marks.append(one.marks())
+        assert one.nbytes == forms[0].nbytes
+    for places, words in marks[1:]:
+        np.testing.assert_array_equal(places, marks[0][0])
+        np.testing.assert_array_equal(words, marks[0][1])
+    for one, saved in zip(forms, marks[1:] + marks[:1], strict=True):
+        one.update(points + 0.3, 0.01)
+        one.restore(*saved)
+        np.testing.assert_array_equal(one.marks()[0], saved[0])
+        np.testing.assert_array_equal(one.marks()[1], saved[1])
 
 
 @pytest.mark.parametrize("wrong", [{"levels": 0}, {"levels": 12, "resolution": 512}, {"coarsest": 0.0}])

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from fields.map import occupancy
 from fields.map.occupancy import OccupancyVoxels
 
 LEVELS = 4
@@ -20,9 +21,11 @@ steps = st.lists(
 )
 
 
-@pytest.fixture(scope="module")
-def voxels(taichi_on_the_cpu: None) -> OccupancyVoxels:
-    return OccupancyVoxels(1.0, levels=LEVELS, resolution=64)
+@pytest.fixture(scope="module", params=["sparse", "hashed"])
+def voxels(taichi_on_the_cpu: None, request: pytest.FixtureRequest) -> OccupancyVoxels:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(occupancy, "has_sparse_fields", lambda: request.param == "sparse")
+        return OccupancyVoxels(1.0, levels=LEVELS, resolution=64)
 
 
 def cells_of(place: tuple[float, ...], size: float) -> set[tuple[int, ...]]:

@@ -1,0 +1,130 @@
+"""The layout of the occupancy voxels' bricks, and `Bricks`, the storage of their words.
+
+A brick holds four levels of the same place: 16^3 cells of the finest of them, then 8^3, 4^3 and 2^3, with one bit per
+cell, in words of 4^3 cells. The last word is only one eighth full. A depth counts levels above the finest, and four
+depths make a stack. The bricks of further stacks follow along the first axis, so that the corner of a brick, three
+integers, tells its stack as well.
+"""
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportOptionalCall=false
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.runtime.engine import ti
+
+__all__ = ["BRICKS", "BRICK_LEVELS", "SIDE", "WORDS", "Bricks", "corner_of", "depth_reached", "place_of"]
+
+BRICK_LEVELS = 4
+BRICK = 2**BRICK_LEVELS
+FIRST_WORD = (0, 64, 72, 73)
+WORDS = 74
+# Bricks per axis, for each stack.
+BRICKS = 1 << 15
+SIDE = BRICK * BRICKS
+
+
+@ti.func
+def depth_reached(cell, level, levels):
+    """Depth of the first level from `level` up that covers a cell; `levels` if none does."""
+    depth = levels - 1 - level
+    reach = ti.max(cell, -1 - cell).max()
+    # The four levels of a brick cover the same range.
+    while depth < levels and (reach >> (depth & -BRICK_LEVELS)) >= SIDE // 2:
+        depth = (depth & -BRICK_LEVELS) + BRICK_LEVELS
+    return depth
+
+
+@ti.func
+def place_of(cell, depth):
+    """Place of a cell at a depth: the corner of its brick, and its word and bit there."""
+    # Shifts, since floor division of signed integers takes many instructions.
+    stack = depth >> 2
+    within = depth & (BRICK_LEVELS - 1)
+    brick = (cell >> ((stack + 1) * BRICK_LEVELS)) + BRICKS // 2
+    inside = (cell >> depth) & ((BRICK >> within) - 1)
+    first = 0
+    for k in ti.static(range(1, BRICK_LEVELS)):
+        first = ti.select(within == k, FIRST_WORD[k], first)
+    words = ti.max(BRICK_LEVELS - 2 - within, 0)  # log2 of the words per axis
+    word = ((inside[0] >> 2) << (2 * words)) + ((inside[1] >> 2) << words) + (inside[2] >> 2)
+    bit = ((inside[0] & 3) << 4) + ((inside[1] & 3) << 2) + (inside[2] & 3)
+    return ti.Vector([brick[0] + stack * BRICKS, brick[1], brick[2]]), first + word, bit
+
+
+def corner_of(cells: NDArray[np.int32], stack: int) -> NDArray[np.int32]:
+    """Corners (N, 3) of the bricks of a stack that hold cells (N, 3) of the finest level."""
+    corners = (cells >> ((stack + 1) * BRICK_LEVELS)) + BRICKS // 2
+    corners[:, 0] += stack * BRICKS
+    return corners
+
+
+class Bricks(ABC):
+    """Storage of the bricks that have been marked. A brick stays allocated when its marks are removed.
+
+    Cells (N, 3) are those of the finest level, and `level` (N,) is the level that is asked for; beyond its range, the
+    first coarser level that covers the cell is used.
+
+    Args:
+        levels: Number of levels.
+    """
+
+    def __init__(self, levels: int) -> None:
+        self.levels = levels
+        self.stacks = -(-levels // BRICK_LEVELS)
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number of allocated bricks."""
+
+    @abstractmethod
+    def clear(self) -> None:
+        """Remove all marks."""
+
+    @abstractmethod
+    def read(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
+        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 74)."""
+
+    @abstractmethod
+    def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
+        """Set words (M,) at their places (M, 4): the brick's corner and the word in the brick."""
+
+    @abstractmethod
+    def query(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return whether each cell is marked (N,). A cell that no level covers counts as marked."""
+
+    @abstractmethod
+    def mark(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> None:
+        """Mark each cell, from its level up to the coarsest. All cells lie in the range of some level."""
+
+    def admit(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Mark the first point of each free cell, in order, and return which those are (N,).
+
+        Points of equal level are processed in parallel. Within one level, a point is only affected by earlier points of
+        its own cell, so the first point represents the cell. The batch is split where the level changes.
+        """
+        admitted = np.zeros(len(cells), dtype=bool)
+        cuts = np.flatnonzero(np.diff(level)) + 1
+        for run in np.split(np.arange(len(cells)), cuts):
+            # Beyond the range of its level, a point is represented by its cell on the coarser level that is used.
+            depth = self.depth_reached(cells[run], level[run])
+            place = np.column_stack([cells[run] >> depth[:, None], depth])
+            first = run[np.sort(np.unique(place, axis=0, return_index=True)[1])]
+            free = first[~self.query(cells[first], level[first])]
+            self.mark(cells[free], level[free])
+            admitted[free] = True
+        return admitted
+
+    def depth_reached(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The function `depth_reached` on the host: the depth (N,) of the level that is used for each cell."""
+        depth = self.levels - 1 - level
+        reach = np.maximum(cells, -1 - cells).max(axis=1)
+        for _ in range(self.stacks):
+            stack = depth & -BRICK_LEVELS
+            beyond = (depth < self.levels) & ((reach >> stack) >= SIDE // 2)
+            depth = np.where(beyond, stack + BRICK_LEVELS, depth)
+        return depth

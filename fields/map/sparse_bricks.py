@@ -1,0 +1,178 @@
+"""`SparseBricks`: bricks of the occupancy voxels as the leaves of a sparse SNode hierarchy, on the CPU and CUDA."""
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportOptionalCall=false
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.bricks import BRICK_LEVELS, BRICKS, WORDS, Bricks, depth_reached, place_of
+from fields.runtime.backend import on_gpu, refuse_too_many_fields
+from fields.runtime.engine import ti
+from fields.runtime.parallel import HANDED_OUT
+
+__all__ = ["SparseBricks"]
+
+# Fan-outs per axis of the pointer levels above the bricks. They are small at the bottom, where most of a node around a
+# surface is empty.
+POINTERS = (64, 16, 8, 2, 2)
+assert np.prod(POINTERS) == BRICKS
+# Number of groups of bricks that the CPU processes in parallel in `admit`.
+SHARES = 8
+
+CELLS = ti.types.ndarray(dtype=ti.i32, ndim=2)
+LEVELS = ti.types.ndarray(dtype=ti.i32, ndim=1)
+FLAGS = ti.types.ndarray(dtype=ti.u8, ndim=1)
+
+
+@ti.data_oriented
+class SparseBricks(Bricks):
+    """Bricks of 64-bit words below five pointer levels.
+
+    The stacks share one tree, because every additional tree takes address space, of which Taichi 1.7.4 handles only the
+    first GB well.
+
+    Args:
+        levels: Number of levels.
+    """
+
+    def __init__(self, levels: int) -> None:
+        super().__init__(levels)
+        self.words = ti.field(ti.u64)
+        outer, *inner = POINTERS
+        builder = ti.FieldsBuilder()
+        node = builder.pointer(ti.ijk, (outer * self.stacks, outer, outer))
+        for fan_out in inner:
+            node = node.pointer(ti.ijk, (fan_out,) * 3)
+        node.dense(ti.l, WORDS).place(self.words)
+        self._bricks = node
+        self._next = ti.field(ti.i32)
+        builder.place(self._next)
+        builder.finalize()
+        refuse_too_many_fields(self.words)
+
+    @property
+    def count(self) -> int:
+        """Number of allocated bricks."""
+        return self._count()
+
+    def clear(self) -> None:
+        """Remove all marks."""
+        self._clear()
+
+    def read(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
+        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 74)."""
+        count = self.count
+        corners, words = np.zeros((count, 3), dtype=np.int32), np.zeros((count, WORDS), dtype=np.uint64)
+        if count:
+            self._next[None] = 0
+            self._read(corners, words)
+        return corners, words
+
+    def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
+        """Set words (M,) at their places (M, 4): the brick's corner and the word in the brick."""
+        self._write(places, words)
+
+    def query(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return whether each cell is marked (N,). A cell that no level covers counts as marked."""
+        out = np.empty(len(cells), dtype=np.uint8)
+        self._query(cells, level, out)
+        return out.astype(bool)
+
+    def mark(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> None:
+        """Mark each cell, from its level up to the coarsest. All cells lie in the range of some level."""
+        self._mark(cells, level)
+
+    def admit(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Mark the first point of each free cell, in order, and return which those are (N,).
+
+        On the CPU, groups of bricks run in parallel, each point after point.
+        """
+        if on_gpu():
+            return super().admit(cells, level)
+        out = np.empty(len(cells), dtype=np.uint8)
+        self._admit(cells, level, out)
+        return out.astype(bool)
+
+    @ti.kernel
+    def _clear(self):
+        # Loop over bricks, since a struct-for over the words skips some of them (Taichi 1.7.4).
+        for i, j, k in self._bricks:
+            for word in range(WORDS):
+                self.words[i, j, k, word] = ti.u64(0)
+
+    @ti.kernel
+    def _count(self) -> ti.i32:
+        count = 0
+        for _i, _j, _k in self._bricks:
+            count += 1
+        return count
+
+    @ti.kernel
+    def _read(self, corners: ti.types.ndarray(dtype=ti.i32, ndim=2), words: ti.types.ndarray(dtype=ti.u64, ndim=2)):
+        for i, j, k in self._bricks:
+            row = ti.atomic_add(self._next[None], 1)
+            corners[row, 0], corners[row, 1], corners[row, 2] = i, j, k
+            for word in range(WORDS):
+                words[row, word] = self.words[i, j, k, word]
+
+    @ti.kernel
+    def _write(self, places: CELLS, words: ti.types.ndarray(dtype=ti.u64, ndim=1)):
+        for m in range(words.shape[0]):
+            self.words[places[m, 0], places[m, 1], places[m, 2], places[m, 3]] = words[m]
+
+    @ti.kernel
+    def _query(self, cells: CELLS, level: LEVELS, out: FLAGS):
+        for i in range(level.shape[0]):
+            cell = ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]])
+            depth = depth_reached(cell, level[i], self.levels)
+            # A cell that no level covers counts as occupied.
+            occupied = 1
+            if depth < self.levels:
+                place, bit, _ = self._at(cell, depth)
+                occupied = (self.words[place] & bit) != ti.u64(0)
+            out[i] = ti.cast(occupied, ti.u8)
+
+    @ti.kernel
+    def _admit(self, cells: CELLS, level: LEVELS, out: FLAGS):
+        # A point depends only on earlier points in its brick of the coarsest levels. Groups of bricks therefore run in
+        # parallel, and each group goes through the batch in order.
+        for spread in range(SHARES * HANDED_OUT):
+            if spread % HANDED_OUT == 0:
+                for i in range(level.shape[0]):
+                    cell = ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]])
+                    if self._share(cell) == spread // HANDED_OUT:
+                        out[i] = self._admit_one(cell, level[i])
+
+    @ti.kernel
+    def _mark(self, cells: CELLS, level: LEVELS):
+        for i in range(level.shape[0]):
+            self._admit_one(ti.Vector([cells[i, 0], cells[i, 1], cells[i, 2]]), level[i])
+
+    @ti.func
+    def _share(self, cell):
+        """Group of a cell, the same for all cells in a brick of the coarsest levels."""
+        brick = cell >> ti.static(BRICK_LEVELS * self.stacks)
+        return (brick[0] + 3 * brick[1] + 5 * brick[2]) & (SHARES - 1)
+
+    @ti.func
+    def _admit_one(self, cell, level):
+        asked = depth_reached(cell, level, self.levels)
+        depth = asked
+        while depth < self.levels:
+            place, bit, siblings = self._at(cell, depth)
+            # An atomic, so that one walk down the tree both reads and writes the word.
+            marked = ti.atomic_or(self.words[place], bit)
+            if marked & bit:
+                break
+            depth += 1
+            # If a sibling is marked, so are the parent and all coarser cells.
+            if marked & siblings:
+                break
+        return ti.cast(depth > asked, ti.u8)
+
+    @ti.func
+    def _at(self, cell, depth):
+        """Index of the word of a cell at a depth, its bit there, and the bits of all eight cells of its parent."""
+        corner, word, bit = place_of(cell, depth)
+        even = bit & 0b101010  # the sibling with even coordinates: the first of the 2^3 bits
+        place = ti.Vector([corner[0], corner[1], corner[2], word])
+        return place, ti.u64(1) << ti.cast(bit, ti.u64), ti.u64(0x330033) << ti.cast(even, ti.u64)
