@@ -65,15 +65,16 @@ class Recording:
         """Class and function of an entry's kernel; None for the engine's own kernels and for serial tasks.
 
         A kernel's first task may be serial: one thread that computes the bounds of the loop. The tasks after the first
-        loop get their number.
+        loop get their number, and so do the further variants of a kernel with templates.
         """
         kernel, _, task = entry.partition("_kernel_")
-        stem = kernel.removesuffix("_reverse_grad").rpartition("_")[0]
+        stem, _, variant = kernel.removesuffix("_reverse_grad").rpartition("_")
         if stem not in self.names or not task.endswith("range_for"):
             return None
         reverse = ", reverse" if kernel.endswith("_reverse_grad") else ""
         number = int(task.split("_")[0])
-        return self.names[stem] + reverse + (f", loop {number}" if number > 1 else "")
+        loop = f", loop {number}" if number > 1 else ""
+        return self.names[stem] + reverse + loop + (f", variant {int(variant) + 1}" if variant != "0" else "")
 
 
 def record(engine: str, capability: int, folder: Path) -> Recording:
@@ -108,9 +109,7 @@ def record(engine: str, capability: int, folder: Path) -> Recording:
     lines = [line.split() for line in (folder / "launches.txt").read_text().splitlines()]
     launches = [Launch(entry, int(threads), int(shared)) for entry, threads, shared in lines]
     first, last = told["step"]
-    return Recording(
-        sorted(folder.glob("*.ptx")), Counter(launches), Counter(launches[first:last]), told["names"]
-    )
+    return Recording(sorted(folder.glob("*.ptx")), Counter(launches), Counter(launches[first:last]), told["names"])
 
 
 def _compile_driver(folder: Path) -> None:

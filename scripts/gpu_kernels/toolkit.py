@@ -50,7 +50,9 @@ def tool(name: str) -> Path:
     installed = shutil.which(name)
     if installed:
         return Path(installed)
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modp-ti" / WHEELS[name].replace("==", "-")
+    cache = (
+        Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modp-ti" / WHEELS[name].replace("==", "-")
+    )
     found = sorted(cache.glob(f"nvidia/**/bin/{name}"))
     if not found:
         print(f"fetching {name} ({WHEELS[name]}) ...", file=sys.stderr)
