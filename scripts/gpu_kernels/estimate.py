@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from benchmarks.scene import Size, add_gaussians, camera_of
 from benchmarks.step import ADAM_BYTES
+from numpy.typing import NDArray
+
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
@@ -19,7 +20,7 @@ from pipelines.render.gpu.compositing_gradient import STEP
 from pipelines.render.renderer import Renderer
 
 __all__ = [
-    "BATCHES", "CARDS", "Card", "Work", "backward_counts", "forward_counts", "measure_work",
+    "BATCHES", "CARDS", "Card", "Work", "backward_counts", "count_work", "forward_counts", "measure_work",
     "memory_milliseconds", "milliseconds",
 ]  # fmt: skip
 
@@ -29,15 +30,15 @@ WARPS = TILE_PIXELS // WARP  # of a tile
 WARP_ROWS = WARP // TILE_WIDTH
 NEAR = 0.01
 
-# Bytes that a step reads or writes in the device's memory, if every value is moved once by each kernel that uses it:
-# of a pixel: image and opacity written and read again (3 + 1 + 1, 3 + 1), loss and its gradient (9 + 9 + 3 + 3 floats of
-# SSIM, 6 of images twice, 3 of the gradient, written and read),
-PIXEL_BYTES = 4 * (5 + 4 + 24 + 12 + 6)
-# of a pair: key and index through four passes of a sort (2 + 8 each way), slot, rows and origin written and read twice,
-# ten values gathered twice, ten sums of the gradient written and read,
+# Bytes that a step reads or writes in the device's memory, if each kernel moves each of its values once.
+# Of a pixel: the image written (5 floats) and its reference (4); the loss (12 of images read, 12 of SSIM written and 9
+# read, 2 of the mask); the gradient written and read (6); what else the backward pass reads (5).
+PIXEL_BYTES = 4 * (5 + 4 + 12 + 21 + 2 + 6 + 5)
+# Of a pair: key and index through four passes of a sort; slot, rows and origin written and read twice; ten values of
+# its Gaussian read twice; ten sums written and read.
 PAIR_BYTES = 4 * 2 * (2 + 8) + 3 * (4 + 4 + 8) + 2 * 40 + 2 * 40
-# of a Gaussian: depth and index through eight passes of a sort, its 14 values and the 12 projected ones written or read
-# by five kernels in each direction; and Adam's.
+# Of a Gaussian: depth and index through eight passes of a sort; its 14 values and the 12 projected ones, read or
+# written by ten kernels; and Adam's.
 GAUSSIAN_BYTES = 8 * 2 * (4 + 8) + 10 * 4 * (14 + 12) + ADAM_BYTES
 
 
@@ -105,20 +106,35 @@ def measure_work(size: Size) -> Work:
     renderer = Renderer(gaussians, size.width, size.height)
     renderer.forward(camera_of(size.width, size.height), np.eye(4), NEAR)
     _SquareBinning(renderer.view, renderer.projected, renderer.pairs).forward()
-    tiles = tile_count(size.width, size.height)
-    first, count = (getattr(renderer.pairs, name).to_numpy()[:tiles] for name in ("first", "tile_count"))
-    packed = renderer.pairs.rows_to_numpy()
+    per_tile = renderer.pairs.tile_count.to_numpy()[: tile_count(size.width, size.height)]
+    return count_work(size, per_tile, renderer.pairs.rows_to_numpy())
+
+
+def count_work(size: Size, per_tile: NDArray[np.int32], packed: NDArray[np.int32]) -> Work:
+    """Count the work of the kernels.
+
+    Args:
+        size: Size of the scene.
+        per_tile: Number of pairs of each tile.
+        packed: Rows of each pair, tile by tile, as first | (last + 1) << 16.
+    """
     top, end = packed & 0xFFFF, packed >> 16
-    hits = np.maximum((end - 1) // WARP_ROWS - top // WARP_ROWS + 1, 0)[end > top].sum()
-    # In the backward pass, a warp sums over the rows of two neighbours of the list at a time.
-    place = np.arange(len(packed)) - np.repeat(first, count)
-    even = np.flatnonzero(place % 2 == 0)
-    paired = np.append(place, 0)[even + 1] % 2 == 1
-    longest = np.maximum(end - top, 0)
-    rows = np.where(paired, np.maximum(longest[even], np.append(longest, 0)[even + 1]), longest[even]).sum()
-    batches = {name: int((-(-count // batch)).sum()) for name, batch in BATCHES.items()}
-    pixel_pairs = int(longest.sum()) * TILE_WIDTH
-    return Work(size, tiles, len(packed), int(hits), int(rows), batches, pixel_pairs)
+    height = np.maximum(end - top, 0)
+    hits = np.where(height > 0, (end - 1) // WARP_ROWS - top // WARP_ROWS + 1, 0)
+    # In the backward pass, a warp sums over the rows of two neighbours of a tile's list at a time.
+    ends = np.cumsum(per_tile)
+    place = np.arange(len(packed)) - np.repeat(ends - per_tile, per_tile)
+    last = place + 1 == np.repeat(per_tile, per_tile)
+    neighbour = np.where(last, 0, np.append(height[1:], 0))
+    return Work(
+        size,
+        tiles=len(per_tile),
+        pairs=len(packed),
+        hits=int(hits.sum()),
+        rows=int(np.maximum(height, neighbour)[place % 2 == 0].sum()),
+        batches={name: int((-(-per_tile // batch)).sum()) for name, batch in BATCHES.items()},
+        pixel_pairs=int(height.sum()) * TILE_WIDTH,
+    )
 
 
 def forward_counts(work: Work, loop: LoopCounts) -> Counts:

@@ -13,8 +13,6 @@ __all__ = ["Counts", "LoopCounts", "instructions_of", "loop_counts"]
 LABEL = re.compile(r"^\s*(\.L_\w+):")
 INSTRUCTION = re.compile(r"^\s*/\*[0-9a-f]{4,}\*/\s+(@!?U?P\d\s+)?([A-Z0-9_.]+)(.*?);?\s*$")
 TARGET = re.compile(r"`\((\.L_\w+)\)")
-# Accesses to shared memory of a row of a column's sums: weight, d loss / d power, and three gradients of the image.
-ROW_LOADS = 5
 
 
 @dataclass(frozen=True)
@@ -118,62 +116,55 @@ def loop_counts(code: list[Instruction]) -> LoopCounts:
     Raises:
         InputError: If the code has no such loop.
     """
-    loops = sorted(
-        {(code[end].target, end) for end in range(len(code)) if _is_back(code, end)}, key=lambda loop: loop[1] - loop[0]
-    )
+    loops = sorted(_loops(code), key=len)
     pairs = next((loop for loop in loops if _has(code, loop, "MUFU.EX2")), None)
-    batches = next((loop for loop in loops if pairs and loop[0] < pairs[0] and loop[1] > pairs[1]), None)
+    batches = next((loop for loop in loops if pairs and loop[0] < pairs[0] and loop[-1] > pairs[-1]), None)
     if pairs is None or batches is None:
         raise InputError("the machine code has no loop over Gaussians; scripts/gpu_kernels/machine_code.py expects one")
     ways = _ways(code, pairs)
-    inner = [
-        loop
-        for loop in loops
-        if batches[0] <= loop[0]
-        and loop[1] <= batches[1]
-        and loop not in (pairs, batches)
-        and not _has(code, loop, "MUFU")
-    ]
-    rows = max(inner, key=lambda loop: _count(code[loop[0] : loop[1] + 1]).shared, default=None)
-    row = Counts()
-    if rows:
-        unrolled = _count(code[rows[0] : rows[1] + 1])
-        row = unrolled * (ROW_LOADS / unrolled.shared)
-    covered = {i for first, last in (pairs, *inner) for i in range(first, last + 1)}
+    inner = [loop for loop in loops if set(loop) < set(batches) and loop != pairs and not _has(code, loop, "MUFU")]
+    rows = max(inner, key=lambda loop: _count(code, loop).shared, default=range(0))
+    # A row converts its number once, so that conversions tell how often the loop was unrolled.
+    unrolled = sum(code[i].opcode.startswith("I2F") for i in rows)
+    outside = set(batches).difference(pairs, *inner)
     return LoopCounts(
         hit=max(ways),
         missed=min(way for way in ways if way.shared),
-        row=row,
-        batch=_count(code[i] for i in range(batches[0], batches[1] + 1) if i not in covered),
-        tile=_count(code[: batches[0]]) + _count(code[batches[1] + 1 :]),
+        row=_count(code, rows) * (1.0 / max(unrolled, 1)),
+        batch=_count(code, outside),
+        tile=_count(code, set(range(len(code))).difference(batches)),
     )
 
 
-def _is_back(code: list[Instruction], i: int) -> bool:
-    target = code[i].target
-    return target is not None and target < i
+def _loops(code: list[Instruction]) -> set[range]:
+    """Indices of the instructions of every loop."""
+    return {
+        range(instruction.target, i + 1)
+        for i, instruction in enumerate(code)
+        if instruction.target is not None and instruction.target < i
+    }
 
 
-def _has(code: list[Instruction], loop: tuple, opcode: str) -> bool:
-    return any(instruction.opcode.startswith(opcode) for instruction in code[loop[0] : loop[1] + 1])
+def _has(code: list[Instruction], loop: range, opcode: str) -> bool:
+    return any(code[i].opcode.startswith(opcode) for i in loop)
 
 
-def _count(code: Iterable[Instruction]) -> Counts:
+def _count(code: list[Instruction], places: Iterable[int]) -> Counts:
     total = Counts()
-    for instruction in code:
-        name = instruction.opcode
-        if name != "NOP":
+    for i in places:
+        name = code[i].opcode
+        if name != "NOP" and code[i].target != i:  # neither what fills the end up nor the trap there
             total += Counts(1, name.startswith(("LDS", "STS")), name.startswith("MUFU"))
     return total
 
 
-def _ways(code: list[Instruction], loop: tuple) -> set[Counts]:
+def _ways(code: list[Instruction], loop: range) -> set[Counts]:
     """Counts of all ways through one turn of a loop."""
-    first, last = loop
+    first, last = loop[0], loop[-1]
     ways: dict[int, set[Counts]] = {first: {Counts()}}
     done: set[Counts] = set()
     for i in range(first, last + 1):
-        here = {way + _count([code[i]]) for way in ways.pop(i, set())}
+        here = {way + _count(code, [i]) for way in ways.pop(i, set())}
         target = code[i].target
         if i == last:
             done |= here

@@ -6,13 +6,12 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from modp_ti.files.errors import InputError
-
 from gpu_kernels.estimate import BATCHES
 from gpu_kernels.machine_code import LoopCounts, instructions_of, loop_counts
 from gpu_kernels.occupancy import Architecture, limit, occupancy
 from gpu_kernels.recording import record
 from gpu_kernels.toolkit import Assembled, assemble, disassemble
+from modp_ti.files.errors import InputError
 
 __all__ = ["COMPOSITING", "Kernel", "Survey", "survey"]
 

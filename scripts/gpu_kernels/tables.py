@@ -39,9 +39,9 @@ def _about(surveys: Sequence[Survey]) -> str:
     entries = ", ".join(str(found.entries) for found in surveys)
     return (
         f"The engine emits {targets}. Entries assembled: {entries}. Launches of a step on one view: "
-        f"{surveys[0].launches}. In the columns: registers of a thread, and the occupancy that registers, shared memory "
-        "and blocks allow; bytes of a thread that are spilled, and of its local memory, where there are any. First the "
-        "kernels of a step, with the number of their launches."
+        f"{surveys[0].launches}. In the columns: registers of a thread, and the occupancy that registers, shared "
+        "memory and blocks allow; bytes of a thread that are spilled, and of its local memory, where there are any. "
+        "Compositing comes first, then the kernels of a step, with the number of their launches."
     )
 
 
