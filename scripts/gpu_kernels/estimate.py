@@ -10,6 +10,7 @@ from benchmarks.step import ADAM_BYTES
 from numpy.typing import NDArray
 
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
+from fields.buffers.tiles import TilePairs
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
 from fields.runtime.engine import ti
@@ -105,9 +106,11 @@ def measure_work(size: Size) -> Work:
     add_gaussians(gaussians, size)
     renderer = Renderer(gaussians, size.width, size.height)
     renderer.forward(camera_of(size.width, size.height), np.eye(4), NEAR)
-    _SquareBinning(renderer.view, renderer.projected, renderer.pairs).forward()
-    per_tile = renderer.pairs.tile_count.to_numpy()[: tile_count(size.width, size.height)]
-    return count_work(size, per_tile, renderer.pairs.rows_to_numpy())
+    pairs = renderer.pairs
+    assert isinstance(pairs, TilePairs)  # the CPU's
+    _SquareBinning(renderer.view, renderer.projected, pairs).forward()
+    per_tile = pairs.tile_count.to_numpy()[: tile_count(size.width, size.height)].astype(np.int32)
+    return count_work(size, per_tile, pairs.rows_to_numpy())
 
 
 def count_work(size: Size, per_tile: NDArray[np.int32], packed: NDArray[np.int32]) -> Work:
