@@ -4,7 +4,7 @@ The pass goes front to back and sums without atomics, in three phases for every 
     A  one thread per pixel writes the weight and d loss / d power of each Gaussian to shared memory,
     B  one thread per (Gaussian, column of pixels) computes ten sums over the rows that the ellipse reaches,
     C  one thread per (Gaussian, sum) adds the columns.
-This takes about eight accesses to shared memory per pixel and Gaussian, compared with some fifty shuffles for a
+This takes about ten accesses to shared memory per pixel and Gaussian, compared with some fifty shuffles for a
 reduction over the warps, and the order of the sums is fixed.
 """
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
