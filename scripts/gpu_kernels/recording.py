@@ -88,6 +88,8 @@ def record(engine: str, capability: int, folder: Path) -> Recording:
     Raises:
         InputError: If the driver's stand-in cannot be compiled, or the engine does not start on it.
     """
+    if sys.platform != "linux":
+        raise InputError("the stand-in for the CUDA driver is a Linux library: run scripts/gpu_report on Linux")
     with tempfile.TemporaryDirectory() as libraries:
         _compile_driver(Path(libraries))
         environment = os.environ | {
