@@ -18,7 +18,6 @@ from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
 from pipelines.render.cpu.projection import ALPHA_MIN
 from pipelines.render.gpu.compositing_gradient import (
     COLUMNS,
-    PLANE,
     ROW_BITS,
     STEP,
     SUMS,
@@ -26,6 +25,7 @@ from pipelines.render.gpu.compositing_gradient import (
     add_columns,
     clear_pairs,
     column_sums,
+    row_bits,
     unclamped_alpha,
     write_weights,
 )
@@ -116,6 +116,7 @@ class DeviceCompositing:
             open_pixels = ti.simt.block.SharedArray((2,), ti.i32)
             tile, thread = i >> TILE_BITS, i & (TILE_PIXELS - 1)
             row = thread >> ROW_BITS
+            bit = 1 << row
             x = tile % tiles_x * TILE_WIDTH + thread % TILE_WIDTH
             y = tile // tiles_x * TILE_HEIGHT + row
             inside = (x < width) & (y < height)
@@ -134,12 +135,13 @@ class DeviceCompositing:
                 if start + thread < count:
                     k = first + start + thread
                     self._load(splats, thread * WIDTH, slot[k])
-                    spans[thread] = rows[k]
+                    spans[thread] = row_bits(rows[k])
                 ti.simt.block.sync()
                 turn = start // BATCH % 2
                 for j in range(ti.select(inside, ti.min(BATCH, count - start), 0)):
-                    at = j * WIDTH
-                    if T > OPAQUE and row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
+                    # LLVM sees from the mask that no index overflows, and makes the offsets of the values constant.
+                    at = (j & (BATCH - 1)) * WIDTH
+                    if T > OPAQUE and spans[j] & bit:
                         alpha = ti.min(unclamped_alpha(splats, at, px, py), ALPHA_MAX)
                         if alpha >= ALPHA_MIN:
                             weight = alpha * T
@@ -230,10 +232,10 @@ class DeviceCompositing:
         splats = ti.simt.block.SharedArray((STEP * WIDTH,), ti.f32)
         spans = ti.simt.block.SharedArray((STEP,), ti.i32)
         origins = ti.simt.block.SharedArray((STEP,), ti.i32)
-        image_grad = ti.simt.block.SharedArray(((3 + with_depth) * TILE_PIXELS,), ti.f32)
-        # First the weights of phase A, then the sums of phase B.
-        weights = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
-        power_grads = ti.simt.block.SharedArray((STEP * PLANE,), ti.f32)
+        # The four values of a pixel are side by side, and so are its two of phase A: one access loads them.
+        image_grad = ti.simt.block.SharedArray((4 * TILE_PIXELS,), ti.f32)
+        # First the weights and d loss / d power of phase A, then the sums of phase B.
+        weights = ti.simt.block.SharedArray((2 * STEP * TILE_PIXELS,), ti.f32)
 
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
         # Shifts and masks, so that LLVM sees that no index overflows.
@@ -249,7 +251,7 @@ class DeviceCompositing:
         # Threads of the block may still use shared memory for the previous tile.
         ti.simt.block.sync()
         for c in ti.static(range(3 + with_depth)):
-            image_grad[c * TILE_PIXELS + thread] = grads[c]
+            image_grad[thread * 4 + c] = grads[c]
 
         first, count, reached = self.pairs.first[tile], self.pairs.tile_count[tile], self.pairs.reached[tile]
         for step in range((reached + STEP - 1) // STEP):
@@ -258,17 +260,17 @@ class DeviceCompositing:
             if thread < here:
                 k = first + start + thread
                 self._load(splats, thread * WIDTH, slot[k])
-                spans[thread] = rows[k]
+                spans[thread] = row_bits(rows[k])
                 origins[thread] = ti.cast(origin[k], ti.i32)
             ti.simt.block.sync()
-            write_weights(here, thread, px, py, grads, T, behind, splats, spans, weights, power_grads, with_depth)
+            write_weights(here, thread, px, py, grads, T, behind, splats, spans, weights, with_depth)
             ti.simt.block.sync()
             # Phase B: this thread's Gaussian and column of pixels.
             g = thread >> ROW_BITS
             sums = ti.Vector.zero(ti.f32, SUMS)
             if g < here:
                 dx, dy = px - splats[g * WIDTH], ti.cast(top, ti.f32) + 0.5 - splats[g * WIDTH + 1]
-                sums = column_sums(g, column, spans[g], dx, dy, weights, power_grads, image_grad, with_depth)
+                sums = column_sums(g, column, spans[g], dx, dy, weights, image_grad, with_depth)
             ti.simt.block.sync()
             for c in ti.static(range(SUMS)):
                 weights[(g * SUMS + c) * COLUMNS + column] = sums[c]

@@ -4,7 +4,7 @@ The pass goes front to back and sums without atomics, in three phases for every 
     A  one thread per pixel writes the weight and d loss / d power of each Gaussian to shared memory,
     B  one thread per (Gaussian, column of pixels) computes ten sums over the rows that the ellipse reaches,
     C  one thread per (Gaussian, sum) adds the columns.
-This takes about eight accesses to shared memory per pixel and Gaussian, compared with some fifty shuffles for a
+This takes about ten accesses to shared memory per pixel and Gaussian, compared with some fifty shuffles for a
 reduction over the warps, and the order of the sums is fixed.
 """
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
@@ -17,7 +17,6 @@ from pipelines.render.cpu.projection import ALPHA_MIN
 
 __all__ = [
     "COLUMNS",
-    "PLANE",
     "ROW_BITS",
     "STEP",
     "SUMS",
@@ -25,6 +24,7 @@ __all__ = [
     "add_columns",
     "clear_pairs",
     "column_sums",
+    "row_bits",
     "unclamped_alpha",
     "write_weights",
 ]
@@ -34,12 +34,21 @@ STEP = 16
 # Values of a Gaussian in shared memory: mean (2), conic (3), opacity, colour (3), depth.
 WIDTH = 10
 ROW_BITS = TILE_WIDTH.bit_length() - 1
-# Strides in shared memory between the pixels of two Gaussians, and between the columns of two sums. They are padded so
-# that the two Gaussians, or the 32 sums, of the threads of a warp use different banks.
-PLANE = TILE_PIXELS + TILE_WIDTH
+# Stride in shared memory between the columns of two sums, padded so that the 32 sums of a warp's threads use different
+# banks.
 COLUMNS = TILE_WIDTH + 1
 # Sums of a Gaussian: the gradients of colour (3), depth and opacity, then the five moments that mean and conic need.
 SUMS = 10
+
+
+@ti.func
+def row_bits(rows):
+    """Rows of a tile that a pair reaches, as a bit each in the lower half, and the first of them in the upper half.
+
+    rows: Packed as first | (last + 1) << 16; see `TilePairs.rows`.
+    """
+    first = rows & 0xFFFF
+    return ((1 << (rows >> 16)) - (1 << first)) | (first << 16)
 
 
 @ti.func
@@ -62,7 +71,6 @@ def write_weights(
     splats: ti.template(),
     spans: ti.template(),
     weights: ti.template(),
-    power_grads: ti.template(),
     with_depth: ti.template(),
 ):
     """Phase A: weights and gradients of the step's `here` Gaussians at this thread's pixel.
@@ -70,10 +78,10 @@ def write_weights(
     grads: Gradients of the pixel's red, green, blue and depth.
     T, behind: Transmittance, and contributions of the Gaussians that are still to come; carried from step to step.
     """
-    row = thread >> ROW_BITS
+    bit = 1 << (thread >> ROW_BITS)
     for j in range(here):
         at = j * WIDTH
-        if row >= (spans[j] & 0xFFFF) and row < (spans[j] >> 16):
+        if spans[j] & bit:
             weight, power_grad = 0.0, 0.0
             unclamped = unclamped_alpha(splats, at, px, py)
             alpha = ti.min(unclamped, ALPHA_MAX)
@@ -88,42 +96,47 @@ def write_weights(
                 # d loss / d power = alpha * d loss / d alpha, and 0 where alpha is clamped.
                 if unclamped <= ALPHA_MAX:
                     power_grad = contribution - behind * alpha / (1.0 - alpha)
-            weights[j * PLANE + thread] = weight
-            power_grads[j * PLANE + thread] = power_grad
+            pixel = 2 * ((j & (STEP - 1)) * TILE_PIXELS + thread)
+            weights[pixel] = weight
+            weights[pixel + 1] = power_grad
 
 
 @ti.func
 def column_sums(
     g,
     column,
-    rows,
+    span,
     dx,
     dy,
     weights: ti.template(),
-    power_grads: ti.template(),
     image_grad: ti.template(),
     with_depth: ti.template(),
 ):
     """Phase B: sums of the step's g-th Gaussian over its rows of one column.
 
+    span: Its rows, from `row_bits`.
     dx, dy: From the Gaussian's mean to the column's first pixel.
     """
     s_red, s_green, s_blue, s_z = 0.0, 0.0, 0.0, 0.0
     s, s_y, s_yy = 0.0, 0.0, 0.0
-    for r in range(rows & 0xFFFF, rows >> 16):
-        at = ((r << ROW_BITS) & (TILE_PIXELS - 1)) | column
-        weight = weights[g * PLANE + at]
-        power_grad = power_grads[g * PLANE + at]
-        s_red += weight * image_grad[at]
-        s_green += weight * image_grad[TILE_PIXELS + at]
-        s_blue += weight * image_grad[2 * TILE_PIXELS + at]
+    r, bits = span >> 16, span & 0xFFFF
+    # Not a loop over a range, which NVIDIA's assembler would unroll four times. That takes 80 to 91 registers instead
+    # of 64, and leaves room for two or three blocks on a multiprocessor instead of four (scripts/gpu_report).
+    while (bits >> r) & 1:
+        pixel = ((r << ROW_BITS) & (TILE_PIXELS - 1)) | column
+        weight = weights[2 * (g * TILE_PIXELS + pixel)]
+        power_grad = weights[2 * (g * TILE_PIXELS + pixel) + 1]
+        s_red += weight * image_grad[4 * pixel]
+        s_green += weight * image_grad[4 * pixel + 1]
+        s_blue += weight * image_grad[4 * pixel + 2]
         if ti.static(with_depth):
-            s_z += weight * image_grad[3 * TILE_PIXELS + at]
+            s_z += weight * image_grad[4 * pixel + 3]
         down = dy + ti.cast(r, ti.f32)
         u = power_grad * down
         s += power_grad
         s_y += u
         s_yy += u * down
+        r += 1
     return ti.Vector([s_red, s_green, s_blue, s_z, s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy])
 
 
