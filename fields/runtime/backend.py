@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import torch
 
+from fields.runtime.device_check import computes_rightly
 from fields.runtime.engine import configuration, engine, forget_arrays, running_program, ti
 from fields.runtime.kernel_sources import answer_quickly
 from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
@@ -111,17 +112,20 @@ def _start_on(device: str, options: dict) -> str | None:
     if device == "metal":
         if sys.platform != "darwin":
             return "only macOS has Metal"
-        _start(ti.metal, options)
-        return None if configuration().arch == ti.metal else f"{engine().title} does not start on this machine's GPU"
-    chosen = _vulkan_device()
-    if chosen is None:
-        return "no Vulkan driver starts here"
-    if not chosen.has_int64:
-        return f"{chosen.name} has no 64-bit integers"
-    # The engine has to take the same device, whose features and kind were asked for and which `describe` names.
-    os.environ[engine().variable("visible_device")] = str(chosen.index)
-    _start(ti.vulkan, options)
-    return None if configuration().arch == ti.vulkan else f"{engine().title} does not start on {chosen.name}"
+        arch, name = ti.metal, "this machine's GPU"
+    else:
+        chosen = _vulkan_device()
+        if chosen is None:
+            return "no Vulkan driver starts here"
+        if not chosen.has_int64:
+            return f"{chosen.name} has no 64-bit integers"
+        # The engine has to take the same device, whose features and kind were asked for and which `describe` names.
+        os.environ[engine().variable("visible_device")] = str(chosen.index)
+        arch, name = ti.vulkan, chosen.name
+    _start(arch, options)
+    if configuration().arch != arch:
+        return f"{engine().title} does not start on {name}"
+    return None if computes_rightly() else f"{name} does not compute what the kernels need"
 
 
 def _start(arch: object, options: dict) -> None:

@@ -57,12 +57,16 @@ def test_a_device_that_does_not_start_is_refused_in_one_line_with_the_way_out_na
     assert "cpu or auto" in result.stderr.splitlines()[-1]
 
 
-def pretending(kind: int, device: str, has_int64: bool = True) -> subprocess.CompletedProcess[str]:
+def pretending(
+    kind: int, device: str, has_int64: bool = True, computes: bool = True
+) -> subprocess.CompletedProcess[str]:
     """Start on a device where the first Vulkan driver of this machine claims to be of a kind."""
+    wrong = "" if computes else "backend.computes_rightly = lambda: False\n"
     return python(
         "from dataclasses import replace; from fields.runtime import backend\n"
         "first = backend.vulkan_devices()[0]\n"
         f"backend.vulkan_devices = lambda: (replace(first, kind={kind}, has_int64={has_int64}),)\n"
+        f"{wrong}"
         f"started = backend.initialise('{device}'); print(started, backend.describe(started), sep='; ')"
     )
 
@@ -83,6 +87,15 @@ def test_a_driver_without_64_bit_integers_is_named_and_not_taken() -> None:
     assert pretending(2, "auto", has_int64=False).stdout.splitlines()[-1] == "cpu; CPU"
     refused = pretending(2, "vulkan", has_int64=False).stderr.splitlines()[-1]
     assert f"{vulkan_devices()[0].name} has no 64-bit integers; use device: cpu or auto" in refused
+
+
+@pytest.mark.skipif(has_cuda_driver() or sys.platform == "darwin", reason="there is another GPU")
+def test_a_driver_that_computes_wrongly_is_named_and_not_taken() -> None:
+    if not vulkan_devices():
+        pytest.skip("no Vulkan driver here")
+    assert pretending(2, "auto", computes=False).stdout.splitlines()[-1] == "cpu; CPU"
+    refused = pretending(2, "vulkan", computes=False).stderr.splitlines()[-1]
+    assert "does not compute what the kernels need; use device: cpu or auto" in refused
 
 
 @pytest.mark.skipif(has_cuda_driver() or sys.platform == "darwin", reason="there is another GPU")
