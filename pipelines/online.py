@@ -25,7 +25,7 @@ __all__ = ["OnlineMapper"]
 # Factor on all rates at the end of `finish`. 0.2 and 0.1 differ by less than 0.1 dB on five recordings; 1 is 0.4 to
 # 1.0 dB worse.
 LAST_RATE = 0.2
-# Number of keyframes whose Gaussians are too young to be removed because they hardly show.
+# Number of keyframes whose Gaussians may still grow, and are not removed because they hardly show.
 YOUNG = 10
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
@@ -105,14 +105,8 @@ class OnlineMapper(OnlineMap):
         psnr = self.optimise(plan.steps, level)
         if plan.removes_hidden and self.settings.densify.min_contribution > 0:
             with self.stopwatch.measure("optimise"):
-                self._remove_hidden()
+                self.remove_hidden(self.settings.densify.min_contribution, spared=YOUNG)
         return psnr, plan.steps
-
-    def _remove_hidden(self) -> None:
-        """Remove Gaussians that hardly show in any keyframe, but none of the latest ones, which may still grow."""
-        shown = self.contribution.measure(self.keyframes, self.near)
-        young = self.densifier.placed_since(self.keyframes[-min(YOUNG, len(self.keyframes))])
-        self.gaussians.remove((shown >= self.settings.densify.min_contribution) | young)
 
     def _draw_level(self, view: Keyframe) -> int:
         """Draw the pyramid level of a new keyframe from the levels that its image has."""

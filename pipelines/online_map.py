@@ -95,6 +95,18 @@ class OnlineMap(Pipeline):
         """
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
 
+    def remove_hidden(self, min_contribution: float, spared: int = 0) -> None:
+        """Remove Gaussians that hardly show in any keyframe.
+
+        Args:
+            min_contribution: Coverage in the keyframe that shows most of a Gaussian, below which it is removed [px].
+            spared: Number of the latest keyframes that keep the Gaussians placed in them.
+        """
+        kept = self.contribution.measure(self.keyframes, self.near) >= min_contribution
+        if spared:
+            kept |= self.densifier.placed_since(self.keyframes[-min(spared, len(self.keyframes))])
+        self.gaussians.remove(kept)
+
     def caught(self) -> Safeguards:
         """Return the safeguards' counts so far. Waits for the device."""
         return self.optimiser.caught()

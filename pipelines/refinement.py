@@ -77,8 +77,7 @@ def refine(
     step, share = done, schedule(done)
     if not done and settings.min_contribution > 0 and share is not None:
         with mapper.stopwatch.measure("refine"):
-            shown = mapper.contribution.measure(store, mapper.near)
-            mapper.gaussians.remove(shown >= settings.min_contribution)
+            mapper.remove_hidden(settings.min_contribution)
     while share is not None:
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0)
