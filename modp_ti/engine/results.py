@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,14 +34,14 @@ __all__ = ["Results", "metrics_of"]
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
 MAPS = ("online", "refined", "offline")
-# Files that are only written for a finished map.
-FIGURES = ("metrics.json", "scores.csv", "report.html")
+# What is only written for a finished map, after its scores.
+FIGURES = ("metrics.json", "scores.csv", "report.html", "renders")
 
 
 class Results:
     """Writes the output files of a run.
 
-    Inside `writing`, files go to the temporary `folder` next to `config.output`.
+    Inside `writing_map` and `writing_figures`, files go to the temporary `folder` next to `config.output`.
 
     Args:
         config: The scene's settings.
@@ -55,15 +55,31 @@ class Results:
         self._album = Album.of(frames.held_out)
 
     @contextmanager
-    def writing(self) -> Iterator[None]:
+    def writing_map(self) -> Iterator[None]:
         """Move the files that are written inside this context to the output folder together, if no error occurred.
 
-        It raises InputError if the files cannot be written.
+        Scores, report and renders of an earlier run are deleted from there, as they are not those of this map. It
+        raises InputError if the files cannot be written.
         """
         with appearing(self.config.output) as self.folder:
-            (self.folder / "renders").mkdir()
             yield
             dump_scene(self.config, self.folder / "config.yaml")
+            for name in FIGURES:
+                earlier = self.config.output / name
+                if earlier.is_dir():
+                    shutil.rmtree(earlier)
+                else:
+                    earlier.unlink(missing_ok=True)
+
+    @contextmanager
+    def writing_figures(self) -> Iterator[None]:
+        """As `writing_map`, for scores, report and pictures of the map that is in the output folder."""
+        with ExitStack() as parts:
+            self.folder = parts.enter_context(appearing(self.config.output))
+            (self.folder / "renders").mkdir()
+            if self.config.export.images:
+                self._images = parts.enter_context(appearing(self.config.output / "colmap"))
+            yield
 
     def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> MapVersion:
         """Write the map, and return it with its Gaussians as read back from `splats.ply`."""
@@ -90,7 +106,7 @@ class Results:
         side.
         """
         if self.config.export.images:
-            write_image(self.folder / "colmap", self._names[frame.index], frame)
+            write_image(self._images, self._names[frame.index], frame)
         if frame.held_out:
             pair = np.round(np.hstack([frame.image, render]) * 255.0).astype(np.uint8)
             write_picture(self.folder / "renders" / f"{frame.index:06d}.png", pair)
@@ -101,11 +117,6 @@ class Results:
         """Write `scores.csv` and `metrics.json`."""
         write_scores(self.folder / "scores.csv", scores)
         replace_text(self.folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
-
-    def remove_figures(self) -> None:
-        """Delete scores and report of an earlier run from the output folder, as a stopped run has none of its own."""
-        for name in FIGURES:
-            (self.config.output / name).unlink(missing_ok=True)
 
     def write_report(
         self,

@@ -50,7 +50,7 @@ def run_scene(
 ) -> Path:
     """Map a scene and write its output folder.
 
-    All files except snapshots are written after the map is finished, and appear together.
+    The finished map appears in the folder first, its scores and the report after them. Files of either appear together.
 
     Args:
         config: The scene's settings.
@@ -109,7 +109,6 @@ class _Session:
         self._say(*remarks(self.mapper.pipeline))
         self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
         versions = self._versions()
-        self.observer.on_stage("evaluating the saved map")
         self._write(versions)
         return self.config.output
 
@@ -276,31 +275,33 @@ class _Session:
         self._after_step("refining", step, steps, psnr)
 
     def _write(self, versions: dict[str, MapVersion]) -> None:
-        """Write the map, evaluate the map as read back from its file, and write the scores and the report."""
-        pipeline = self.mapper.pipeline
+        """Write the map; evaluate it as read back from its file, and write the scores and the report."""
+        pipeline, output = self.mapper.pipeline, self.config.output
         results = Results(self.config, self.mapper.frames)
         last = list(versions)[-1]
         try:
-            with results.writing():
-                with self.line.working("writing the map"):
-                    versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
-                    self.conductor.write_session(results.folder, self.config)
-                self._say(*self.conductor.notes)
-                self.conductor.saved()
-                scores = self._score(versions, results)
-                metrics = None if scores is None else self._write_figures(scores, versions, results)
+            with results.writing_map(), self.line.working("writing the map"):
+                versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
+                self.conductor.write_session(results.folder, self.config)
         except InputError as error:
             raise InputError(f"{error}{self._way_on(versions[last])}") from None
-        if metrics is None:
-            results.remove_figures()
-            output = self.config.output
-            more = f"; modp-ti run --resume {output} scores it" if self.checkpointer.path.is_file() else ""
-            raise KeyboardInterrupt(f"interrupted: the finished map is in {output}, without its scores{more}")
+        self._say(*self.conductor.notes)
+        self.conductor.saved()
+        self.observer.on_stage("evaluating the saved map")
+        more = f"; modp-ti run --resume {output} scores it" if self.checkpointer.path.is_file() else ""
+        unscored = f"the finished map is in {output}, without its scores{more}"
+        try:
+            with results.writing_figures():
+                metrics = self._write_figures(self._score(versions, results), versions, results)
+        except RunStopped:
+            raise KeyboardInterrupt(f"interrupted: {unscored}") from None
+        except InputError as error:
+            raise InputError(f"{error}; {unscored}") from None
         self.checkpointer.remove()
         self.line.summary(metrics)
 
-    def _score(self, versions: dict[str, MapVersion], results: Results) -> list[FrameScore] | None:
-        """Score all frames and write the pictures of the last version. None if interrupted; the map is complete."""
+    def _score(self, versions: dict[str, MapVersion], results: Results) -> list[FrameScore]:
+        """Score all frames and write the pictures of the last version. Raises RunStopped between two frames."""
         last = list(versions)[-1]
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
@@ -314,8 +315,6 @@ class _Session:
         try:
             with pipeline.stopwatch.measure("evaluate"), FramesAhead(self.tracker, self.ahead) as again:
                 return evaluate(pipeline, again, versions, self.lpips, keep)
-        except RunStopped:
-            return None
         finally:
             self.line.stop()
 
@@ -365,11 +364,10 @@ class _Session:
         if len(keyframes):
             results, version = Results(self.config, frames), self.mapper.version()
             try:
-                with results.writing():
+                with results.writing_map():
                     results.write_map(version, keyframes, self.mapper.pipeline.near)
             except InputError as error:
                 raise InputError(f"{error}{self._way_on(version)}") from None
-            results.remove_figures()
             said += f"; the map so far is in {output}"
         return KeyboardInterrupt(f"{said}; modp-ti run --resume {output} goes on" if resumable else said)
 

@@ -81,7 +81,7 @@ def test_ctrl_c_after_the_recording_has_ended_saves_the_map_so_far(
         session.run_scene(load_scene(scene))
     out = scene.parent / "out"
     assert str(stopped.value) == f"interrupted after {observer.seen} frames; the map so far is in {out}"
-    assert set(os.listdir(out)) == SAVED | {"renders"}
+    assert set(os.listdir(out)) == SAVED
     assert len(read_splats(out / "splats.ply")["position"]) > 20
 
 
@@ -104,8 +104,13 @@ def test_a_live_map_that_does_not_fit_on_the_disk_is_saved_elsewhere(
     monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
     monkeypatch.setattr(results.tempfile, "tempdir", None)
     (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(results, "write_scores", full)
     config = load_scene(scene, ["source.stop=12", "refine.seconds=null", "refine.steps=2"])
+    write_map = results.write_map
+    monkeypatch.setattr(
+        results,
+        "write_map",
+        lambda folder, *rest: full() if folder.parent == config.output.parent else write_map(folder, *rest),
+    )
     room_left(monkeypatch)
     with pytest.raises(InputError) as error:
         session.run_scene(config)
@@ -118,3 +123,33 @@ def test_a_live_map_that_does_not_fit_on_the_disk_is_saved_elsewhere(
         assert set(os.listdir(kept)) == SAVED and len(read_splats(kept / "splats.ply")["position"]) > 20
     else:
         assert said.endswith(f"; nor can {tmp_path / 'tmp'}: No space left on device, and the map is lost")
+
+
+class Watcher(Observer):
+    """Notes what the output folder holds when the evaluation begins."""
+
+    def __init__(self, output: Path) -> None:
+        self.output, self.held = output, set[str]()
+
+    def on_stage(self, stage: str) -> None:
+        if stage == "evaluating the saved map":
+            self.held = set(os.listdir(self.output))
+
+
+def test_the_finished_map_is_there_before_its_scores_and_stays_without_room_for_them(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = scene.parent / "out"
+    out.mkdir()
+    (out / "metrics.json").write_text("{}")
+    (out / "renders").mkdir()
+    watcher = Watcher(out)
+    monkeypatch.setattr(session._Session, "_open_observer", lambda _: watcher)
+    monkeypatch.setattr(results, "write_scores", full)
+    with pytest.raises(InputError) as error:
+        session.run_scene(load_scene(scene, ["source.stop=12", "refine.seconds=null", "refine.steps=2"]))
+    assert str(error.value) == (
+        f"{out}: cannot be written: No space left on device; the finished map is in {out}, without its scores"
+    )
+    assert watcher.held == SAVED == set(os.listdir(out))
+    assert len(read_splats(out / "splats.ply")["position"]) > 20

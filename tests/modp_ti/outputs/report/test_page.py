@@ -244,13 +244,13 @@ def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path, stages) -> N
     run = made_up_run(tmp_path, frames=6, refine=0, holdout=0)
     results = Results(run.config, delivered(list(run.tracked), [False] * 6))
     scores = list(run.scores) if stages == "all" else []
-    with results.writing():
+    with results.writing_figures():
         for i in range(6):
             image, render = picture(i, (16, 16)), picture(i + 1, (16, 16))
             results.write_frame(dataclasses.replace(black_frame(i), image=image), render)
         versions = dict(run.versions) if stages == "all" else {}
         said = results.write_report(run.record, dict(run.metrics), scores, versions, Keyframes(), [])
-    assert (run.config.output / "config.yaml").is_file()
+    assert (run.config.output / "renders").is_dir()
     if stages == "all":
         assert said is None
         page = Page((run.config.output / "report.html").read_text(encoding="utf-8"))
