@@ -74,7 +74,7 @@ class CorrectionReport:
     """Result of a correction.
 
     Attributes:
-        around: Similarity S_after_before (4, 4) of the world around every frame, by index.
+        around: Similarity S_after_before (4, 4) of the world around each frame whose world moved, by index.
         moved: Whether Gaussians have moved.
     """
 
@@ -136,17 +136,19 @@ class MapCorrector:
         growth = 1.0 if camera is None else camera[1].focal / camera[0].camera.focal
         anchors, voxels = self.densifier.anchors, self.densifier.voxels
         degree = self.densifier.gaussians.sh_degree
+        no_turn = sh_rotation(degree, np.eye(3))
         turns = {
             view.index: sh_rotation(degree, view.pending_motion[:3, :3] / scale_of(view.pending_motion))
             for view in self.keyframes
+            if view.pending_motion is not NO_MOTION
         }
         if anchors:
             S = np.stack([anchor.keyframe.pending_motion for anchor in anchors])
-            self.motion.move(S, np.stack([turns[anchor.keyframe.index] for anchor in anchors]))
+            self.motion.move(S, np.stack([turns.get(anchor.keyframe.index, no_turn) for anchor in anchors]))
             if camera is not None:
                 self.motion.place(self._on_new_rays(*camera), growth)
-        for anchor in anchors:
-            anchor.spacing *= float(scale_of(anchor.keyframe.pending_motion)) * growth
+            for anchor, scale in zip(anchors, scale_of(S).tolist(), strict=True):
+                anchor.spacing *= scale * growth
         if voxels is not None:
             first = self.keyframes[0].pending_motion
             origin = moved_points(first, voxels.origin[None])[0]
@@ -169,15 +171,15 @@ class MapCorrector:
 def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArray[np.float64]]:
     """Apply a correction to the tracked poses of all frames, and to the poses, points, depths and camera of keyframes.
 
-    Corrected frames take the pose that the correction names, and all others move with the world around them. The
-    Gaussians are not moved. Each keyframe's `pending_motion` accumulates the motion that they have to follow.
+    Corrected frames take the pose that the correction names, and all others move with the world around them unless they
+    stay. The Gaussians are not moved. Each keyframe's `pending_motion` accumulates the motion that they have to follow.
 
     Args:
         store: The keyframes, with the trajectory. Corrected frames that it does not contain are ignored.
         correction: The correction.
 
     Returns:
-        Similarity S_after_before (4, 4) of the world around every frame, by index.
+        Similarity S_after_before (4, 4) of the world around each frame whose world moved, by index.
     """
     trajectory = store.trajectory
     # Held-out frames take their corrected poses as well, but must not move the map.
@@ -188,13 +190,13 @@ def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArra
     scale = _scales(store, index, T_after, ids, xyz)
     S = [motion_around(trajectory[int(i)], T, s) for i, T, s in zip(index, T_after, scale, strict=True)]
     motion = WorldMotion(index, T_after, np.array(S).reshape(-1, 4, 4))
-    before = dict(trajectory)
-    after = {i: motion.of(i, T) for i, T in before.items()}
     named = dict(zip(correction.index.tolist(), correction.T_camera_world.copy(), strict=True))
+    before = {i: T for i, T in trajectory.items() if i in named or not correction.others_stay}
+    after = {i: motion.of(i, T) for i, T in before.items()}
     trajectory.revise({i: T for i, (T, _) in after.items()} | named)
-    around = {i: S for i, (_, S) in after.items()}
     for keyframe in store:
-        keyframe.follow(before[keyframe.index], around[keyframe.index])
+        if keyframe.index in after:
+            keyframe.follow(before[keyframe.index], after[keyframe.index][1])
     if correction.camera is not None:
         store.revise_camera(correction.camera)
     for keyframe in store:
@@ -205,7 +207,7 @@ def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArra
             if not np.array_equal(moved, keyframe.points.xyz):
                 keyframe.revise_points(replace(keyframe.points, xyz=moved))
     store.take_in_depths()
-    return around
+    return {i: S for i, (_, S) in after.items() if not np.array_equal(S, NO_MOTION)}
 
 
 def pending_motion_in_pixels(view: Keyframe) -> float:
@@ -214,7 +216,7 @@ def pending_motion_in_pixels(view: Keyframe) -> float:
     This is the mean over a grid of pixels at the keyframe's median depth; infinite if one of them would lie behind or
     too close to the camera.
     """
-    if np.array_equal(view.pending_motion, np.eye(4)):
+    if view.pending_motion is NO_MOTION or np.array_equal(view.pending_motion, NO_MOTION):
         return 0.0
     camera = view.camera
     across, down = (np.arange(0.1, 1.0, 0.2) * side for side in (camera.width, camera.height))

@@ -16,8 +16,8 @@ __all__ = ["PoseCorrection"]
 class PoseCorrection:
     """Revised poses and points after a bundle adjustment or a loop closure, and the camera if it was estimated anew.
 
-    Frames that are not listed follow the listed frames around them. A new camera is that of all frames, those after the
-    correction included.
+    Frames that are not listed follow the listed frames around them, or keep their poses with `others_stay`. A new
+    camera is that of all frames, those after the correction included.
 
     Attributes:
         index: Indices (N,) int64 of the frames, increasing.
@@ -25,6 +25,7 @@ class PoseCorrection:
         ids: Ids (M,) int64 of the tracked points that moved; may be empty.
         xyz: New positions (M, 3) float64 of these points in the world frame.
         camera: The new camera; None if it stays the same.
+        others_stay: Whether frames that are not listed keep their poses.
 
     Raises:
         ValueError: If there is no pose, a value is not finite, the shapes disagree, or the indices are negative or not
@@ -39,6 +40,7 @@ class PoseCorrection:
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     xyz: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     camera: CameraRevision | None = None
+    others_stay: bool = False
 
     def __post_init__(self) -> None:
         n, m = len(self.index), len(self.ids)

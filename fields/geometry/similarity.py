@@ -38,9 +38,10 @@ def motion_around(T_before: ArrayLike, T_after: ArrayLike, scale: float = 1.0) -
 
 def moved_pose(S: NDArray[np.float64], T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """T_camera_world (4, 4) of a camera that moves with the world by S (4, 4), so that its image stays the same."""
+    if np.array_equal(S, np.eye(4)):
+        return T_camera_world.copy()
     s = float(scale_of(S))
-    T = orthonormalised(np.diag([s, s, s, 1.0]) @ T_camera_world @ np.linalg.inv(S))
-    return T_camera_world.copy() if np.array_equal(S, np.eye(4)) else T
+    return orthonormalised(np.diag([s, s, s, 1.0]) @ T_camera_world @ np.linalg.inv(S))
 
 
 def moved_points(S: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -47,15 +47,18 @@ class GaussianMotion:
             raise ValueError(f"anchor {int(g.anchors().max())} has none of the {len(S)} motions")
         scale = scale_of(S)
         rotation = S[:, :3, :3] / scale[:, None, None]
+        moves = (S != np.eye(4)).any(axis=(1, 2))
+        quaternion = np.zeros((len(S), 4))
+        for a in np.flatnonzero(moves):  # of thousands of anchors, often only the latest move
+            quaternion[a] = quaternion_from_matrix(rotation[a])
         tables = (
             S[:, :3].reshape(-1, 12),
             rotation.reshape(-1, 9),
-            np.stack([quaternion_from_matrix(R) for R in rotation]),
+            quaternion,
             np.stack([np.log(scale), 1.0 / scale], axis=1),
             sh_rotation,
         )
-        moves = (S != np.eye(4)).any(axis=(1, 2)).astype(np.int32)
-        self._move(g.count, moves, *(np.ascontiguousarray(table, dtype=g.dtype) for table in tables))
+        self._move(g.count, moves.astype(np.int32), *(np.ascontiguousarray(table, dtype=g.dtype) for table in tables))
 
     def place(self, position: NDArray[np.float64], growth: float) -> None:
         """Give the Gaussians new positions, and scale them. Moments stay, and gradients are set to zero.

@@ -35,7 +35,7 @@ __all__ = ["FILE", "RecordedSession", "ReplayedRun", "SessionRecorder"]
 
 FILE = "session.zip"
 # Version of the file. Others are refused.
-VERSION = 1
+VERSION = 2
 ABOUT = "about.json"
 # Arrays of a correction, and of its camera where it has one.
 CORRECTION = ("index", "T_camera_world", "ids", "xyz")
@@ -94,7 +94,7 @@ class SessionRecorder:
         if revision is not None:
             arrays["camera"] = _numbers(revision.camera)
             arrays |= {name: array for name in REVISION if (array := getattr(revision, name)) is not None}
-        self._write({**arrays, "more": np.array(more)})
+        self._write({**arrays, "others_stay": np.array(correction.others_stay), "more": np.array(more)})
 
     def recorded(self, schedule: Schedule) -> Schedule:
         """Return the schedule of a refinement, and record what it says."""
@@ -268,7 +268,9 @@ def _correction(arrays: dict[str, NDArray]) -> PoseCorrection:
     camera = None
     if "camera" in arrays:
         camera = CameraRevision(_camera(arrays["camera"]), arrays.get("lookup"), arrays.get("covered"))
-    return PoseCorrection(**{name: arrays[name] for name in CORRECTION}, camera=camera)
+    return PoseCorrection(
+        **{name: arrays[name] for name in CORRECTION}, camera=camera, others_stay=bool(arrays["others_stay"])
+    )
 
 
 class ReplayedRun(Conductor):

@@ -74,10 +74,11 @@ class DeliveredFrames:
 
         Args:
             correction: The correction from the tracker.
-            around: Similarity S_after_before (4, 4) of the world around each frame, by index.
+            around: Similarity S_after_before (4, 4) of the world around each frame whose world moved, by index.
             moved: Whether the correction moved the map.
         """
-        self.points.correct(correction.ids, correction.xyz, [around[index] for index in self.index])
+        motions = {line: around[index] for line, index in enumerate(self.index) if index in around}
+        self.points.correct(correction.ids, correction.xyz, motions)
         if correction.camera is not None:
             self.camera = [correction.camera.camera] * len(self)
             self.points.revise_camera(correction.camera)

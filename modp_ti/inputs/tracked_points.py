@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from fields.frames.camera_revision import CameraRevision
 from fields.frames.tracked_frame import TrackedFrame
-from fields.geometry.similarity import moved_points
 from modp_ti.inputs.multiview.point_solving import placed_anew
 from modp_ti.inputs.multiview.reprojection import Observations
 from pipelines.memory_budget import OBSERVATION
@@ -78,7 +77,9 @@ class TrackedPoints:
         self._held_out.append(held_out)
         self._observations += len(rows)
 
-    def correct(self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Sequence[NDArray[np.float64]]) -> None:
+    def correct(
+        self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Mapping[int, NDArray[np.float64]]
+    ) -> None:
         """Apply a correction of the tracker's map.
 
         Ids that no frame observed are ignored. Points that are not in `ids` move with the last frame that observed
@@ -87,12 +88,15 @@ class TrackedPoints:
         Args:
             ids: Ids (N,) of the corrected points.
             xyz: Their new world positions (N, 3).
-            motions: Per frame, the similarity S_after_before (4, 4) of the world around it.
+            motions: Similarity S_after_before (4, 4) of the world around each frame whose world moved, by its place
+                among the frames.
         """
         last, places = self._last[: len(self), 0], self.xyz
-        for frame in np.unique(last):
-            seen = last == frame
-            places[seen] = moved_points(motions[frame], places[seen])
+        frames = np.array(sorted(motions), dtype=np.int64)
+        moving = np.flatnonzero(np.isin(last, frames))
+        if len(moving):
+            S = np.stack([motions[frame] for frame in frames.tolist()])[np.searchsorted(frames, last[moving])]
+            places[moving] = np.einsum("nij,nj->ni", S[:, :3, :3], places[moving]) + S[:, :3, 3]
         rows = np.array([self._row_of.get(i, -1) for i in ids.tolist()], dtype=np.int64)
         places[rows[rows >= 0]] = xyz[rows >= 0]
 

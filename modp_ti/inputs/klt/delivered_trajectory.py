@@ -119,6 +119,7 @@ class DeliveredTrajectory:
             T_camera_world=np.stack([self.frames[i].T_camera_world for i in index]),
             ids=ids.astype(np.int64),
             xyz=landmarks.xyz[ids].copy(),
+            others_stay=True,
         )
 
     def revise_camera(self, undistorter: Undistorter) -> PoseCorrection:
@@ -151,7 +152,10 @@ class DeliveredTrajectory:
 
     def _shift(self, k: int, delivered: NDArray[np.float64]) -> float:
         """Approximate image motion [px of the tracked image] of keyframe k since its pose was last delivered."""
-        change = self._map.keyframes[k].T_camera_world @ inverse_se3(delivered)
+        T_camera_world = self._map.keyframes[k].T_camera_world
+        if np.array_equal(T_camera_world, delivered):
+            return 0.0
+        change = T_camera_world @ inverse_se3(delivered)
         turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
         away = float(np.linalg.norm(change[:3, 3])) / max(self._depth(k), 1e-12)
         return (turn + away) * self._map.lens.focal

@@ -45,12 +45,21 @@ def test_points_move_with_the_world_around_their_frames(frames: DeliveredFrames)
     assert frames.corrections == {"received": 1, "moved": 1}
 
 
+def test_points_of_frames_whose_world_stays_do_not_move(frames: DeliveredFrames) -> None:
+    S = exp_se3([0.3, -0.2, 0.1, 0.1, 0.2, -0.3])
+    before = frames.points.xyz.copy()
+    frames.correct(PoseCorrection(np.array([2]), pose(2)[None], others_stay=True), {2: S}, moved=True)
+    moved = np.arange(3) + 6  # the points of frame 2, which no other frame sees
+    np.testing.assert_array_equal(np.flatnonzero((frames.points.xyz != before).any(axis=1)), moved)
+    np.testing.assert_allclose(frames.points.xyz[moved], before[moved] @ S[:3, :3].T + S[:3, 3], atol=1e-12)
+
+
 def test_points_that_the_tracker_names_are_where_it_says(frames: DeliveredFrames) -> None:
     before = frames.points.xyz.copy()
     correction = PoseCorrection(
         np.array([0]), pose(0)[None], np.array([21, 99]), np.array([[7.0, 8.0, 9.0], [0, 0, 0]])
     )
-    frames.correct(correction, dict.fromkeys(range(4), np.eye(4)), moved=False)
+    frames.correct(correction, {}, moved=False)
     changed = (frames.points.xyz != before).any(axis=1)
     np.testing.assert_array_equal(frames.points.ids[changed], [21])
     np.testing.assert_array_equal(frames.points.xyz[changed], [[7.0, 8.0, 9.0]])
