@@ -25,8 +25,6 @@ __all__ = ["OnlineMapper"]
 # Factor on all rates at the end of `finish`. 0.2 and 0.1 differ by less than 0.1 dB on five recordings; 1 is 0.4 to
 # 1.0 dB worse.
 LAST_RATE = 0.2
-# Number of keyframes whose Gaussians may still grow, and are not removed because they hardly show.
-YOUNG = 10
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
@@ -103,9 +101,8 @@ class OnlineMapper(OnlineMap):
             warming_up = self.frame_count <= self.settings.densify.warm_up
             self.densifier.add_error_pixels(image, warming_up, plan.pixels)
         psnr = self.optimise(plan.steps, level)
-        if plan.removes_hidden and self.settings.densify.min_contribution > 0:
-            with self.stopwatch.measure("optimise"):
-                self.remove_hidden(self.settings.densify.min_contribution, spared=YOUNG)
+        with self.stopwatch.measure("remove"):
+            self.hidden.sweep(plan.swept, self.near)
         return psnr, plan.steps
 
     def _draw_level(self, view: Keyframe) -> int:
@@ -185,7 +182,7 @@ class OnlineMapper(OnlineMap):
 
         While frames arrive, all rates are constant, and large enough for few steps. Here they decay, so that each
         Gaussian comes to rest. In a pass, every keyframe is a view once; views that follow each other are far apart.
-        After an interruption, `finish` goes on where it was.
+        The pace may end the passes early. After an interruption, `finish` goes on where it was.
 
         Args:
             progress: Called after every step with (views done, number of Gaussians, mean PSNR of the step's views).
@@ -194,7 +191,7 @@ class OnlineMapper(OnlineMap):
             Mean PSNR of the last step; None if nothing was optimised.
         """
         order = np.argsort(np.arange(len(self.keyframes)) * GOLDEN_RATIO % 1.0)
-        total = self.settings.optimise.last_views(len(order)) if len(self.gaussians) else 0
+        total = self.pace.last_views(len(order)) if len(self.gaussians) else 0
         views = np.resize(order, total)
         count = self.settings.views.per_step
         psnr = None

@@ -14,6 +14,7 @@ from pipelines.corrections import MapCorrector
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
 from pipelines.densify.depth import DepthEstimator, build_depth
+from pipelines.densify.hidden_gaussians import HiddenGaussians
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.pace import CompletePace, Pace
@@ -64,7 +65,6 @@ class OnlineMap(Pipeline):
         self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
         self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
         self.loss = self.optimiser.loss
-        self.contribution = Contribution(self.gaussians, self.renderer)
         self.trajectory = Trajectory()
         self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side, self.trajectory)
         self.gate = FrameGate(settings.gate, self.trajectory)
@@ -72,6 +72,8 @@ class OnlineMap(Pipeline):
         depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
         self.budget = self.densifier.budget
+        contribution = Contribution(self.gaussians, self.renderer)
+        self.hidden = HiddenGaussians(contribution, self.densifier, settings.densify.min_contribution)
         self.pace = pace or CompletePace(settings)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self.corrector = MapCorrector(self.keyframes, self.densifier)
@@ -94,18 +96,6 @@ class OnlineMap(Pipeline):
             Number of Gaussians removed.
         """
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
-
-    def remove_hidden(self, min_contribution: float, spared: int = 0) -> None:
-        """Remove Gaussians that hardly show in any keyframe.
-
-        Args:
-            min_contribution: Coverage in the keyframe that shows most of a Gaussian, below which it is removed [px].
-            spared: Number of the latest keyframes that keep the Gaussians placed in them.
-        """
-        kept = self.contribution.measure(self.keyframes, self.near) >= min_contribution
-        if spared:
-            kept |= self.densifier.placed_since(self.keyframes[-min(spared, len(self.keyframes))])
-        self.gaussians.remove(kept)
 
     def caught(self) -> Safeguards:
         """Return the safeguards' counts so far. Waits for the device."""

@@ -77,7 +77,7 @@ def refine(
     step, share = done, schedule(done)
     if not done and settings.min_contribution > 0 and share is not None:
         with mapper.stopwatch.measure("refine"):
-            mapper.remove_hidden(settings.min_contribution)
+            mapper.hidden.remove(settings.min_contribution, mapper.near)
     while share is not None:
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0)

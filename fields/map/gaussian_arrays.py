@@ -3,7 +3,7 @@
 
 from fields.runtime.engine import ti
 
-__all__ = ["read_integers", "read_values", "write_integers", "write_values"]
+__all__ = ["read_numbers", "read_values", "write_integers", "write_values"]
 
 
 @ti.kernel
@@ -59,7 +59,7 @@ def write_values(
 
 
 @ti.kernel
-def read_integers(field: ti.template(), out: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+def read_numbers(field: ti.template(), out: ti.types.ndarray(ndim=1)):
     """Copy the first N entries of a field."""
     for i in range(out.shape[0]):
         out[i] = field[i]

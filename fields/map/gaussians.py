@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fields.map.gaussian_arrays import read_integers, read_values, write_integers, write_values
+from fields.map.gaussian_arrays import read_numbers, read_values, write_integers, write_values
 from fields.runtime.backend import growing, refuse_too_many_fields
 from fields.runtime.engine import ti
 
@@ -25,7 +25,7 @@ MOMENTS = ("_m", "_v")
 class GaussianField:
     """Anisotropic Gaussians in the world frame, with their gradients and Adam moments.
 
-    Gaussians are always stored contiguously, at indices 0 to `count - 1`. A Gaussian takes 236 bytes at degree 0 in
+    Gaussians are always stored contiguously, at indices 0 to `count - 1`. A Gaussian takes 240 bytes at degree 0 in
     float32. The SNode tree is pointer(blocks) over dense(1024): memory follows the number of Gaussians, and no kernel
     is recompiled when the map grows. On a GPU the storage is dense and holds `max_gaussians` from the start. The values
     have the Taichi type `real`, `ti.f32` or `ti.f64`.
@@ -42,6 +42,8 @@ class GaussianField:
         sh: Coefficients (K, 3) of the harmonics, K = (sh_degree + 1)^2, in the layout of 3DGS files.
         steps: Number of Adam updates of each Gaussian.
         anchor: Number of the view that placed each Gaussian; NO_ANCHOR if it is not known.
+        coverage: Largest coverage of each Gaussian in the views measured so far [px], see `Contribution`. It is not
+            saved.
         count: Number of Gaussians.
         capacity: Size of the pool.
 
@@ -70,6 +72,7 @@ class GaussianField:
         self.steps = ti.field(ti.i32)
         self.anchor = ti.field(ti.i32)
         self.touched = ti.field(ti.i32)
+        self.coverage = ti.field(ti.f32)
         self._caught = ti.field(ti.i32)
 
         builder = ti.FieldsBuilder()
@@ -85,7 +88,7 @@ class GaussianField:
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh)
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
         blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
-        blocks.dense(ti.i, BLOCK).place(self.steps, self.anchor, self.touched)
+        blocks.dense(ti.i, BLOCK).place(self.steps, self.anchor, self.touched, self.coverage)
         builder.dense(ti.i, 2).place(self._caught)
         builder.finalize()
         refuse_too_many_fields(self._caught)
@@ -95,8 +98,8 @@ class GaussianField:
 
     @property
     def bytes_each(self) -> int:
-        """Bytes of one Gaussian: values, gradients, two moments and three integers."""
-        return 4 * (11 + 3 * self.sh_count) * np.dtype(self.dtype).itemsize + 3 * 4
+        """Bytes of one Gaussian: values, gradients, two moments, three integers and the coverage."""
+        return 4 * (11 + 3 * self.sh_count) * np.dtype(self.dtype).itemsize + 4 * 4
 
     # ---- growing and shrinking -------------------------------------------------------------------------------
 
@@ -181,7 +184,14 @@ class GaussianField:
         """Return the anchor (N,) of every Gaussian."""
         out = np.zeros(self.count, dtype=np.int32)
         if self.count:
-            read_integers(self.anchor, out)
+            read_numbers(self.anchor, out)
+        return out
+
+    def coverages(self) -> NDArray[np.float32]:
+        """Return the coverage (N,) of every Gaussian [px]."""
+        out = np.zeros(self.count, dtype=np.float32)
+        if self.count:
+            read_numbers(self.coverage, out)
         return out
 
     def gradients_to_numpy(self) -> dict[str, NDArray]:
@@ -228,7 +238,7 @@ class GaussianField:
         }
         steps = np.zeros(self.count, dtype=np.int32)
         if self.count:
-            read_integers(self.steps, steps)
+            read_numbers(self.steps, steps)
         return moments | {"steps": steps, "anchor": self.anchors()}
 
     def restore(self, state: dict[str, NDArray]) -> None:
@@ -329,6 +339,7 @@ class GaussianField:
             self.sh_v[i, k].fill(0.0)
         self.steps[i] = 0
         self.touched[i] = 0
+        self.coverage[i] = 0.0
 
     @ti.kernel
     def _write(
@@ -378,6 +389,7 @@ class GaussianField:
                 self.sh_v[t, k] = self.sh_v[s, k]
             self.steps[t] = self.steps[s]
             self.anchor[t] = self.anchor[s]
+            self.coverage[t] = self.coverage[s]
 
 
 _NAMES = ("position", "log_scale", "quaternion", "opacity_logit", "sh")

@@ -47,7 +47,7 @@ def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Co
         InputError: If the session cannot be recorded.
     """
     if isinstance(tracker, RecordedSession):
-        return ReplayedRun(tracker)
+        return ReplayedRun(config.mapping, tracker)
     if not config.is_realtime:
         frames, every = tracker.frame_count, config.source.holdout
         held_out = 0 if frames is None or every is None else -(-frames // every)

@@ -29,7 +29,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
 from pipelines.pace import Plan, RecordedPace
 from pipelines.refinement import Schedule
-from pipelines.settings import RefineSettings
+from pipelines.settings import MappingSettings, RefineSettings
 
 __all__ = ["FILE", "RecordedSession", "ReplayedRun", "SessionRecorder"]
 
@@ -120,7 +120,7 @@ class SessionRecorder:
             return
         decisions = {
             "version": VERSION,
-            "plans": [None if plan is None else [plan.pixels, plan.steps] for plan in plans],
+            "plans": [None if plan is None else [plan.pixels, plan.steps, plan.swept] for plan in plans],
             "further": self._further,
             "refinement": self._shares,
         }
@@ -182,7 +182,9 @@ class RecordedSession(Tracker):
             if about["version"] != VERSION:
                 raise InputError(f"{self._path}: a session of version {about['version']}, this program reads {VERSION}")
             self.settings: dict[str, Any] = dict(about["settings"])
-            self.plans = [None if plan is None else Plan(float(plan[0]), int(plan[1])) for plan in about["plans"]]
+            self.plans = [
+                None if plan is None else Plan(float(plan[0]), int(plan[1]), int(plan[2])) for plan in about["plans"]
+            ]
             self.shares: list[float] | None = about["refinement"]
             self._names = sorted(name for name in self._zip.namelist() if name != ABOUT)
             self.further: list[int] = []
@@ -277,11 +279,12 @@ class ReplayedRun(Conductor):
     """Repeats a recorded session: the same frames get the same work, whatever it costs now.
 
     Args:
+        settings: Settings of the mapping.
         session: The recorded session, which is also the tracker.
     """
 
-    def __init__(self, session: RecordedSession) -> None:
-        super().__init__(RecordedPace(session.plans))
+    def __init__(self, settings: MappingSettings, session: RecordedSession) -> None:
+        super().__init__(RecordedPace(settings, session.plans))
         self._session = session
         self._more = iter(session.more)
 

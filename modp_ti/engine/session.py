@@ -220,7 +220,7 @@ class _Session:
     def _settle(self) -> None:
         """Finish an online map. Raises RunStopped between two steps."""
         keyframes, frames = len(self.mapper.pipeline.keyframes), len(self.mapper.frames)
-        views = self.config.mapping.optimise.last_views(keyframes)
+        views = self.conductor.pace.last_views(keyframes)
         self.line.start("settling", views, later=lambda pace: self.after_mapping.after_passes(pace, keyframes, frames))
         self.mapper.finish(lambda done, size, psnr: self._after_step("settling", done, views, psnr, size))
 

@@ -7,12 +7,12 @@ from typing import Protocol
 
 from pipelines.settings import MappingSettings
 
-__all__ = ["CompletePace", "Pace", "Plan"]
+__all__ = ["FIRST_SWEEP", "CompletePace", "Pace", "Plan"]
 
 # Number of keyframes that are assumed before the first one, in the estimate of how many there will be.
 BEFORE = 4
 # Number of keyframes at which Gaussians that hardly show are removed first, and the factor to the next number.
-FIRST_REMOVAL, UNTIL_NEXT = 64, 1.5
+FIRST_SWEEP, UNTIL_NEXT = 64, 1.5
 # Steps that every keyframe gets, however long the recording is.
 LEAST_STEPS = 2
 
@@ -24,12 +24,13 @@ class Plan:
     Attributes:
         pixels: Share of `densify.pixels` whose depth is estimated, from 0 to 1.
         steps: Number of optimisation steps.
-        removes_hidden: Whether Gaussians that hardly show in any keyframe are then removed.
+        swept: Number of keyframes in which it is then measured how much of each Gaussian shows, for the removal of
+            those that hardly show in any (`HiddenGaussians`).
     """
 
     pixels: float
     steps: int
-    removes_hidden: bool = False
+    swept: int = 0
 
 
 class Pace(Protocol):
@@ -58,6 +59,14 @@ class Pace(Protocol):
         """
         ...
 
+    def last_views(self, keyframes: int) -> int:
+        """Return the number of views of the last passes over the finished map.
+
+        Args:
+            keyframes: Number of keyframes, with the frames between them that are views.
+        """
+        ...
+
 
 class CompletePace:
     """Gives every keyframe the work of the settings, however long it takes.
@@ -83,10 +92,13 @@ class CompletePace:
 
     def plan(self, level: int, keyframes: int, frames: int) -> Plan:
         steps = round(self.share(keyframes, frames) * self._settings.optimise.steps)
-        return Plan(1.0, steps, _is_due(keyframes))
+        return Plan(1.0, steps, keyframes if _is_due(keyframes) else 0)
 
     def steps_after_correction(self, keyframes: int, frames: int) -> int:
         return round(self.share(keyframes, frames) * self._settings.corrections.steps)
+
+    def last_views(self, keyframes: int) -> int:
+        return self._settings.optimise.last_views(keyframes)
 
     def share(self, keyframes: int, frames: int) -> float:
         """Return the share of the settings' steps for which the budget suffices, as far as the frames so far tell."""
@@ -100,7 +112,7 @@ class CompletePace:
 
 def _is_due(keyframes: int) -> bool:
     """Whether Gaussians that hardly show are removed after this number of keyframes."""
-    at = float(FIRST_REMOVAL)
+    at = float(FIRST_SWEEP)
     while round(at) < keyframes:
         at *= UNTIL_NEXT
     return round(at) == keyframes

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pipelines.pace.costs import Costs
-from pipelines.pace.pace import Plan
-from pipelines.settings import MappingSettings
+from pipelines.pace.pace import FIRST_SWEEP, Plan
+from pipelines.settings import MappingSettings, OptimiseSettings
 
-__all__ = ["RealtimePace"]
+__all__ = ["RealtimePace", "bounded_last_views"]
 
 # Lag at the start of a keyframe that the pace holds, as a share of `max_lag`, and share of a deviation from it that is
 # made up for within one keyframe. A share between 0 and 1 lets the lag approach the goal without oscillating.
@@ -24,6 +24,9 @@ KEYFRAME, DEPTH, STEP = 0.03, 0.2, 0.1
 # Share of the time that keyframes without work may take beyond `max_lag`; the rest reduces the lag. Some are kept,
 # so that no part of the recording remains without views.
 KEEPING = 0.5
+# Keyframes that are swept with each keyframe that gets steps, for the removal of Gaussians that hardly show. With two,
+# a sweep ends when the keyframes are twice as many as when it began.
+SWEPT = 2
 # Weight of a new interval between keyframes in their mean.
 WEIGHT = 0.2
 
@@ -61,6 +64,7 @@ class RealtimePace:
     """
 
     def __init__(self, settings: MappingSettings) -> None:
+        self._settings = settings
         self.max_lag = settings.max_lag
         self.most_steps = settings.optimise.steps
         self.costs = Costs()
@@ -131,7 +135,7 @@ class RealtimePace:
         return taken
 
     def plan(self, level: int, keyframes: int, frames: int) -> Plan:
-        plan = self._plan(self._time(), self._cost("depth", level, DEPTH), self._cost("step", level, STEP))
+        plan = self._plan(keyframes, self._time(), self._cost("depth", level, DEPTH), self._cost("step", level, STEP))
         self._planned = plan, level
         if plan.steps == 0 and self.most_steps > 0:
             self.skipped += 1
@@ -144,6 +148,9 @@ class RealtimePace:
     def steps_after_correction(self, keyframes: int, frames: int) -> int:
         """Return 0: the ordinary steps mend the seams, by the same clock as everything else."""
         return 0
+
+    def last_views(self, keyframes: int) -> int:
+        return bounded_last_views(self._settings.optimise, keyframes)
 
     def _note_interval(self) -> None:
         if self._last_keyframe is not None:
@@ -167,13 +174,19 @@ class RealtimePace:
         known = [self.costs.of(f"{kind} {finer}", float("inf")) for finer in range(level + 1)]
         return min(known) if min(known) < float("inf") else unknown
 
-    def _plan(self, time: float, depth: float, step: float) -> Plan:
+    def _plan(self, keyframes: int, time: float, depth: float, step: float) -> Plan:
         least = min(LEAST_STEPS, self.most_steps)
         if time < least * step or time <= 0.0:
             return Plan(0.0, 0)
         pixels = _pixels_for((time - least * step) / depth)
         time -= depth * _share_of_depth(pixels) if pixels else 0.0
-        return Plan(pixels, int(min(max(time / step, least), self.most_steps)))
+        swept = SWEPT if keyframes >= FIRST_SWEEP else 0
+        return Plan(pixels, int(min(max(time / step, least), self.most_steps)), swept)
+
+
+def bounded_last_views(settings: OptimiseSettings, keyframes: int) -> int:
+    """Return the views of the last passes: after a live session of many keyframes, those of `budget` keyframes."""
+    return settings.last_views(keyframes if settings.budget is None else min(keyframes, settings.budget))
 
 
 def _share_of_depth(pixels: float) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from pipelines.pace.pace import Plan
+from pipelines.pace.realtime import bounded_last_views
+from pipelines.settings import MappingSettings
 
 __all__ = ["RecordedPace"]
 
@@ -13,10 +15,12 @@ class RecordedPace:
     """Repeats recorded decisions in their order, so that the same frames give the same map.
 
     Args:
+        settings: Settings of the mapping.
         decisions: For every frame that should have become a keyframe, its plan, or None if it was merged.
     """
 
-    def __init__(self, decisions: Iterable[Plan | None]) -> None:
+    def __init__(self, settings: MappingSettings, decisions: Iterable[Plan | None]) -> None:
+        self._settings = settings
         self._decisions = iter(decisions)
         self._next: Plan | None = None
 
@@ -38,3 +42,6 @@ class RecordedPace:
 
     def steps_after_correction(self, keyframes: int, frames: int) -> int:
         return 0
+
+    def last_views(self, keyframes: int) -> int:
+        return bounded_last_views(self._settings.optimise, keyframes)

@@ -24,8 +24,8 @@ POINT = np.dtype([("id", "i8"), ("xyz", "f8", 3), ("pixel", "f8", 2)])
 class DeliveredLog:
     """Records of the delivered frames in order, with all corrections applied.
 
-    Only the frames that a correction lists move, as `PoseCorrection.others_stay` says for those of `klt`. The points are kept in a file without
-    a name. Their ids count from 0, as those of `klt`.
+    Only the frames that a correction lists move, as `PoseCorrection.others_stay` says for those of `klt`. The points
+    are kept in a file without a name. Their ids count from 0, as those of `klt`.
 
     Attributes:
         records: The records without their points.

@@ -48,12 +48,17 @@ def test_it_is_the_largest_sum_of_weights_over_the_views(
     state = random_gaussians(120, seed=4)
     renderer.gaussians.load(state)
     before = renderer.view_renders
-    measured = Contribution(renderer.gaussians, renderer).measure(store, NEAR)
+    contribution = Contribution(renderer.gaussians, renderer)
+    contribution.measure(store, NEAR)
+    contribution.begin()
+    for view in store:  # one after the other, as all at once
+        contribution.measure([view], NEAR)
+    measured = renderer.gaussians.coverages()
     masks = [view.rgba[..., 3] == 255 for view in store]
     expected = [weights(state, view.T_camera_world, mask) for view, mask in zip(store, masks, strict=True)]
     np.testing.assert_allclose(measured, np.maximum(*expected), rtol=1e-3, atol=1e-3)
     assert not np.array_equal(np.argmax(expected, axis=0), np.zeros(120))  # both views count
-    assert renderer.view_renders == before + 2
+    assert renderer.view_renders == before + 4
 
 
 def test_what_no_view_shows_covers_nothing(renderers: Callable[..., Renderer], store: KeyframeStore) -> None:
@@ -61,7 +66,8 @@ def test_what_no_view_shows_covers_nothing(renderers: Callable[..., Renderer], s
     state = random_gaussians(20, seed=5)
     state["position"][7] = -50.0 * POSE[2, :3]  # behind both cameras
     renderer.gaussians.load(state)
-    measured = Contribution(renderer.gaussians, renderer).measure(store, NEAR)
+    Contribution(renderer.gaussians, renderer).measure(store, NEAR)
+    measured = renderer.gaussians.coverages()
     assert measured[7] == 0 and np.count_nonzero(measured) >= 10
 
 

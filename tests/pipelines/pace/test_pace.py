@@ -15,9 +15,11 @@ def test_the_complete_pace_gives_what_the_settings_say() -> None:
     assert pace.steps_after_correction(keyframes=1, frames=1) == 3
 
 
-def test_what_hardly_shows_is_removed_each_time_that_the_keyframes_are_half_as_many_again() -> None:
+def test_all_keyframes_are_swept_each_time_that_the_keyframes_are_half_as_many_again() -> None:
     pace = CompletePace(MappingSettings())
-    assert [n for n in range(1, 400) if pace.plan(0, n, n).removes_hidden] == [64, 96, 144, 216, 324]
+    assert {n: swept for n in range(1, 400) if (swept := pace.plan(0, n, n).swept)} == {
+        n: n for n in (64, 96, 144, 216, 324)
+    }
 
 
 @pytest.mark.parametrize(("every", "steps"), [(1, 4), (3, 12), (5, 20)])
@@ -47,14 +49,14 @@ def test_every_keyframe_gets_two_steps_at_least() -> None:
 
 
 def test_recorded_decisions_are_repeated_in_their_order() -> None:
-    plans = [Plan(1.0, 3), None, Plan(0.5, 0)]
-    pace = RecordedPace(plans)
+    plans = [Plan(1.0, 3, 2), None, Plan(0.5, 0)]
+    pace = RecordedPace(MappingSettings(), plans)
     repeated = [pace.plan(0, 1, 1) if pace.takes_keyframe() else None for _ in plans]
     assert repeated == plans
 
 
 def test_other_frames_than_the_recorded_ones_are_an_error() -> None:
-    pace = RecordedPace([None])
+    pace = RecordedPace(MappingSettings(), [None])
     assert not pace.takes_keyframe()
     with pytest.raises(ValueError, match="these are other frames"):
         pace.takes_keyframe()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pipelines.pace import Plan, RealtimePace
+from pipelines.pace import Plan, RealtimePace, RecordedPace
 from pipelines.settings import MappingSettings, OptimiseSettings
 
 SETTINGS = MappingSettings()
@@ -191,3 +191,26 @@ def test_a_repeated_setting_of_no_steps_is_kept() -> None:
     session = SimulatedMapper().run(camera(2, 20.0), pace)
     assert all(plan is not None and plan.steps == 0 for plan in session.plans)
     assert pace.skipped == 0
+
+
+def test_keyframes_with_steps_sweep_over_two_others_once_there_are_many() -> None:
+    pace = RealtimePace(SETTINGS)
+    plans = []
+    for n in range(1, 100):
+        pace.begin_frame(arrived=float(n), now=float(n))
+        assert pace.takes_keyframe()
+        plans.append(pace.plan(0, n, n))
+        pace.end_frame(0.1, 0.05, 0.02, plans[-1].steps)
+    assert all(plan.steps > 0 for plan in plans)
+    assert [plan.swept for plan in plans] == [0] * 63 + [2] * 36
+
+
+def test_the_last_passes_of_a_long_session_take_no_longer_than_those_of_the_budget() -> None:
+    passes, budget = SETTINGS.optimise.last_passes, SETTINGS.optimise.budget
+    of_session, of_replay = RealtimePace(SETTINGS), RecordedPace(SETTINGS, [])
+    for keyframes in (1, 20, 139, 140, 141, 1000):
+        views = of_session.last_views(keyframes)
+        assert views == of_replay.last_views(keyframes) == SETTINGS.optimise.last_views(min(keyframes, budget))
+    assert of_session.last_views(1000) == passes * budget
+    unlimited = SETTINGS.model_copy(update={"optimise": SETTINGS.optimise.model_copy(update={"budget": None})})
+    assert RealtimePace(unlimited).last_views(1000) == passes * 1000
