@@ -11,6 +11,10 @@ from pipelines.settings import RefineSettings
 
 __all__ = ["Schedule", "decay", "in_seconds", "in_steps", "refine"]
 
+# Number of views up to which hidden Gaussians are removed before a refinement of limited time. More would take too much
+# of it, and a realtime run has removed most of these Gaussians before.
+MOST_SWEPT = 300
+
 Schedule = Callable[[int], float | None]
 """Schedule of a refinement: returns the share of it that has passed before a step, None after the last step."""
 
@@ -53,8 +57,8 @@ def refine(
 ) -> None:
     """Optimise a finished map on error-weighted draws from all keyframes.
 
-    All rates decay. Before the first step, Gaussians that cover fewer than
-    `settings.min_contribution` pixels in every keyframe are removed.
+    All rates decay. Before the first step, Gaussians that cover fewer than `settings.min_contribution` pixels in every
+    keyframe are removed, but not from a map of many keyframes in a refinement by the clock.
 
     Args:
         mapper: Mapper after `finish`.
@@ -72,10 +76,12 @@ def refine(
     pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0
     if len(store) == 0 or len(mapper.gaussians) == 0:
         return
+    by_the_clock = schedule is not None or settings.seconds is not None
     if schedule is None:
         schedule = in_steps(settings.steps) if settings.seconds is None else in_seconds(settings.seconds)
     step, share = done, schedule(done)
-    if not done and settings.min_contribution > 0 and share is not None:
+    removes = settings.min_contribution > 0 and not (by_the_clock and len(store) > MOST_SWEPT)
+    if removes and not done and share is not None:
         with mapper.stopwatch.measure("refine"):
             mapper.hidden.remove(settings.min_contribution, mapper.near)
     while share is not None:

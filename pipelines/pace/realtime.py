@@ -24,8 +24,9 @@ KEYFRAME, DEPTH, STEP = 0.03, 0.2, 0.1
 # Share of the time that keyframes without work may take beyond `max_lag`; the rest reduces the lag. Some are kept,
 # so that no part of the recording remains without views.
 KEEPING = 0.5
-# Keyframes that are swept with each keyframe that gets steps, for the removal of Gaussians that hardly show. With two,
-# a sweep ends when the keyframes are twice as many as when it began.
+# Keyframes that are swept with each kept keyframe, for the removal of Gaussians that hardly show. With two, a sweep
+# ends when the keyframes are twice as many as when it began. Skipped keyframes sweep too: where a large map leaves no
+# time for steps, removal is what makes it smaller.
 SWEPT = 2
 # Weight of a new interval between keyframes in their mean.
 WEIGHT = 0.2
@@ -176,11 +177,11 @@ class RealtimePace:
 
     def _plan(self, keyframes: int, time: float, depth: float, step: float) -> Plan:
         least = min(LEAST_STEPS, self.most_steps)
+        swept = SWEPT if keyframes >= FIRST_SWEEP and time > 0.0 else 0
         if time < least * step or time <= 0.0:
-            return Plan(0.0, 0)
+            return Plan(0.0, 0, swept)
         pixels = _pixels_for((time - least * step) / depth)
         time -= depth * _share_of_depth(pixels) if pixels else 0.0
-        swept = SWEPT if keyframes >= FIRST_SWEEP else 0
         return Plan(pixels, int(min(max(time / step, least), self.most_steps)), swept)
 
 

@@ -7,9 +7,10 @@ import pytest
 
 from fields.geometry.se3 import exp_se3
 from fields.map.keyframes import KeyframeStore
+from pipelines import refinement
 from pipelines.online import OnlineMapper
 from pipelines.optimise.adam import LearningRates
-from pipelines.refinement import decay, refine
+from pipelines.refinement import decay, in_steps, refine
 from pipelines.settings import MappingSettings, RefineSettings
 from tests.pipelines.wall import CAMERA, NORMAL, OFFSET, frame, on_the_plane, pose
 
@@ -124,6 +125,18 @@ def test_refinement_removes_what_no_keyframe_shows(mapped: OnlineMapper) -> None
     refine(mapped, RefineSettings(steps=1, views=1, min_contribution=1e-3))
     assert (mapped.gaussians.to_numpy()["position"][:, 2] > -50).all()
     mapped.gaussians.load(state)
+
+
+def test_refinement_by_the_clock_does_not_render_a_large_map_once_before(
+    mapped: OnlineMapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renders = mapped.renderer.view_renders
+    monkeypatch.setattr(refinement, "MOST_SWEPT", len(mapped.keyframes) - 1)
+    refine(mapped, RefineSettings(views=1), schedule=in_steps(3))
+    assert mapped.renderer.view_renders == renders + 3
+    monkeypatch.setattr(refinement, "MOST_SWEPT", len(mapped.keyframes))
+    refine(mapped, RefineSettings(views=1), schedule=in_steps(3))
+    assert mapped.renderer.view_renders == renders + 3 + len(mapped.keyframes) + 3
 
 
 def test_a_perturbed_pose_comes_back(mapped: OnlineMapper) -> None:

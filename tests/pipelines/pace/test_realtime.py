@@ -193,16 +193,20 @@ def test_a_repeated_setting_of_no_steps_is_kept() -> None:
     assert pace.skipped == 0
 
 
-def test_keyframes_with_steps_sweep_over_two_others_once_there_are_many() -> None:
+@pytest.mark.parametrize(("step", "steps"), [(0.02, True), (1.0, False)])
+def test_each_kept_keyframe_sweeps_over_two_once_there_are_many(step: float, steps: bool) -> None:
+    """Also those for which there is no time for steps, as long as the lag is below the limit."""
     pace = RealtimePace(SETTINGS)
+    pace.costs.learn("step 0", step)
     plans = []
     for n in range(1, 100):
-        pace.begin_frame(arrived=float(n), now=float(n))
+        late = SETTINGS.max_lag if n == 90 else 0.0
+        pace.begin_frame(arrived=float(n), now=float(n) + late)
         assert pace.takes_keyframe()
         plans.append(pace.plan(0, n, n))
-        pace.end_frame(0.1, 0.05, 0.02, plans[-1].steps)
-    assert all(plan.steps > 0 for plan in plans)
-    assert [plan.swept for plan in plans] == [0] * 63 + [2] * 36
+        pace.end_frame(0.1)
+    assert all((plan.steps > 0) == (steps and n != 89) for n, plan in enumerate(plans))
+    assert [plan.swept for plan in plans] == [0] * 63 + [2] * 26 + [0] + [2] * 9
 
 
 def test_the_last_passes_of_a_long_session_take_no_longer_than_those_of_the_budget() -> None:
