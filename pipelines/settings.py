@@ -157,7 +157,7 @@ class DensifySettings(StrictModel):
         default=0.5,
         ge=0,
         description="pixels covered where it shows most, below which a Gaussian is removed, each time that the "
-        "keyframes have become half as many again (in a realtime run twice as many), from 64 on; 0 for never",
+        "keyframes have become half as many again, from 64 on; 0 for never",
     )
     prune_every: int = Field(default=100, ge=1, description="frames between removals of transparent Gaussians")
     prune_opacity: float = Field(default=0.01, ge=0, lt=1, description="opacity below which a Gaussian is removed")

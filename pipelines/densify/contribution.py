@@ -30,20 +30,23 @@ class Contribution:
         if self.gaussians.count:
             self._clear(self.gaussians.count)
 
-    def measure(self, views: Iterable[Keyframe], near: float) -> None:
+    def measure(self, views: Iterable[Keyframe], near: float, level: int = 0) -> None:
         """Render further views, and raise each Gaussian's coverage to that in the view that shows most of it.
 
         Args:
             views: Views to render.
             near: Depth below which nothing is drawn [scene units].
+            level: Pyramid level to render at. The coverage is that in pixels of the full size, nearly the same from
+                each level.
         """
         renderer, images = self.renderer, self.images
         for view in views:
-            renderer.forward(view.camera, view.T_camera_world, near)
-            images.set_reference(view.rgba)
+            image = view.image(level)
+            renderer.forward(image.camera, view.T_camera_world, near)
+            images.set_reference(image.rgba)
             self._ask_for_weights(3 * images.plane, images.plane)
             renderer.compositing.backward()
-            self._keep_largest()
+            self._keep_largest(view.camera.width * view.camera.height / (image.camera.width * image.camera.height))
             renderer.view_renders += 1
 
     @ti.kernel
@@ -60,8 +63,8 @@ class Contribution:
             self.images.colour_grad[i] = weight
 
     @ti.kernel
-    def _keep_largest(self):
+    def _keep_largest(self, pixels: ti.f32):
         for s in range(self.projected.seen[None]):
             i = self.projected.gaussian[s]
-            here = ti.cast(self.projected.colour.grad[s][0], ti.f32)
+            here = pixels * ti.cast(self.projected.colour.grad[s][0], ti.f32)
             self.gaussians.coverage[i] = ti.max(self.gaussians.coverage[i], here)

@@ -10,6 +10,8 @@ __all__ = ["HiddenGaussians"]
 
 # Number of keyframes before a sweep whose Gaussians may still grow, and are not removed.
 YOUNG = 10
+# Pyramid level of a sweep in parts, which is made while frames arrive. It takes half as long as at the full size.
+COARSE = 1
 
 
 class HiddenGaussians:
@@ -43,7 +45,8 @@ class HiddenGaussians:
         if self._swept == 0:
             self.contribution.begin()
             self._young = keyframes[-min(YOUNG, len(keyframes))]
-        self.contribution.measure(keyframes[self._swept : self._swept + count], near)
+        level = 0 if count >= len(keyframes) else COARSE
+        self.contribution.measure(keyframes[self._swept : self._swept + count], near, level)
         self._swept += count
         if self._swept >= len(keyframes):
             self._swept = 0

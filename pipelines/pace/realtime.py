@@ -24,10 +24,10 @@ KEYFRAME, DEPTH, STEP = 0.03, 0.2, 0.1
 # Share of the time that keyframes without work may take beyond `max_lag`; the rest reduces the lag. Some are kept,
 # so that no part of the recording remains without views.
 KEEPING = 0.5
-# Keyframes that are swept with each kept keyframe, for the removal of Gaussians that hardly show. With two, a sweep
-# ends when the keyframes are twice as many as when it began. Skipped keyframes sweep too: where a large map leaves no
-# time for steps, removal is what makes it smaller.
-SWEPT = 2
+# Keyframes that are swept with each kept keyframe, for the removal of Gaussians that hardly show. With three, a
+# sweep ends when the keyframes are half as many again as when it began. Skipped keyframes sweep too: where a large map
+# leaves no time for steps, removal is what makes it smaller.
+SWEPT = 3
 # Weight of a new interval between keyframes in their mean.
 WEIGHT = 0.2
 

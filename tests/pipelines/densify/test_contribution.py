@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
@@ -76,3 +77,19 @@ def test_measuring_leaves_no_gradient(renderers: Callable[..., Renderer], store:
     gaussians.load(random_gaussians(20, seed=6))
     Contribution(gaussians, renderers()).measure(store, NEAR)
     assert all(not gradient.any() for gradient in gaussians.gradients_to_numpy().values())
+
+
+def test_a_coarser_level_tells_nearly_the_same_pixels_of_the_full_size(renderers: Callable[..., Renderer]) -> None:
+    renderer, camera = renderers(), PinholeCamera(50.0, 48.0, 31.0, 25.0, 64, 48)
+    renderer.gaussians.load(random_gaussians(120, seed=1))
+    store = KeyframeStore(levels=2)
+    store.append(TrackedFrame(0, 0.0, "a", np.zeros((48, 64, 3), dtype=np.float32), camera, POSE, NONE))
+    contribution, measured = Contribution(renderer.gaussians, renderer), []
+    for level in (0, 1):
+        contribution.begin()
+        contribution.measure(store, NEAR, level)
+        measured.append(renderer.gaussians.coverages())
+    fine, coarse = measured
+    assert fine.max() > 40
+    assert np.abs(coarse - fine).max() < 3.0  # 0.8 to 1.4 over ten seeds
+    assert coarse.sum() == pytest.approx(fine.sum(), rel=0.02)

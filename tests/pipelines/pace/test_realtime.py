@@ -194,7 +194,7 @@ def test_a_repeated_setting_of_no_steps_is_kept() -> None:
 
 
 @pytest.mark.parametrize(("step", "steps"), [(0.02, True), (1.0, False)])
-def test_each_kept_keyframe_sweeps_over_two_once_there_are_many(step: float, steps: bool) -> None:
+def test_each_kept_keyframe_sweeps_over_three_once_there_are_many(step: float, steps: bool) -> None:
     """Also those for which there is no time for steps, as long as the lag is below the limit."""
     pace = RealtimePace(SETTINGS)
     pace.costs.learn("step 0", step)
@@ -206,7 +206,7 @@ def test_each_kept_keyframe_sweeps_over_two_once_there_are_many(step: float, ste
         plans.append(pace.plan(0, n, n))
         pace.end_frame(0.1)
     assert all((plan.steps > 0) == (steps and n != 89) for n, plan in enumerate(plans))
-    assert [plan.swept for plan in plans] == [0] * 63 + [2] * 26 + [0] + [2] * 9
+    assert [plan.swept for plan in plans] == [0] * 63 + [3] * 26 + [0] + [3] * 9
 
 
 def test_the_last_passes_of_a_long_session_take_no_longer_than_those_of_the_budget() -> None:
