@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -74,12 +74,8 @@ def adjusted_bundle(
     model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
     model.add_camera_with_trivial_rig(camera)
     tracks = _add_views(model, config, poses, view, point, pixels, free)
-    names = {}
-    for number, seen in tracks.items():
-        if len(seen) == 1:
-            continue  # one ray constrains nothing, and COLMAP refuses it
-        track = pycolmap.Track([pycolmap.TrackElement(*each) for each in seen])
-        names[number] = model.add_point3D(xyz[number], track)
+    # One ray constrains nothing, and COLMAP refuses it.
+    names = {number: model.add_point3D(xyz[number], track) for number, track in tracks if track.length() > 1}
     if len(free) == len(poses):
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     if not refined:
@@ -106,26 +102,31 @@ def _add_views(
     point: NDArray[np.int64],
     pixels: NDArray[np.float64],
     free: Collection[int],
-) -> dict[int, list[tuple[int, int]]]:
+) -> Iterator[tuple[int, pycolmap.Track]]:
     """Add the views with their observations. View k becomes image k + 1.
 
     Returns:
-        (image, place of the observation in it) for every point.
+        Every observed point, in the order of their first observations, with its track.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-    tracks: dict[int, list[tuple[int, int]]] = {}
+    mine = {k: np.flatnonzero(view == k) for k in poses}
     for k, T in poses.items():
-        mine = np.flatnonzero(view == k)
-        points = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels[mine]])
-        image = pycolmap.Image(name=str(k), camera_id=1, image_id=k + 1, points2D=points)
+        image = pycolmap.Image(name=str(k), keypoints=pixels[mine[k]], camera_id=1, image_id=k + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
         config.add_image(k + 1)
         if k not in free:
             config.set_constant_rig_from_world_pose(k + 1)
-        for place, number in enumerate(point[mine].tolist()):
-            tracks.setdefault(number, []).append((k + 1, place))
-    return tracks
+    images = np.repeat([k + 1 for k in mine], [len(rows) for rows in mine.values()])
+    places = np.concatenate([np.arange(len(rows)) for rows in mine.values()])
+    numbers = point[np.concatenate(list(mine.values()))]
+    first, of, counts = np.unique(numbers, return_index=True, return_inverse=True, return_counts=True)[1:]
+    by_point = np.argsort(first[of], kind="stable")
+    elements = list(map(pycolmap.TrackElement, images[by_point].tolist(), places[by_point].tolist()))
+    ends = np.cumsum(counts[np.argsort(first)]).tolist()
+    starts = [0, *ends[:-1]]
+    for number, start, end in zip(numbers[np.sort(first)].tolist(), starts, ends, strict=True):
+        yield number, pycolmap.Track(elements[start:end])
 
 
 def _adjusted_poses(model: pycolmap.Reconstruction, free: Collection[int]) -> dict[int, NDArray[np.float64]]:
