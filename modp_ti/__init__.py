@@ -14,6 +14,10 @@ Map frames from your own loop:
     mapper.add(modp_ti.TrackedFrame.from_arrays(index, image, T_camera_world, intrinsics, xyz, pixels))
     mapper.save("out/room")
 
+Find out where a new picture was taken in a finished map:
+
+    location = modp_ti.Locator("out/room").locate("new.jpg")
+
 Use one part alone:
 
     picture = modp_ti.rasterize(**gaussians, T_camera_world=T_camera_world, camera=camera)  # a PyTorch function
@@ -47,6 +51,8 @@ if TYPE_CHECKING:
     from modp_ti.inputs.trackers import open_tracker as open_tracker
     from modp_ti.outputs.formats.splats_ply import read_splats as read_splats
     from modp_ti.outputs.formats.splats_ply import write_splats as write_splats
+    from modp_ti.outputs.locating.locator import Location as Location
+    from modp_ti.outputs.locating.locator import Locator as Locator
     from pipelines.online import OnlineMapper as OnlineMapper
     from pipelines.refinement import refine as refine
     from pipelines.render.rasterize import RasterizedView as RasterizedView
@@ -58,6 +64,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "GaussianField": "fields.map.gaussians",
     "InputError": "modp_ti.files.errors",
+    "Location": "modp_ti.outputs.locating.locator",
+    "Locator": "modp_ti.outputs.locating.locator",
     "Mapper": "modp_ti.engine.mapper",
     "MappingSettings": "pipelines.settings",
     "OccupancyVoxels": "fields.map.occupancy",

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fields.runtime.engine import EngineError, engine
-from modp_ti.commands import cameras, check, export, render, run, view, warmup
+from modp_ti.commands import cameras, check, export, locate, render, run, view, warmup
 from modp_ti.commands.shared import examples
 from modp_ti.version import __version__
 
@@ -19,10 +19,11 @@ OVERVIEW = examples(
     "modp-ti run room.mp4   (the same without a scene file)",
     "modp-ti render OUT --path orbit   (OUT: the output folder of a run)",
     "modp-ti export OUT --format mesh",
+    "modp-ti locate OUT new.jpg",
 )
 ENDS = (
-    "Exit codes: 0 done; 1 (check) usable, with warnings; 2 wrong input or options; 3 a fault of the program; "
-    "130 interrupted."
+    "Exit codes: 0 done; 1 (check) usable, with warnings; 1 (locate) a picture was not located; 2 wrong input or "
+    "options; 3 a fault of the program; 130 interrupted."
 )
 
 app = typer.Typer(
@@ -58,6 +59,7 @@ app.command("cameras", epilog=cameras.EXAMPLES)(cameras.cameras)
 app.command("check", epilog=check.EXAMPLES)(check.check)
 app.command("render", epilog=render.EXAMPLES)(render.render)
 app.command("export", epilog=export.EXAMPLES)(export.export)
+app.command("locate", epilog=locate.EXAMPLES)(locate.locate)
 app.command("view", epilog=view.EXAMPLES)(view.view)
 app.command("warmup", epilog=warmup.EXAMPLES)(warmup.warmup)
 

@@ -36,7 +36,7 @@ __all__ = [
     "standalone",
 ]
 
-# Exit codes; docs/commands.md lists all of them. 1 is used only by `check`: the input is usable, with warnings.
+# Exit codes; docs/commands.md lists all of them. 1 has its own meaning in `check` and `locate`.
 BAD_INPUT, FAULT, INTERRUPTED = 2, 3, 130
 
 # Longest error message in characters, since messages may quote the content of a damaged file.

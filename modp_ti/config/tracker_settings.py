@@ -24,6 +24,7 @@ __all__ = [
     "RecordedSettings",
     "ReplicaSettings",
     "SevenScenesSettings",
+    "SfmSettings",
     "SocketSettings",
     "StellaVslamSettings",
     "TimedPosesSettings",
@@ -130,6 +131,28 @@ class KltSettings(TrackerSettings):
     follows_streams: ClassVar[bool] = True
 
     kind: Literal["klt"] = Field(default="klt", description="the built-in tracker, which uses only the images")
+
+
+class SfmSettings(TrackerSettings):
+    """Structure from motion on the images, before the first frame is mapped."""
+
+    kind: Literal["sfm"] = Field(
+        default="sfm",
+        description="structure from motion by pycolmap on the images alone; the model is kept in the output folder",
+    )
+    order: Literal["sequential", "unordered"] = Field(
+        default="sequential",
+        description="`sequential`: the images follow each other along a path, and each is matched with its neighbours "
+        "and with images that look alike, which closes loops; `unordered`: only with images that look alike. Up to 60 "
+        "images are all matched with each other",
+    )
+    mapper: Literal["incremental", "global"] = Field(
+        default="incremental",
+        description="`incremental`: place the images one after the other; `global`: all at once, which is faster for "
+        "many images",
+    )
+    overlap: int = Field(default=10, ge=1, description="number of next images that an image is matched with")
+    features: int = Field(default=4000, ge=100, description="largest number of features of an image")
 
 
 class TumSettings(TimedPosesSettings, GivenPosesSettings):
@@ -255,6 +278,7 @@ AnyTrackerSettings = Annotated[
     ColmapSettings
     | TransformsSettings
     | KltSettings
+    | SfmSettings
     | TumSettings
     | OrbSlam3Settings
     | StellaVslamSettings

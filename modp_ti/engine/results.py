@@ -20,6 +20,7 @@ from modp_ti.config.scene_file import dump_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text, write_picture
 from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.inputs.sources.undistortion import Undistorter
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
 from modp_ti.outputs.formats.colmap_model import image_names, write_image
 from modp_ti.outputs.formats.map_folder import appearing, write_map
@@ -46,11 +47,13 @@ class Results:
     Args:
         config: The scene's settings.
         frames: Metadata of all frames.
+        undistorter: Undistorter of the first frame's image, None if it is not known.
     """
 
-    def __init__(self, config: SceneConfig, frames: DeliveredFrames) -> None:
+    def __init__(self, config: SceneConfig, frames: DeliveredFrames, undistorter: Undistorter | None = None) -> None:
         self.config = config
         self.frames = frames
+        self.undistorter = undistorter
         self._names = image_names(frames.name, config.export.images)
         self._album = Album.of(frames.held_out)
 
@@ -83,7 +86,7 @@ class Results:
 
     def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> MapVersion:
         """Write the map, and return it with its Gaussians as read back from `splats.ply`."""
-        write_map(self.folder, version, self.frames, self._names, keyframes, near)
+        write_map(self.folder, version, self.frames, self._names, keyframes, near, self.undistorter)
         return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
 
     def elsewhere(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> str:
@@ -91,7 +94,7 @@ class Results:
         folder = None
         try:
             folder = Path(tempfile.mkdtemp(prefix="modp-ti-map-"))
-            write_map(folder, version, self.frames, self._names, keyframes, near)
+            write_map(folder, version, self.frames, self._names, keyframes, near, self.undistorter)
             dump_scene(self.config, folder / "config.yaml")
         except OSError as error:
             if folder is not None:

@@ -277,7 +277,7 @@ class _Session:
     def _write(self, versions: dict[str, MapVersion]) -> None:
         """Write the map; evaluate it as read back from its file, and write the scores and the report."""
         pipeline, output = self.mapper.pipeline, self.config.output
-        results = Results(self.config, self.mapper.frames)
+        results = Results(self.config, self.mapper.frames, self.tracker.undistorter)
         last = list(versions)[-1]
         try:
             with results.writing_map(), self.line.working("writing the map"):
@@ -362,7 +362,7 @@ class _Session:
         frames, keyframes, output = self.mapper.frames, self.mapper.pipeline.keyframes, self.config.output
         said = f"interrupted after {len(frames)} frames"
         if len(keyframes):
-            results, version = Results(self.config, frames), self.mapper.version()
+            results, version = Results(self.config, frames, self.tracker.undistorter), self.mapper.version()
             try:
                 with results.writing_map():
                     results.write_map(version, keyframes, self.mapper.pipeline.near)
@@ -375,7 +375,7 @@ class _Session:
         """Return the part of an error message that says how to go on, or where the map is."""
         if self.checkpointer.possible:
             return self.checkpointer.way_on()
-        results, pipeline = Results(self.config, self.mapper.frames), self.mapper.pipeline
+        results, pipeline = Results(self.config, self.mapper.frames, self.tracker.undistorter), self.mapper.pipeline
         return results.elsewhere(version, pipeline.keyframes, pipeline.near)
 
     def _open_observer(self) -> Observer:

@@ -16,12 +16,13 @@ from tests.pipelines.wall import CAMERA, frame, pose
 
 pytestmark = pytest.mark.slow
 
-# What an example leaves behind, later ones use. Those that map a whole scene are run by the tests of docs/examples.
+# What an example leaves behind, later ones use. Those that map a whole scene are run by the tests of docs/examples,
+# and those that need a finished run by the tests of what they show.
 FIRST = ["initialise", "Mapper", "write_splats", "PoseCorrection", "RefineSettings", "OnlineMapper", "refine"]
 THEN = ["GaussianField", "Renderer", "rasterize"]
 # Taichi 1.7.4 has room for the fields of one or two maps of 640x480 in a process.
 NEW_FIELDS = ["Mapper", "OnlineMapper", "GaussianField", "rasterize", "MappingSettings"]
-WHOLE_SCENES = ["SceneConfig", "InputError", "load_scene", "open_tracker", "run_scene"]
+WHOLE_SCENES = ["SceneConfig", "InputError", "load_scene", "open_tracker", "run_scene", "Location", "Locator"]
 
 
 def example(name: str) -> str:

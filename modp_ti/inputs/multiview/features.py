@@ -42,6 +42,15 @@ class Features:
     descriptors: NDArray[np.uint8]
     pixel: float
 
+    def within(self, valid: NDArray[np.bool_] | None) -> Features:
+        """Select the features at valid pixels (H, W) of the stored image; None for all."""
+        if valid is None:
+            return self
+        height, width = valid.shape
+        column, row = np.minimum(np.floor(self.pixels).astype(int), [width - 1, height - 1]).T
+        kept = valid[row, column]
+        return Features(self.pixels[kept], self.descriptors[kept], self.pixel)
+
 
 @dataclass(frozen=True)
 class Matches:

@@ -21,7 +21,7 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
     """Open the configured tracker. Its input is checked as far as possible without decoding all images.
 
     Args:
-        config: The scene configuration. Only `source`, `tracker` and `seed` are used.
+        config: The scene configuration. Only `source`, `tracker` and `seed` are used, and `output` by `sfm`.
         progress: Called while the tracker prepares, for example while it triangulates points.
 
     Raises:
@@ -49,6 +49,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
             from modp_ti.inputs.klt import open_klt
 
             return open_klt(source, config.seed, progress)
+        case kinds.SfmSettings() as tracker:
+            from modp_ti.inputs.trackers.sfm import open_sfm
+
+            return open_sfm(source, tracker, config.output / "sfm", config.seed, progress)
         case kinds.TumSettings() as tracker:
             from modp_ti.inputs.trackers.tum import open_tum
 

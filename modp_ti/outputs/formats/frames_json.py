@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from fields.geometry.camera import PinholeCamera
 from modp_ti.files import read_json
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.distortion import Distortion
+from modp_ti.inputs.sources.intrinsics import Intrinsics, require_plausible
+from modp_ti.inputs.sources.undistortion import Undistorter
 
 __all__ = ["FramesRecord", "read_frames", "write_frames"]
 
@@ -24,20 +29,35 @@ class FramesRecord:
         scene_depth: Median depth of the keyframes' views [scene units].
         keyframes: Ascending positions of the keyframes in trajectory.txt.
         held_out: Ascending positions of the held-out frames in trajectory.txt.
+        stored_camera: Camera of the images as stored, before they were undistorted and scaled, of the first frame;
+            None if it is not known.
     """
 
     near: float
     scene_depth: float
     keyframes: list[int]
     held_out: list[int]
+    stored_camera: Intrinsics | None = None
 
 
 def write_frames(
-    path: Path, near: float, scene_depth: float, keyframes: Collection[int], held_out: Collection[int]
+    path: Path,
+    near: float,
+    scene_depth: float,
+    keyframes: Collection[int],
+    held_out: Collection[int],
+    undistorter: Undistorter | None = None,
 ) -> None:
-    """Write the record. Numbers are written with enough digits to be read back exactly."""
-    record = FramesRecord(float(near), float(scene_depth), sorted(keyframes), sorted(held_out))
-    text = ",\n ".join(f'"{name}": {json.dumps(value)}' for name, value in vars(record).items())
+    """Write the record, with `undistorter` that of the first frame's image. Numbers are read back exactly."""
+    record: dict[str, Any] = {
+        "near": float(near),
+        "scene_depth": float(scene_depth),
+        "keyframes": sorted(keyframes),
+        "held_out": sorted(held_out),
+    }
+    if undistorter is not None:
+        record["stored_camera"] = asdict(undistorter.raw) | {"distortion": asdict(undistorter.distortion)}
+    text = ",\n ".join(f'"{name}": {json.dumps(value)}' for name, value in record.items())
     replace_text(path, f"{{{text}}}\n")
 
 
@@ -50,7 +70,11 @@ def read_frames(path: Path, count: int) -> FramesRecord:
     try:
         data = read_json(path, "of a finished run")
         record = FramesRecord(
-            float(data["near"]), float(data["scene_depth"]), list(data["keyframes"]), list(data["held_out"])
+            float(data["near"]),
+            float(data["scene_depth"]),
+            list(data["keyframes"]),
+            list(data["held_out"]),
+            _stored_camera(data["stored_camera"], path) if "stored_camera" in data else None,
         )
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: cannot be read as what a run says of its frames: {error!r:.80}") from None
@@ -60,3 +84,13 @@ def read_frames(path: Path, count: int) -> FramesRecord:
     if not all(type(index) is int and 0 <= index < count for index in indices):
         raise InputError(f"{path}: names frames beyond the {count} that trajectory.txt has")
     return record
+
+
+def _stored_camera(data: Mapping[str, Any], path: Path) -> Intrinsics:
+    lens = data["distortion"]
+    numerator, denominator = (tuple(map(float, lens[name])) for name in ("numerator", "denominator"))
+    p1, p2 = map(float, lens["tangential"])
+    fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
+    camera = PinholeCamera(fx, fy, cx, cy, int(data["width"]), int(data["height"]))
+    distortion = Distortion(numerator, denominator, (p1, p2), bool(lens["fisheye"]))
+    return Intrinsics(*require_plausible(camera, distortion, f"{path}: stored_camera"))

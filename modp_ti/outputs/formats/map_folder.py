@@ -12,6 +12,7 @@ from fields.map.keyframes import KeyframeStore
 from modp_ti.files.atomic import sync_folder
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.inputs.sources.undistortion import Undistorter
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.formats.colmap_model import write_colmap
 from modp_ti.outputs.formats.exposure import write_exposures
@@ -59,6 +60,7 @@ def write_map(
     names: Sequence[str],
     keyframes: KeyframeStore,
     near: float,
+    undistorter: Undistorter | None = None,
 ) -> None:
     """Write `splats.ply`, `trajectory.txt`, `frames.json`, `colmap/` and, with estimated exposures, `exposure.json`.
 
@@ -69,6 +71,7 @@ def write_map(
         names: Image names for the COLMAP model.
         keyframes: The map's keyframes.
         near: Depth below which nothing is drawn [scene units].
+        undistorter: Undistorter of the first frame's image, None if it is not known.
     """
     selected = {keyframe.index for keyframe in keyframes.selected}
     write_splats(folder / "splats.ply", version.gaussians)
@@ -76,7 +79,7 @@ def write_map(
     write_colmap(folder / "colmap", names, frames.camera, version.trajectory, frames.points)
     lines = [line for line, index in enumerate(frames.index) if index in selected]
     held_out = [line for line, held in enumerate(frames.held_out) if held]
-    write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out)
+    write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out, undistorter)
     if len(keyframes) and keyframes[0].exposure is not None:
         exposures = [exposure for exposure in version.exposures if exposure is not None]
         estimated = {keyframe.index for keyframe in keyframes}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.trajectory import read_tum_rows, tum_poses
 
-__all__ = ["read_trajectory", "write_trajectory"]
+__all__ = ["read_trajectory", "tum_line", "write_trajectory"]
 
 
 def write_trajectory(
@@ -34,11 +34,16 @@ def write_trajectory(
     for time, T_camera_world in zip(timestamps, poses, strict=True):
         if not np.isfinite(T_camera_world).all():
             raise ValueError(f"the pose at {time} s is not finite")
-        rotation = np.asarray(T_camera_world, dtype=np.float64)[:3, :3].T
-        centre = -rotation @ T_camera_world[:3, 3]
-        numbers = [float(time), *centre.tolist(), *_quaternion(rotation).tolist()]
-        lines.append(" ".join(repr(number + 0.0) for number in numbers))  # + 0.0 turns -0.0 into 0.0
+        lines.append(tum_line(time, T_camera_world))
     replace_text(path, "\n".join(lines) + "\n")
+
+
+def tum_line(time: float, T_camera_world: NDArray[np.float64]) -> str:
+    """Return the line of a pose (4, 4), with enough digits to be read back exactly."""
+    rotation = np.asarray(T_camera_world, dtype=np.float64)[:3, :3].T
+    centre = -rotation @ T_camera_world[:3, 3]
+    numbers = [float(time), *centre.tolist(), *_quaternion(rotation).tolist()]
+    return " ".join(repr(number + 0.0) for number in numbers)  # + 0.0 turns -0.0 into 0.0
 
 
 def read_trajectory(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

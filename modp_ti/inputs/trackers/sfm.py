@@ -1,0 +1,128 @@
+"""Tracker `sfm`: poses, points and cameras of bare images by structure from motion, kept for the next run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import ColmapSettings, SfmSettings
+from modp_ti.files import read_text
+from modp_ti.files.atomic import replace_text
+from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL
+from modp_ti.inputs.multiview.features import detect_features
+from modp_ti.inputs.multiview.image_pairs import image_pairs
+from modp_ti.inputs.multiview.structure import MatchedImage, reconstructed
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import ReplayedTracker, Unreadable
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source
+from modp_ti.inputs.trackers.colmap import open_colmap
+from modp_ti.inputs.trackers.given_poses import selected_frames
+
+__all__ = ["open_sfm"]
+
+# The fingerprint of what a kept model was made of. A change of the method must change METHOD.
+MADE_OF = "made_of.txt"
+METHOD = "1"
+
+
+def open_sfm(
+    source: SourceSettings, tracker: SfmSettings, folder: Path, seed: int, progress: Progress | None = None
+) -> ReplayedTracker:
+    """Reconstruct the selected images, or take the model in `folder` if it was made of the same images and settings.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the reconstruction.
+        folder: The folder of the model, a COLMAP model with a fingerprint.
+        seed: Seed of RANSAC.
+        progress: Called while features are found, matched and placed.
+
+    Raises:
+        InputError: If the images cannot be used, or fewer than three of them belong together.
+    """
+    images = open_source(source)
+    reader = FrameReader(images, source)
+    names = selected_frames(images, source)
+    made_of = _fingerprint(images, source, tracker, names, seed)
+    kept = _kept(folder) == made_of
+    if not kept:
+        _reconstruct(reader, names, tracker, folder, seed, progress or _silent)
+        replace_text(folder / MADE_OF, made_of)
+    images.close()
+    opened = open_colmap(source, ColmapSettings(path=folder))
+    if kept:
+        opened.notes.append(f"structure from motion: {folder} is of these images and settings, and is used again")
+    return opened
+
+
+def _reconstruct(
+    reader: FrameReader, names: Sequence[str], tracker: SfmSettings, folder: Path, seed: int, progress: Progress
+) -> None:
+    """Write the model of the images to the folder."""
+    matched = list(_described(reader, names, tracker, progress))
+    overlap = tracker.overlap if tracker.order == "sequential" else None
+    pairs = image_pairs([image.features for image in matched], overlap, seed)
+    model = reconstructed(matched, pairs, tracker.mapper, seed, progress)
+    if model is None:
+        raise InputError(
+            f"{reader.images.path}: structure from motion could not join three of the {len(matched)} images: they need "
+            "to show one scene with detail, from places apart (tracker.kind: sfm)"
+        )
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    model.write_binary(str(folder))
+
+
+def _described(
+    reader: FrameReader, names: Sequence[str], tracker: SfmSettings, progress: Progress
+) -> Iterator[MatchedImage]:
+    """Find the features of the images. Damaged images are skipped."""
+    images, unreadable = reader.images, Unreadable()
+    for number, name in enumerate(names):
+        progress("finding features", number, len(names))
+        try:
+            raw = images.read(name)
+        except UnreadableImageError as error:
+            unreadable.add(name, error, len(names))
+            continue
+        features = detect_features(raw, tracker.features).within(reader.valid(name, raw))
+        intrinsics = images.intrinsics or _guessed(raw.shape[1], raw.shape[0])
+        yield MatchedImage(name, features, intrinsics, images.intrinsics is not None)
+    progress("finding features", len(names), len(names))
+
+
+def _guessed(width: int, height: int) -> Intrinsics:
+    """A typical camera, to start from."""
+    focal = TYPICAL_FOCAL * max(width, height)
+    return Intrinsics(PinholeCamera(focal, focal, width / 2, height / 2, width, height))
+
+
+def _fingerprint(
+    images: ImageSource, source: SourceSettings, tracker: SfmSettings, names: Sequence[str], seed: int
+) -> str:
+    """A hash of everything that the model depends on; of files, their sizes and times of change."""
+    files = [images.path / name for name in names]
+    stamps = [(file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
+    if not stamps:  # a video
+        stamps = [(images.path.stat().st_size, images.path.stat().st_mtime_ns)]
+    chosen = source.model_dump(mode="json", include={"kind", "intrinsics", "masks", "mask_colour", "mask_tolerance"})
+    content = [METHOD, list(names), stamps, chosen, tracker.model_dump(mode="json"), seed]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def _kept(folder: Path) -> str | None:
+    """The fingerprint of the model in the folder; None if there is none."""
+    try:
+        return read_text(folder / MADE_OF)
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
+def _silent(what: str, done: int, total: int) -> None:
+    """Progress that nobody sees."""

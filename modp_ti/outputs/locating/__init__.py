@@ -1,0 +1,1 @@
+"""Localisation of new pictures in a finished map."""

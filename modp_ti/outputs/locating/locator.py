@@ -1,0 +1,135 @@
+"""`Locator`: finds the poses of new pictures in a finished map."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import IntrinsicsSettings
+from modp_ti.outputs.locating.map_views import MapViews
+from modp_ti.outputs.locating.picture import camera_of, read_picture
+from modp_ti.outputs.locating.search import Search
+from modp_ti.outputs.playback.finished_run import open_run
+from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
+from modp_ti.outputs.progress import ProgressLine
+
+__all__ = ["Location", "Locator"]
+
+# Most keyframes that the map is rendered from, evenly spaced.
+MOST_VIEWS = 400
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where a picture was taken.
+
+    Attributes:
+        name: Name of the picture.
+        T_camera_world: Pose (4, 4) in the map, OpenCV axes; None if it was not found.
+        reason: Why it was not found; empty otherwise.
+        inliers: Number of features that the picture and the render of the map from this pose show at the same place.
+        likeness: Correlation of the picture and this render, from -1 to 1.
+        covariance: Covariance (6, 6) of the tangent (translation, rotation) of exp(xi) T_camera_world [scene units,
+            rad], by the reprojection errors of the inliers; None if the pose was not found.
+        camera: Camera of the picture at its own size, without its lens distortion; None if the pose was not found.
+        note: Where the camera is from.
+
+    Example:
+        location: modp_ti.Location = modp_ti.Locator("out/room").locate("new.jpg")
+        print(location.reason if location.T_camera_world is None else location.T_camera_world)
+    """
+
+    name: str
+    T_camera_world: NDArray[np.float64] | None = None
+    reason: str = ""
+    inliers: int = 0
+    likeness: float = 0.0
+    covariance: NDArray[np.float64] | None = None
+    camera: PinholeCamera | None = None
+    note: str = ""
+
+
+class Locator:
+    """Locates pictures in the map of a finished run.
+
+    The map is rendered from its keyframes. Features of a picture are matched with those of the renders that resemble
+    it, whose places are known from the rendered depth, and give a first pose. It is refined with a render from this
+    pose, first by features and then photometrically. A pose is accepted only if the picture and the render from it
+    have features in common at the same places, and look alike.
+
+    This starts the device, as `initialise` does.
+
+    Args:
+        output: Output folder of a run. Only the map and its poses are read, not the images.
+        device: "cpu", "cuda", "vulkan", "metal" or "auto".
+        console: Receives the progress, None for no output.
+
+    Raises:
+        InputError: If the folder holds no finished run.
+
+    Example:
+        locator = modp_ti.Locator("out/room")
+        location = locator.locate("new.jpg")
+        print(location.T_camera_world, location.inliers)
+    """
+
+    def __init__(self, output: str | os.PathLike[str], device: str = "auto", console: Console | None = None) -> None:
+        line = ProgressLine(console or Console(quiet=True))
+        with line.working("loading the map"):
+            self._run = run = open_run(Path(output))
+            gaussians = run.gaussians
+            start_device(device)
+        keyframes = run.record.keyframes
+        count = min(len(keyframes), MOST_VIEWS)
+        shown = [keyframes[i * len(keyframes) // count] for i in range(count)]
+        cameras = [run.cameras[index] for index in shown]
+        self._side = max(max(camera.width, camera.height) for camera in cameras)
+        renderer = MapRenderer(gaussians, self._side, self._side, run.record.near)
+        shots = list(zip(cameras, run.poses[shown], strict=True))
+        views = MapViews(renderer, line.through("rendering the map", shots, len(shots)))
+        self._search = Search(renderer, views)
+
+    def locate(
+        self,
+        picture: str | os.PathLike[str] | NDArray[np.uint8],
+        camera: IntrinsicsSettings | None = None,
+        name: str | None = None,
+    ) -> Location:
+        """Locate one picture.
+
+        Args:
+            picture: An image file, or an image (H, W, 3) uint8 RGB.
+            camera: The picture's camera, as `source.intrinsics` of a scene. None: the run's camera if the picture has
+                the shape of the run's images; otherwise the focal length is estimated.
+            name: Name for the result; None for that of the file.
+
+        Raises:
+            InputError: If the file cannot be read as an image, or the camera is of another image size.
+        """
+        if isinstance(picture, np.ndarray):
+            raw, name = picture, name or "picture"
+        else:
+            raw, name = read_picture(Path(picture)), name or os.fspath(picture)
+        height, width = raw.shape[:2]
+        chosen = camera_of(self._run, width, height, camera)
+        undistorter = chosen.intrinsics.undistorter(min(1.0, self._side / max(width, height)))
+        image, valid = undistorter.image(raw)
+        found = self._search.find(image, valid, undistorter.camera, not chosen.known)
+        if isinstance(found, str):
+            return Location(name, reason=found, note=chosen.note)
+        return Location(
+            name,
+            found.T_camera_world,
+            "",
+            found.inliers,
+            found.likeness,
+            found.covariance,
+            found.camera.resized(width, height),
+            chosen.note,
+        )

@@ -1,0 +1,74 @@
+"""Bare pictures of the test room: their poses are found, kept, and found anew when something has changed."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import modp_ti.inputs.trackers.sfm as sfm
+from fields.geometry.se3 import camera_centres
+from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
+from modp_ti.config.tracker_settings import SfmSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.trackers.sfm import open_sfm
+from modp_ti.outputs.evaluation import umeyama
+from tests.room import Room, RoomRecording, pinhole, walk
+
+CAMERA = pinhole(240, 180)
+POSES = walk(6, step=0.25)
+
+
+@pytest.fixture
+def source(room: Room, tmp_path: Path) -> SourceSettings:
+    """Six pictures in no order of the alphabet, one of which has a blank in its name."""
+    (tmp_path / "images").mkdir()
+    for i, image in enumerate(RoomRecording(room, CAMERA, POSES).images):
+        cv2.imwrite(str(tmp_path / "images" / f"view {i + 7}.png"), image[..., ::-1])
+    return SourceSettings(path=tmp_path / "images", scale=0.5, intrinsics=IntrinsicsSettings(fx=CAMERA.fx))
+
+
+def test_the_frames_have_the_poses_and_points_of_the_room(source: SourceSettings, room: Room, tmp_path: Path) -> None:
+    said: list[str] = []
+    frames = list(open_sfm(source, SfmSettings(), tmp_path / "sfm", 0, lambda what, done, total: said.append(what)))
+    assert [frame.name for frame in frames] == [f"view {i + 7}.png" for i in range(6)]
+    assert list(dict.fromkeys(said)) == ["finding features", "matching images", "placing the images"]
+    s, R, t = umeyama(camera_centres([frame.T_camera_world for frame in frames]), camera_centres(POSES))
+    for frame, T in zip(frames, POSES, strict=True):
+        assert frame.camera.fx == pytest.approx(0.5 * CAMERA.fx)
+        centre = camera_centres([frame.T_camera_world])[0]
+        assert np.linalg.norm(s * R @ centre + t - camera_centres([T])[0]) < 0.03
+        assert len(frame.points) > 20
+        # The points lie on the surfaces of the room.
+        depth = room.depth(frame.camera, T, frame.points.pixels)
+        assert np.median(np.abs(s * frame.points.depths(frame.T_camera_world) / depth - 1)) < 0.1
+
+
+def test_the_model_is_kept_until_images_or_settings_change(
+    source: SourceSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    monkeypatch.setattr(sfm, "_reconstruct", lambda *arguments, _made=sfm._reconstruct: made.append(_made(*arguments)))
+    first = open_sfm(source, SfmSettings(), tmp_path / "sfm", 0)
+    again = open_sfm(source, SfmSettings(), tmp_path / "sfm", 0)
+    assert len(made) == 1 and any("used again" in note for note in again.notes)
+    np.testing.assert_array_equal(first.frames[3].T_camera_world, again.frames[3].T_camera_world)
+    open_sfm(source, SfmSettings(features=1500), tmp_path / "sfm", 0)
+    assert len(made) == 2
+    assert source.path is not None
+    shutil.copyfile(source.path / "view 8.png", source.path / "view 9.png")
+    open_sfm(source, SfmSettings(features=1500), tmp_path / "sfm", 0)
+    assert len(made) == 3
+
+
+def test_pictures_without_a_scene_are_wrong_input(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for i in range(4):
+        noise = np.random.default_rng(i).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), noise)
+    with pytest.raises(InputError, match="could not join three of the 4 images"):
+        open_sfm(SourceSettings(path=tmp_path / "images", scale=1), SfmSettings(), tmp_path / "sfm", 0)
+    assert not (tmp_path / "sfm").exists()

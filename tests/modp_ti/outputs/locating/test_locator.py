@@ -1,0 +1,127 @@
+"""Pictures of the test room, taken from known poses, in a map of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from fields.geometry.se3 import exp_se3, inverse_se3
+from modp_ti.commands.app import app
+from modp_ti.config.settings import IntrinsicsSettings
+from modp_ti.outputs.formats.trajectory import read_trajectory
+from modp_ti.outputs.locating.locator import Location, Locator
+from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, photograph, write_run
+from tests.room import Room, walk
+
+pytestmark = pytest.mark.slow
+
+K1 = -0.08
+# Of pictures of 240 pixels at 3 m, against a map of overlapping Gaussians that nothing has optimised [m, degrees].
+AWAY, TURNED = 0.05, 1.0
+
+
+@pytest.fixture(scope="module")
+def out(made_once: Callable[[str, Callable[[Path], None]], Path], room: Room) -> Path:
+    return made_once("a painted room", lambda folder: (write_run(room, folder / "out", K1), None)[1]) / "out"
+
+
+@pytest.fixture(scope="module")
+def locator(out: Path) -> Locator:
+    return Locator(out, "cpu")
+
+
+def new_poses() -> list[NDArray[np.float64]]:
+    """Between the keyframes, up to 20 cm beside them, and turned by up to 6 degrees."""
+    rng = np.random.default_rng(5)
+    between = walk(13, step=0.1)[3:11:2]
+    return [exp_se3(rng.uniform(-1, 1, 6) * np.repeat([0.12, 0.06], 3)) @ T for T in between]
+
+
+def errors(location: Location, T: NDArray[np.float64]) -> tuple[float, float]:
+    """Distance [m] and angle [degrees] from the true pose."""
+    assert location.T_camera_world is not None, location.reason
+    turned = location.T_camera_world[:3, :3] @ T[:3, :3].T
+    away = np.linalg.norm(inverse_se3(location.T_camera_world)[:3, 3] - inverse_se3(T)[:3, 3])
+    return float(away), float(np.degrees(np.arccos(min((np.trace(turned) - 1) / 2, 1.0))))
+
+
+def test_pictures_by_the_runs_camera_are_located(locator: Locator, room: Room) -> None:
+    """At the size of the stored images, through their lens."""
+    double = CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height)
+    for T in new_poses()[:2]:
+        location = locator.locate(photograph(room, double, T, K1))
+        away, turned = errors(location, T)
+        assert away < AWAY and turned < TURNED
+        assert location.inliers >= 20 and location.likeness > 0.9
+
+
+def test_an_undistorted_picture_of_the_mapped_size_is_located(locator: Locator, room: Room) -> None:
+    T = new_poses()[0]
+    away, turned = errors(locator.locate(photograph(room, CAMERA, T)), T)
+    assert away < AWAY and turned < TURNED
+
+
+def test_a_darker_picture_is_located(locator: Locator, room: Room) -> None:
+    T = new_poses()[1]
+    dark = (photograph(room, CAMERA, T) * np.array([0.5, 0.6, 0.55])).astype(np.uint8)
+    away, turned = errors(locator.locate(dark), T)
+    assert away < AWAY and turned < TURNED
+
+
+def test_an_unknown_camera_gets_a_focal_length(locator: Locator, room: Room) -> None:
+    """A square cut out of the middle, whose shape is not that of the run's images."""
+    T = new_poses()[2]
+    cut = np.ascontiguousarray(photograph(room, CAMERA, T)[:, 30:210])
+    location = locator.locate(cut)
+    away, turned = errors(location, T)
+    assert away < 3 * AWAY and turned < 3 * TURNED
+    assert location.camera is not None and location.camera.fx == pytest.approx(CAMERA.fx, rel=0.05)
+    assert "estimated" in location.note
+    given = locator.locate(cut, IntrinsicsSettings(fx=CAMERA.fx))
+    assert errors(given, T)[0] < AWAY and "given" in given.note
+
+
+def test_other_places_are_not_located(locator: Locator) -> None:
+    elsewhere = another_room()
+    rng = np.random.default_rng(0)
+    pictures = [photograph(elsewhere, CAMERA, T) for T in new_poses()[:2]]
+    pictures.append(rng.integers(0, 256, (180, 240, 3), dtype=np.uint8))
+    pictures.append(np.zeros((180, 240, 3), np.uint8))
+    for picture in pictures:
+        location = locator.locate(picture)
+        assert location.T_camera_world is None and location.reason
+
+
+def test_the_command_says_which_pictures_it_has_located(out: Path, room: Room, tmp_path: Path) -> None:
+    T = new_poses()[0]
+    cv2.imwrite(str(tmp_path / "here.png"), photograph(room, CAMERA, T)[..., ::-1])
+    cv2.imwrite(str(tmp_path / "elsewhere.png"), photograph(another_room(), CAMERA, T)[..., ::-1])
+    names = [str(tmp_path / name) for name in ("elsewhere.png", "here.png")]
+
+    alone = CliRunner().invoke(app, ["locate", str(out), names[1], "--device", "cpu"])
+    assert alone.exit_code == 0, alone.output
+    (tmp_path / "found.txt").write_text(alone.stdout)
+    times, poses = read_trajectory(tmp_path / "found.txt")
+    assert times.tolist() == [0.0]
+
+    both = CliRunner().invoke(app, ["locate", str(out), *names, "--device", "cpu", "--json"])
+    assert both.exit_code == 1, both.output
+    missed, found = json.loads(both.stdout)["pictures"]
+    assert not missed["located"] and missed["reason"] and "T_camera_world" not in missed
+    assert found["located"] and found["inliers"] >= 20 and np.shape(found["covariance"]) == (6, 6)
+    np.testing.assert_allclose(poses[0], found["T_camera_world"], atol=1e-9)
+
+
+def test_a_picture_that_cannot_be_read_is_wrong_input(out: Path, tmp_path: Path) -> None:
+    (tmp_path / "text.png").write_text("no picture")
+    result = CliRunner().invoke(app, ["locate", str(out), str(tmp_path / "text.png"), "--device", "cpu"])
+    assert result.exit_code == 2 and "text.png" in result.stderr
+    result = CliRunner().invoke(app, ["locate", str(out), str(tmp_path / "text.png"), "--camera", "fx=5,focus=3"])
+    assert result.exit_code == 2 and "focus" in result.stderr
