@@ -67,6 +67,7 @@ class Engine:
         source_readers: Modules that look up the sources of kernels, below the package.
         position_note: Module, class and method that describe the source line of an expression.
         saves_cache_on_reset: Whether the offline cache is written only when the engine is reset.
+        parses_twice: Whether it parses a kernel a first time to find which fields of its dataclass arguments are used.
     """
 
     package: str
@@ -85,6 +86,7 @@ class Engine:
     source_readers: tuple[str, ...]
     position_note: tuple[str, str, str]
     saves_cache_on_reset: bool
+    parses_twice: bool
 
     def __str__(self) -> str:
         return f"{self.title} {self.version}"
@@ -131,6 +133,7 @@ TAICHI = Engine(
     source_readers=("lang.kernel_impl",),
     position_note=("lang.ast.ast_transformer_utils", "ASTTransformerContext", "get_pos_info"),
     saves_cache_on_reset=False,
+    parses_twice=False,
 )
 
 # With this many Gaussians of degree 3, indices of their coefficients still fit in 32 bits.
@@ -153,6 +156,7 @@ QUADRANTS = Engine(
     source_readers=("lang.kernel_impl", "lang.kernel", "lang._func_base", "lang.ast.checkers"),
     position_note=("lang.ast.ast_transformer_utils", "ASTTransformerFuncContext", "memoized_get_pos_info"),
     saves_cache_on_reset=True,
+    parses_twice=True,
 )
 
 ENGINES = {known.package: known for known in (TAICHI, QUADRANTS)}

@@ -57,3 +57,20 @@ def test_kernels_of_classes_are_told_from_functions():
     assert part("lang.kernel_impl")._inside_class.__module__ == "fields.runtime.kernel_sources"
     assert Counter().total() == 18
     assert four() == 4
+
+
+def test_a_kernel_is_parsed_once():
+    """Quadrants would do it twice. Both forms of a kernel with a template argument are parsed."""
+    answer_quickly()
+    parsed = []
+
+    def note(value):
+        parsed.append(value)
+        return value
+
+    @ti.kernel
+    def twice(of: ti.template()) -> ti.i32:
+        return 2 * ti.static(note(of))
+
+    assert [twice(3), twice(4), twice(3)] == [6, 8, 6]
+    assert parsed == [3, 4]
