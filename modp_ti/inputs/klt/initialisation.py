@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.relocalisation import describe
 from modp_ti.inputs.klt.two_view import TwoViews, two_views
 from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
@@ -66,7 +65,7 @@ class Initialisation:
 
     def _match(self, last: Frame, frame: Frame) -> None:
         """Add SIFT matches with the frame before to both frames, where flow has lost too many features."""
-        a, b = describe(last.grey), describe(frame.grey)
+        a, b = last.described, frame.described
         pairs = match_anywhere(a, b).pairs
         ids = self._new_ids(len(pairs))
         last.append(ids, a.pixels[pairs[:, 0]])
