@@ -117,6 +117,7 @@ class Odometry:
                 lens = (self._run or self._active).tracking.map.lens
                 self._initialisation = Initialisation([lens], self._seed)
         assert self._initialisation is not None
+        frame.ids, frame.pixels = frame.ids[:0], frame.pixels[:0]  # those of the lost map
         landmarks = self._initialisation.add(frame)
         if landmarks is None or not self._may_begin():
             return []
