@@ -43,8 +43,12 @@ class Initialisation:
         self._seed = seed
         self._count = 0
 
-    def add(self, frame: Frame) -> LandmarkMap | None:
+    def add(self, frame: Frame, attempts: bool = True) -> LandmarkMap | None:
         """Add a frame without features. It is given those of the frame before, and new ones.
+
+        Args:
+            frame: The frame.
+            attempts: Whether a map may begin with this frame.
 
         Returns:
             The map, whose last keyframe is this frame; None as long as it cannot be initialised.
@@ -57,7 +61,7 @@ class Initialisation:
         self.frames.append(frame)
         if len(self.frames) > LONGEST:
             del self.frames[0]
-        found = self._attempt(frame)
+        found = self._attempt(frame) if attempts else None
         if len(frame.ids) < 0.75 * WANTED:
             new = frame.new_corners()
             frame.append(self._new_ids(len(new)), new)

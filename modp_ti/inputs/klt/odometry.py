@@ -118,8 +118,8 @@ class Odometry:
                 self._initialisation = Initialisation([lens], self._seed)
         assert self._initialisation is not None
         frame.ids, frame.pixels = frame.ids[:0], frame.pixels[:0]  # those of the lost map
-        landmarks = self._initialisation.add(frame)
-        if landmarks is None or not self._may_begin():
+        landmarks = self._initialisation.add(frame, self._may_begin())
+        if landmarks is None:
             return []
         submap, views = self._begin(landmarks, self._initialisation.frames)
         self._initialisation = None
