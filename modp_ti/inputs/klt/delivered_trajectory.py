@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.se3 import inverse_se3
+from modp_ti.inputs.klt.landmark_map import Keyframe
 from modp_ti.inputs.klt.tracking import Tracking, View
 from modp_ti.inputs.multiview.reprojection import ray_errors
 from modp_ti.inputs.replay import points_inside
@@ -56,7 +57,8 @@ class DeliveredTrajectory:
         self._tracking = tracking
         self._map = tracking.map
         self._undistorter = undistorter
-        self._keyframes: dict[int, NDArray[np.float64]] = {}
+        # By number of the frame: the keyframes of delivered frames, with their delivered poses.
+        self._keyframes: dict[int, tuple[Keyframe, NDArray[np.float64]]] = {}
         self._keyframes_checked = len(tracking.map.keyframes)
         self._xyz = np.zeros((0, 3))
         self._remembered = 0  # the first frame that still has its landmarks
@@ -65,7 +67,8 @@ class DeliveredTrajectory:
         """Add the next frame."""
         frame = DeliveredFrame(name, view, self._tracking.pose(view))
         self.frames.append(frame)
-        self._keyframes.setdefault(view.keyframe, self._map.keyframes[view.keyframe].T_camera_world.copy())
+        keyframe = view.keyframe
+        self._keyframes.setdefault(keyframe.number, (keyframe, keyframe.T_camera_world.copy()))
         return frame
 
     def points(self, frame: DeliveredFrame) -> SparsePoints:
@@ -101,18 +104,17 @@ class DeliveredTrajectory:
         if not last and len(landmarks.keyframes) == self._keyframes_checked:
             return
         self._keyframes_checked = len(landmarks.keyframes)
-        moved = {k: self._shift(k, T) for k, T in self._keyframes.items()}
+        moved = {number: self._shift(*each) for number, each in self._keyframes.items()}
         if max(moved.values()) < (MOVED if last else NOTABLE):
             return
-        affected = {k for k, shift in moved.items() if shift >= MOVED}
-        index = [i for i, frame in enumerate(self.frames) if frame.view.keyframe in affected]
+        affected = {number for number, shift in moved.items() if shift >= MOVED}
+        index = [i for i, frame in enumerate(self.frames) if frame.view.keyframe.number in affected]
         for i in index:
             self.frames[i].T_camera_world = self._tracking.pose(self.frames[i].view)
-        for k in affected:
-            self._keyframes[k] = landmarks.keyframes[k].T_camera_world.copy()
+        self._remember(affected)
         known = np.flatnonzero(~np.isnan(self._xyz[:, 0]) & landmarks.known[: len(self._xyz)])
         away = np.linalg.norm(landmarks.xyz[known] - self._xyz[known], axis=1)
-        ids = known[away > MOVED * self._depth(max(affected)) / landmarks.lens.focal]
+        ids = known[away > MOVED * self._depth(self._keyframes[max(affected)][0]) / landmarks.lens.focal]
         self._xyz[ids] = landmarks.xyz[ids]
         yield PoseCorrection(
             index=np.array(index, dtype=np.int64),
@@ -132,7 +134,7 @@ class DeliveredTrajectory:
         for frame in self.frames:
             self._tracking.relocalise(frame.view)
             frame.T_camera_world = self._tracking.pose(frame.view)
-        self._keyframes = {k: self._map.keyframes[k].T_camera_world.copy() for k in self._keyframes}
+        self._remember(list(self._keyframes))
         ids = np.flatnonzero(~np.isnan(self._xyz[:, 0]) & self._map.known[: len(self._xyz)])
         self._xyz[ids] = self._map.xyz[ids]
         return PoseCorrection(
@@ -143,19 +145,23 @@ class DeliveredTrajectory:
             camera=revision,
         )
 
-    def _depth(self, k: int) -> float:
-        """Median depth of the landmarks that keyframe k sees."""
-        keyframe = self._map.keyframes[k]
+    def _remember(self, numbers: Iterable[int]) -> None:
+        """Record that the poses of these keyframes were delivered."""
+        for number in numbers:
+            keyframe = self._keyframes[number][0]
+            self._keyframes[number] = keyframe, keyframe.T_camera_world.copy()
+
+    def _depth(self, keyframe: Keyframe) -> float:
+        """Median depth of the landmarks that a keyframe sees."""
         ids = keyframe.ids[self._map.known[keyframe.ids]]
         T = keyframe.T_camera_world
         return float(np.median(self._map.xyz[ids] @ T[2, :3] + T[2, 3])) if len(ids) else 1.0
 
-    def _shift(self, k: int, delivered: NDArray[np.float64]) -> float:
-        """Approximate image motion [px of the tracked image] of keyframe k since its pose was last delivered."""
-        T_camera_world = self._map.keyframes[k].T_camera_world
-        if np.array_equal(T_camera_world, delivered):
+    def _shift(self, keyframe: Keyframe, delivered: NDArray[np.float64]) -> float:
+        """Approximate image motion [px of the tracked image] of a keyframe since its pose was last delivered."""
+        if np.array_equal(keyframe.T_camera_world, delivered):
             return 0.0
-        change = T_camera_world @ inverse_se3(delivered)
+        change = keyframe.T_camera_world @ inverse_se3(delivered)
         turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-        away = float(np.linalg.norm(change[:3, 3])) / max(self._depth(k), 1e-12)
+        away = float(np.linalg.norm(change[:3, 3])) / max(self._depth(keyframe), 1e-12)
         return (turn + away) * self._map.lens.focal

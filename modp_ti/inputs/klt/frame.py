@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.optical_flow import corners, flow
+from modp_ti.inputs.klt.relocalisation import describe
+from modp_ti.inputs.multiview.features import Features
 
 __all__ = ["WANTED", "Frame", "LocalisedFrame"]
 
@@ -31,6 +34,11 @@ class Frame:
     valid: NDArray[np.bool_] | None = None
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     pixels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+
+    @cached_property
+    def described(self) -> Features:
+        """Its SIFT features, detected when they are first needed."""
+        return describe(self.grey)
 
     def track(self, other: Frame, guess: NDArray[np.float64] | None = None) -> None:
         """Replace the features by those of another frame that optical flow finds in this one.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.relocalisation import describe
 from modp_ti.inputs.klt.two_view import TwoViews, two_views
 from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
@@ -44,8 +43,12 @@ class Initialisation:
         self._seed = seed
         self._count = 0
 
-    def add(self, frame: Frame) -> LandmarkMap | None:
+    def add(self, frame: Frame, attempts: bool = True) -> LandmarkMap | None:
         """Add a frame without features. It is given those of the frame before, and new ones.
+
+        Args:
+            frame: The frame.
+            attempts: Whether a map may begin with this frame.
 
         Returns:
             The map, whose last keyframe is this frame; None as long as it cannot be initialised.
@@ -58,7 +61,7 @@ class Initialisation:
         self.frames.append(frame)
         if len(self.frames) > LONGEST:
             del self.frames[0]
-        found = self._attempt(frame)
+        found = self._attempt(frame) if attempts else None
         if len(frame.ids) < 0.75 * WANTED:
             new = frame.new_corners()
             frame.append(self._new_ids(len(new)), new)
@@ -66,7 +69,7 @@ class Initialisation:
 
     def _match(self, last: Frame, frame: Frame) -> None:
         """Add SIFT matches with the frame before to both frames, where flow has lost too many features."""
-        a, b = describe(last.grey), describe(frame.grey)
+        a, b = last.described, frame.described
         pairs = match_anywhere(a, b).pairs
         ids = self._new_ids(len(pairs))
         last.append(ids, a.pixels[pairs[:, 0]])

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
+from fields.geometry.similarity import moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
-__all__ = ["Keyframe", "LandmarkMap"]
+__all__ = ["Keyframe", "LandmarkMap", "MapState"]
 
 # Observations with a larger reprojection error [px] are outliers.
 MAX_ERROR = 2.5
 # Smallest angle [degrees] between the rays of a new landmark. With less parallax its depth is unreliable.
 MIN_ANGLE = 1.2
+# The arrays of the landmarks, and the values of free places that are not 0.
+LANDMARKS = ("xyz", "known", "first", "first_pixel", "last", "last_pixel", "looked", "found")
+EMPTY = {"first": -1, "last": -1}
 
 
 @dataclass
@@ -35,6 +39,7 @@ class Keyframe:
         rays: (N, 2) their undistorted normalised coordinates.
         described: Its M SIFT features; None until they are needed.
         described_ids: (M,) the feature id of each SIFT feature, -1 for none.
+        scale: What the scale of the map around it has grown by since it was made.
     """
 
     number: int
@@ -45,11 +50,17 @@ class Keyframe:
     rays: NDArray[np.float64]
     described: Features | None = None
     described_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    scale: float = 1.0
 
     @property
     def centre(self) -> NDArray[np.float64]:
         """Camera centre (3,) in the world."""
         return inverse_se3(self.T_camera_world)[:3, 3]
+
+    def move(self, S: NDArray[np.float64]) -> None:
+        """Move it in place with the world around it, by a similarity (4, 4)."""
+        self.T_camera_world[:] = moved_pose(S, self.T_camera_world)
+        self.scale *= float(scale_of(S))
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
         """Remove all observations except those of the mask (N,)."""
@@ -60,6 +71,21 @@ class Keyframe:
         self.ids = np.concatenate([self.ids, ids])
         self.pixels = np.concatenate([self.pixels, pixels])
         self.rays = np.concatenate([self.rays, rays])
+
+
+@dataclass(frozen=True)
+class MapState:
+    """What a map was at some time.
+
+    Attributes:
+        lens: The camera.
+        landmarks: Copies of the arrays of the landmarks, by name.
+        keyframes: Copies of the keyframes.
+    """
+
+    lens: Lens
+    landmarks: dict[str, NDArray]
+    keyframes: list[Keyframe]
 
 
 class LandmarkMap:
@@ -100,8 +126,8 @@ class LandmarkMap:
         self._count += count
         if self._count > len(self.known):
             extra = max(self._count, 2 * len(self.known), 1024) - len(self.known)
-            for name in ("xyz", "known", "first", "first_pixel", "last", "last_pixel", "looked", "found"):
-                array, value = getattr(self, name), -1 if name in ("first", "last") else 0
+            for name in LANDMARKS:
+                array, value = getattr(self, name), EMPTY.get(name, 0)
                 setattr(self, name, np.concatenate([array, np.full((extra, *array.shape[1:]), value, array.dtype)]))
         return ids
 
@@ -111,6 +137,39 @@ class LandmarkMap:
         k = len(self.keyframes) - 1
         self.note_observations(k, keyframe.ids, keyframe.pixels)
         return k
+
+    def absorb(self, other: LandmarkMap, S_self_other: NDArray[np.float64]) -> int:
+        """Take over the keyframes and landmarks of another map, whose keyframes become those of this one.
+
+        Args:
+            other: The other map, which must not be used afterwards.
+            S_self_other: (4, 4) similarity from its world to this one.
+
+        Returns:
+            What its ids have grown by.
+        """
+        offset, count = self._count, other._count
+        ids = self.new_ids(count)
+        mine, others = list(self.keyframes), list(other.keyframes)
+        self.keyframes = sorted([*mine, *others], key=lambda keyframe: keyframe.number)
+        place = {keyframe.number: k for k, keyframe in enumerate(self.keyframes)}
+        for name in ("known", "looked", "found", "first_pixel", "last_pixel"):
+            getattr(self, name)[ids] = getattr(other, name)[:count]
+        self.xyz[ids] = moved_points(S_self_other, other.xyz[:count])
+        for name in ("first", "last"):
+            array = getattr(self, name)
+            for rows, keyframes, old in (
+                (np.arange(offset), mine, array[:offset]),
+                (ids, others, getattr(other, name)[:count]),
+            ):
+                now = np.array([place[keyframe.number] for keyframe in keyframes] + [-1], dtype=np.int64)
+                array[rows] = now[old]  # -1, for none, is the last
+        for keyframe in others:
+            keyframe.move(S_self_other)
+            keyframe.ids = keyframe.ids + offset
+            keyframe.described_ids = np.where(keyframe.described_ids < 0, -1, keyframe.described_ids + offset)
+            keyframe.rays = self.lens.rays(keyframe.pixels)
+        return offset
 
     def note_observations(self, k: int, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:
         """Update the first and last observation of features (N,) that keyframe k sees at pixels (N, 2)."""
@@ -214,16 +273,37 @@ class LandmarkMap:
             self._take(Lens(bundle.camera))
         return bundle.cost
 
-    def state(self) -> tuple[Lens, NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Camera, landmarks and poses of the keyframes, for `restore`."""
-        return self.lens, self.xyz.copy(), [keyframe.T_camera_world.copy() for keyframe in self.keyframes]
+    def move(self, moves: Sequence[NDArray[np.float64]]) -> None:
+        """Move each keyframe, with the landmarks that it saw first, by a similarity S_after_before (4, 4)."""
+        ids = np.flatnonzero(self.known & (self.first >= 0))
+        each = np.stack(moves)[self.first[ids]]
+        self.xyz[ids] = np.einsum("nij,nj->ni", each[:, :3, :3], self.xyz[ids]) + each[:, :3, 3]
+        for keyframe, S in zip(self.keyframes, moves, strict=True):
+            keyframe.move(S)
 
-    def restore(self, lens: Lens, xyz: NDArray[np.float64], poses: Sequence[NDArray[np.float64]]) -> None:
-        """Take back what has changed since `state`, without the outliers that were removed meanwhile."""
-        self.xyz[: len(xyz)] = xyz
-        for keyframe, T in zip(self.keyframes, poses, strict=True):
-            keyframe.T_camera_world[:] = T
-        self._take(lens)
+    def state(self) -> MapState:
+        """The camera, the landmarks and the keyframes with their observations, for `restore`."""
+        arrays = {name: getattr(self, name).copy() for name in LANDMARKS}
+        keyframes = [
+            replace(each, T_camera_world=each.T_camera_world.copy(), described_ids=each.described_ids.copy())
+            for each in self.keyframes
+        ]
+        return MapState(self.lens, arrays, keyframes)
+
+    def restore(self, state: MapState) -> None:
+        """Take back what has changed since `state`, if no keyframe has been added. Ids that were given stay taken."""
+        for name, array in state.landmarks.items():
+            getattr(self, name)[: len(array)] = array
+            getattr(self, name)[len(array) :] = EMPTY.get(name, 0)
+        for keyframe, before in zip(self.keyframes, state.keyframes, strict=True):
+            keyframe.T_camera_world[:] = before.T_camera_world
+            keyframe.ids, keyframe.pixels, keyframe.rays = before.ids, before.pixels, before.rays
+            keyframe.scale = before.scale
+            if before.described is not None:
+                keyframe.described_ids = before.described_ids
+            else:
+                keyframe.described_ids = np.full_like(keyframe.described_ids, -1)
+        self.lens = state.lens
 
     def _take(self, lens: Lens) -> None:
         """Replace the camera, and with it the rays of all observations."""

@@ -10,7 +10,15 @@ from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.multiview.features import Features, detect_features, essential_matrix, match_anywhere
 from modp_ti.inputs.multiview.reprojection import pose_from_points
 
-__all__ = ["alike_keyframes", "describe", "inherited", "place_by_features", "thumbnail"]
+__all__ = [
+    "alike_keyframes",
+    "describe",
+    "described_keyframe",
+    "inherited",
+    "place_by_features",
+    "thumbnail",
+    "world_points",
+]
 
 # Thresholds in px of the tracked image. MAX_ERROR is RANSAC's, and is wide because many depths are those of neighbours.
 # A SIFT feature nearer than SAME_PLACE to a landmark takes its depth.
@@ -41,13 +49,13 @@ def alike_keyframes(thumbnails: NDArray[np.float32], grey: NDArray[np.uint8], co
 
 
 def place_by_features(
-    landmarks: LandmarkMap, k: int, features: Features, seed: int
+    landmarks: LandmarkMap, keyframe: Keyframe, features: Features, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """Localise a frame by SIFT matches with keyframe k.
+    """Localise a frame by SIFT matches with a keyframe.
 
     Args:
         landmarks: The map.
-        k: Index of the keyframe.
+        keyframe: One of its keyframes.
         features: SIFT features of the frame.
         seed: Seed of RANSAC.
 
@@ -55,11 +63,10 @@ def place_by_features(
         T_camera_world (4, 4) of the frame, and the matches (M, 2) that agree: indices of SIFT features in the keyframe
         and in the frame. None if too few agree.
     """
-    keyframe = landmarks.keyframes[k]
-    pairs = match_anywhere(_described(keyframe), features).pairs
+    pairs = match_anywhere(described_keyframe(keyframe), features).pairs
     if len(pairs) < FEWEST:
         return None
-    xyz = _places(landmarks, keyframe)[pairs[:, 0]]
+    xyz = world_points(landmarks, keyframe)[pairs[:, 0]]
     placed = np.isfinite(xyz).all(axis=1)
     if placed.sum() < FEWEST:
         return None
@@ -91,7 +98,7 @@ def inherited(
         Ids (N,) and their pixels (N, 2) in the frame.
     """
     keyframe = landmarks.keyframes[k]
-    described = _described(keyframe)
+    described = described_keyframe(keyframe)
     a, b = described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
     rays_a, rays_b = landmarks.lens.rays(a), landmarks.lens.rays(b)
     lines = np.c_[rays_a, np.ones(len(a))] @ essential_matrix(keyframe.T_camera_world, T).T
@@ -110,7 +117,7 @@ def inherited(
     return keyframe.described_ids[slots], b
 
 
-def _described(keyframe: Keyframe) -> Features:
+def described_keyframe(keyframe: Keyframe) -> Features:
     """SIFT features of a keyframe, detected when they are first needed."""
     if keyframe.described is None:
         keyframe.described = describe(keyframe.grey)
@@ -118,13 +125,13 @@ def _described(keyframe: Keyframe) -> Features:
     return keyframe.described
 
 
-def _places(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
+def world_points(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
     """World points (M, 3) of a keyframe's SIFT features; NaN where the depth is unknown.
 
     A feature that is a landmark has its position. Any other takes the depth of a landmark at the same pixel, or of the
     landmarks around it if they agree.
     """
-    pixels, ids = _described(keyframe).pixels, keyframe.described_ids
+    pixels, ids = described_keyframe(keyframe).pixels, keyframe.described_ids
     xyz = np.full((len(pixels), 3), np.nan)
     own = np.flatnonzero(ids >= 0)
     own = own[landmarks.known[ids[own]]]

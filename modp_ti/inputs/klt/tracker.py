@@ -18,6 +18,8 @@ from modp_ti.inputs.klt.camera_refinement import WHILE_TRACKING
 from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
+from modp_ti.inputs.klt.pose_graph import solver_is_there
+from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import PosedImage, Unreadable, readable_sizes, tracked_frame
@@ -26,6 +28,7 @@ from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 __all__ = ["KltTracker", "open_klt"]
 
+BEGINS_ANEW_AFTER = 10  # frames without a pose after which another map may begin
 FOLLOWED_SIDE = 640  # longer side [px] of the images in which features are tracked, at most
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
@@ -190,7 +193,7 @@ class KltTracker(Tracker):
             self._lens = Lens.radial(followed.fx, 0.0, followed.width, followed.height)
         else:
             self._lens = Lens.pinhole(followed)
-        self._odometry = Odometry([self._lens], seed, WHILE_TRACKING if is_guess else None)
+        self._odometry = Odometry([self._lens], seed, WHILE_TRACKING if is_guess else None, BEGINS_ANEW_AFTER)
         self._estimated_from = 0  # images, 0 for a camera that has not been estimated
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable = Unreadable()
@@ -272,36 +275,51 @@ class KltTracker(Tracker):
                 continue
             grey, valid = self._followed.grey(raw, self._reader.valid(name, raw))
             views = self._odometry.process(number, grey, valid)
-            tracking = self._odometry.tracking
-            if tracking is None:
-                continue
-            if self._trajectory is None:
-                self._trajectory = DeliveredTrajectory(tracking, self._delivered)
-            if tracking.map.lens is self._lens:
-                yield from self._trajectory.corrections()
-            else:
-                self._estimated_from = len(names)
-                yield self._take_lens(tracking.map.lens, self._trajectory)
-            self._skipped = len(names) - len(self._trajectory.frames) - len(views)
-            for view in views:
-                delivered = self._trajectory.add(names[view.number], view)
-                points, index = self._trajectory.points(delivered), len(self._trajectory.frames) - 1
-                frame = self._frame(index, delivered, points, raw if view.number == number else None)
-                self._trajectory.record(frame.points)
-                yield frame
+            yield from self._delivered_events(names, views, raw)
+        yield from self._delivered_events(names, self._odometry.finish())
         self._ended = True
         if self._trajectory is not None:
             self._skipped = len(names) - len(self._trajectory.frames)
             yield from self._trajectory.corrections(last=True)
         self._sum_up(names)
 
-    def _take_lens(self, lens: Lens, trajectory: DeliveredTrajectory) -> PoseCorrection:
-        """Take a new estimate of the camera. Returns the correction of what was delivered with the former one."""
+    def _delivered_events(
+        self, names: Sequence[str], views: Sequence[View], raw: NDArray[np.uint8] | None = None
+    ) -> Iterator[TrackedFrame | PoseCorrection]:
+        """Deliver what has changed and the next views.
+
+        Args:
+            names: Names of the images so far.
+            views: The views.
+            raw: The last image.
+        """
+        tracking = self._odometry.tracking
+        if tracking is None:
+            return
+        if tracking.map.lens is not self._lens:
+            self._estimated_from = len(names)
+            self._take_lens(tracking.map.lens)
+            if self._trajectory is not None:
+                yield self._trajectory.revise_camera(self._delivered)
+        elif self._trajectory is not None:
+            yield from self._trajectory.corrections()
+        if self._trajectory is None:
+            self._trajectory = DeliveredTrajectory(tracking, self._delivered)
+        waiting = sum(map(len, self._odometry.waiting))
+        self._skipped = len(names) - len(self._trajectory.frames) - len(views) - waiting
+        for view in views:
+            delivered = self._trajectory.add(names[view.number], view)
+            points, index = self._trajectory.points(delivered), len(self._trajectory.frames) - 1
+            frame = self._frame(index, delivered, points, raw if view.number == len(names) - 1 else None)
+            self._trajectory.record(frame.points)
+            yield frame
+
+    def _take_lens(self, lens: Lens) -> None:
+        """Take a new estimate of the camera."""
         raw = self.intrinsics.camera
         self._lens = lens
         self.intrinsics = intrinsics_of(lens, (raw.width, raw.height))
         self._delivered = self.intrinsics.undistorter(self.scale)
-        return trajectory.revise_camera(self._delivered)
 
     def _sum_up(self, names: Sequence[str]) -> None:
         if self._odometry.tracking is None or self._trajectory is None:
@@ -309,6 +327,12 @@ class KltTracker(Tracker):
                 f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
                 "and a camera that moves sideways and does not only turn"
             )
+        if not solver_is_there():
+            self._notes.append(
+                "klt closed no loops, for gtsam is not installed: `pip install gtsam` where it has a wheel"
+            )
+        if self._odometry.loops:
+            self._notes.append(f"klt closed {self._odometry.loops} loops")
         if self._estimated_from:
             self._notes.append(_note(self.intrinsics, self._estimated_from))
         placed = {frame.name for frame in self._trajectory.frames} | set(self._unreadable)
@@ -318,8 +342,18 @@ class KltTracker(Tracker):
         if without:
             self._notes.append(
                 f"{len(without)} of {len(names)} images could not be placed (the first is {without[0]}): skipped; the "
-                f"camera was found again {self._odometry.tracking.recovered} times"
+                f"camera was found again {self._odometry.recovered} times"
             )
+        apart = self._odometry.waiting
+        if apart:
+            largest = max(apart, key=len)
+            self._notes.append(
+                f"{sum(map(len, apart))} of these images are in {len(apart)} other maps, which show no place of the "
+                f"run's map; the largest has {len(largest)} images, {names[largest[0]]} to {names[largest[-1]]}: give "
+                "it a run of its own with source.start and source.stop"
+            )
+        if self._odometry.joined:
+            self._notes.append(f"the track was lost, and {self._odometry.joined} maps begun anew were joined with it")
 
     def _frame(
         self, index: int, delivered: DeliveredFrame, points: SparsePoints, raw: NDArray[np.uint8] | None = None

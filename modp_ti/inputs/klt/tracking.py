@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised
+from fields.geometry.similarity import moved_pose, scale_of
 from modp_ti.inputs.klt.camera_refinement import CameraRefinement, is_plausible
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, realigned, searched
-from modp_ti.inputs.klt.relocalisation import alike_keyframes, describe, inherited, place_by_features, thumbnail
+from modp_ti.inputs.klt.relocalisation import alike_keyframes, inherited, place_by_features, thumbnail
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
-from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import refine_pose
 
 __all__ = ["Tracking", "View"]
@@ -40,17 +40,28 @@ class View:
 
     Attributes:
         number: Number of the frame.
-        keyframe: Index of its keyframe in the map.
+        keyframe: Its keyframe.
         T_camera_keyframe: (4, 4) pose relative to the keyframe.
         ids: (N,) landmarks that it sees.
         pixels: (N, 2) their positions in the tracked image.
+        scale: The keyframe's `scale` to which `T_camera_keyframe` belongs.
     """
 
     number: int
-    keyframe: int
+    keyframe: Keyframe
     T_camera_keyframe: NDArray[np.float64]
     ids: NDArray[np.int64]
     pixels: NDArray[np.float64]
+    scale: float = 1.0
+
+    @property
+    def T_camera_world(self) -> NDArray[np.float64]:  # noqa: N802  # a transform is named by its ends
+        """(4, 4) pose in the current map."""
+        T = self.T_camera_keyframe
+        if self.scale != self.keyframe.scale:
+            T = T.copy()
+            T[:3, 3] *= self.keyframe.scale / self.scale
+        return orthonormalised(T @ self.keyframe.T_camera_world)
 
 
 class Tracking:
@@ -82,6 +93,7 @@ class Tracking:
         self._refinement = refinement
         self._thumbnails: list[NDArray[np.float32]] = []  # of the first keyframes, made when they are needed
         self._lost_for = 0
+        self._counted = len(landmarks.keyframes)  # when the map was last adjusted
         self._wide_is_due = False
         start = landmarks.keyframes[-1]
         last = LocalisedFrame(
@@ -92,11 +104,24 @@ class Tracking:
 
     def pose(self, view: View) -> NDArray[np.float64]:
         """T_camera_world (4, 4) of a view in the current map."""
-        return orthonormalised(view.T_camera_keyframe @ self.map.keyframes[view.keyframe].T_camera_world)
+        return view.T_camera_world
 
     def track(self, frame: Frame) -> View | None:
         """Localise the next frame, which may become a keyframe. None if that fails."""
-        return self._recover(frame) if self._last is None else self._follow(self._last, frame)
+        if self._last is not None:
+            return self._follow(self._last, frame)
+        self._lost_for += 1
+        return self.recover(frame) if self.is_sought else None
+
+    @property
+    def lost_for(self) -> int:
+        """Number of frames since the track was lost; 0 while it is not."""
+        return 0 if self._last is not None else self._lost_for + 1
+
+    @property
+    def is_sought(self) -> bool:
+        """Whether a frame that cannot be tracked is compared with the keyframes, which is not done every time."""
+        return self._lost_for <= EAGER or self._lost_for % LAZY == 0
 
     def localised(self, frame: Frame, T_guess: NDArray[np.float64]) -> LocalisedFrame | None:
         """Localise a frame by its features, without the outliers; None if too few landmarks agree.
@@ -115,14 +140,16 @@ class Tracking:
         """The view of keyframe k."""
         keyframe = self.map.keyframes[k]
         known = self.map.known[keyframe.ids]
-        return View(keyframe.number, k, np.eye(4), keyframe.ids[known], keyframe.pixels[known])
+        ids, pixels = keyframe.ids[known], keyframe.pixels[known]
+        return View(keyframe.number, keyframe, np.eye(4), ids, pixels, keyframe.scale)
 
     def view(self, frame: LocalisedFrame) -> View:
         """The view of a frame relative to the last keyframe before it, or to the first keyframe."""
         k = max(0, bisect_right(self.map.keyframes, frame.number, key=lambda keyframe: keyframe.number) - 1)
-        T = frame.T_camera_world @ inverse_se3(self.map.keyframes[k].T_camera_world)
+        keyframe = self.map.keyframes[k]
+        T = frame.T_camera_world @ inverse_se3(keyframe.T_camera_world)
         known = self.map.known[frame.ids]
-        return View(frame.number, k, T, frame.ids[known], frame.pixels[known])
+        return View(frame.number, keyframe, T, frame.ids[known], frame.pixels[known], keyframe.scale)
 
     # ------------------------------------------------------------------------------------------------- following
 
@@ -201,7 +228,8 @@ class Tracking:
 
     def _adjust(self) -> None:
         count = len(self.map.keyframes)
-        if self._refinement is not None and count in self._refinement.at:
+        before, self._counted = self._counted, count
+        if self._refinement is not None and any(before < at <= count for at in self._refinement.at):
             self._refine_camera_in_use() if self._refinement.settles else self.refine_camera()
             return
         # The wide adjustment comes with the next frame that is no keyframe, because a keyframe costs enough without it;
@@ -241,19 +269,19 @@ class Tracking:
         before = self.map.state()
         self.refine_camera()
         if not is_plausible(self.map.lens):
-            self.map.restore(*before)
+            self.map.restore(before)
         if len(self.map.keyframes) >= self._refinement.at[-1]:
             self._refinement = None
 
     def relocalise(self, view: View) -> None:
         """Refine the pose of an earlier view, after the map and its camera have changed."""
-        keyframe = self.map.keyframes[view.keyframe]
+        keyframe = view.keyframe
         known = self.map.known[view.ids]
         if view.number == keyframe.number or known.sum() < FEWEST:
             return
         rays = self.map.lens.rays(view.pixels[known])
         T = refine_pose(self.pose(view), self.map.xyz[view.ids[known]], rays, SIGMA / self.map.lens.focal)
-        view.T_camera_keyframe = T @ inverse_se3(keyframe.T_camera_world)
+        view.T_camera_keyframe, view.scale = T @ inverse_se3(keyframe.T_camera_world), keyframe.scale
 
     def _companions(self, free: list[int]) -> list[int]:
         """Other keyframes that share the most landmarks with `free`, at most HELD of them."""
@@ -264,6 +292,47 @@ class Tracking:
         closest = sorted(others, key=lambda k: (-shared[k], -k))[:HELD]
         return sorted(k for k in closest if shared[k] >= 15)
 
+    # ------------------------------------------------------------------------------------------------- joining
+
+    def absorb(self, other: Tracking, S_self_other: NDArray[np.float64], follows: bool) -> int:
+        """Take over the map of another tracking.
+
+        Args:
+            other: The other tracking, which must not be used afterwards.
+            S_self_other: (4, 4) similarity from its world to this one.
+            follows: Whether to go on with the other's last frame.
+
+        Returns:
+            What the ids of the other map have grown by.
+        """
+        T = None if other._last is None else moved_pose(S_self_other, other._last.T_camera_world)
+        offset = self.map.absorb(other.map, S_self_other)
+        self._thumbnails = []
+        self.recovered += other.recovered
+        if follows:
+            self._lost_for, self._last, self.motion = other._lost_for, other._last, other.motion.copy()
+            self.motion[:3, 3] *= float(scale_of(S_self_other))
+            if self._last is not None:
+                assert T is not None
+                newest = self.map.keyframes[-1]
+                # A keyframe and its frame share their pose, so that the frame follows when the map is adjusted.
+                self._last.T_camera_world = newest.T_camera_world if newest.number == self._last.number else T
+                self._last.ids = self._last.ids + offset
+        return offset
+
+    def move(self, moves: Sequence[NDArray[np.float64]]) -> None:
+        """Move the map, whose last keyframe is the last frame, by a similarity S_after_before (4, 4) per keyframe."""
+        self.map.move(moves)
+        self.motion = self.motion.copy()
+        self.motion[:3, 3] *= float(scale_of(moves[-1]))
+
+    def settle(self) -> None:
+        """Bundle adjust the whole map, after it has absorbed another one or closed a loop."""
+        every = range(len(self.map.keyframes))
+        for _ in range(2):
+            self.map.adjust(every, steps=10)
+            self.map.discard_outliers(every)
+
     # ------------------------------------------------------------------------------------------------- gaps
 
     def _bridge(self, last: LocalisedFrame, frame: Frame) -> View | None:
@@ -271,37 +340,33 @@ class Tracking:
         if self.map.keyframes[-1].number != last.number:
             self._make_keyframe(last)
         count = len(self.map.keyframes)
-        view = self._placed(frame, describe(frame.grey), range(count - 1, max(-1, count - 4), -1))
+        view = self._placed(frame, range(count - 1, max(-1, count - 4), -1))
         if view is None:
             self._last = None
             self._lost_for = 0
         return view
 
-    def _recover(self, frame: Frame) -> View | None:
+    def recover(self, frame: Frame) -> View | None:
         """Relocalise a frame after the track was lost, against the most similar keyframes and the last one."""
-        self._lost_for += 1
-        if self._lost_for > EAGER and self._lost_for % LAZY:
-            return None
-        features = describe(frame.grey)
-        if len(features.pixels) < FEWEST:
+        if len(frame.described.pixels) < FEWEST:
             return None
         self._thumbnails += [thumbnail(each.grey) for each in self.map.keyframes[len(self._thumbnails) :]]
         alike = alike_keyframes(np.array(self._thumbnails), frame.grey, 3)
-        view = self._placed(frame, features, dict.fromkeys([*alike, len(self.map.keyframes) - 1]))
+        view = self._placed(frame, dict.fromkeys([*alike, len(self.map.keyframes) - 1]))
         if view is not None:
             self.recovered += 1
         return view
 
-    def _placed(self, frame: Frame, features: Features, candidates: Iterable[int]) -> View | None:
+    def _placed(self, frame: Frame, candidates: Iterable[int]) -> View | None:
         """Localise the frame against the first candidate keyframe that fits, and make it a keyframe."""
         for k in candidates:
-            placed = place_by_features(self.map, k, features, self._seed)
+            placed = place_by_features(self.map, self.map.keyframes[k], frame.described, self._seed)
             if placed is None:
                 continue
             T, pairs = placed
             located = LocalisedFrame(frame.number, frame.grey, frame.valid, T_camera_world=T)
             self.search(located)
-            located.append(*inherited(self.map, k, features, pairs, T))
+            located.append(*inherited(self.map, k, frame.described, pairs, T))
             located = self.localised(located, T)
             if located is not None:
                 self.motion = np.eye(4)

@@ -82,6 +82,15 @@ def walk(frames: int) -> list[NDArray[np.float64]]:
     return [look_at(eye, target) for eye, target in zip(eyes, targets, strict=True)]
 
 
+def turning_walk(frames: int) -> list[NDArray[np.float64]]:
+    """T_camera_world of a camera that first looks at the wall at the side and then turns to the one of `box_walk`."""
+    t = np.linspace(0, 1, frames)
+    angle = np.radians(10) + np.radians(85) * np.clip(1.3 * t - 0.3, 0, 1)
+    eyes = np.stack([-0.8 - 0.3 * t, -0.2 - 0.9 * t, np.full(frames, 1.2)], axis=1)
+    aims = eyes + np.stack([np.cos(angle), np.sin(angle), np.full(frames, -0.05)], axis=1)
+    return [look_at(eye, aim) for eye, aim in zip(eyes, aims, strict=True)]
+
+
 @dataclass(frozen=True)
 class Walk:
     poses: list[NDArray[np.float64]]

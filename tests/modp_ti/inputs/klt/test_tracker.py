@@ -17,6 +17,7 @@ from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.klt.calibration import estimated_intrinsics
 from modp_ti.inputs.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.outputs.evaluation import absolute_trajectory_error
+from tests.modp_ti.inputs.klt.conftest import Walk, turning_walk
 
 pytestmark = pytest.mark.slow
 
@@ -194,3 +195,28 @@ def test_frames_of_a_guessed_camera_are_delivered_at_once_and_corrected_when_it_
         p = one.points.xyz @ one.T_camera_world[:3, :3].T + one.T_camera_world[:3, 3]
         error = np.linalg.norm(one.camera.project(p) - one.points.pixels, axis=1)
         assert np.median(error) < 0.4
+
+
+def test_frames_of_a_second_map_come_with_their_own_images_when_it_is_joined(box_room, box_walk, tmp_path):
+    there = [box_room.image(T) for T in turning_walk(60)]
+    black = np.zeros((240, 320, 3), np.uint8)
+    images = [*box_walk.images[:30], *[black] * 12, *there]
+    folder = Walk([], images).written(tmp_path / "images")
+    tracker = known_camera(folder, box_room)
+    frames = [event for event in tracker.events() if isinstance(event, TrackedFrame)]
+    assert [int(frame.name[:4]) for frame in frames] == [*range(30), *range(42, 102)]
+    assert tracker.frame_count == 90
+    for frame in frames[::10]:
+        np.testing.assert_allclose(frame.image, images[int(frame.name[:4])] / 255, atol=1e-3)
+    truth = [*box_walk.poses[:30], *turning_walk(60)]
+    assert absolute_trajectory_error([frame.T_camera_world for frame in tracker], truth) < 0.02
+    assert any("1 maps begun anew were joined" in note for note in tracker.notes)
+
+
+def test_a_map_that_is_not_joined_is_named_in_a_note(box_room, box_walk, tmp_path):
+    black = np.zeros((240, 320, 3), np.uint8)
+    images = [*box_walk.images[:20], *[black] * 12, *(image[::-1] for image in box_walk.images[:15])]
+    tracker = known_camera(Walk([], images).written(tmp_path / "images"), box_room)
+    assert [frame.name for frame in tracker] == [f"{i:04d}.png" for i in range(20)]
+    note = next(note for note in tracker.notes if "other maps" in note)
+    assert "15 of these images are in 1 other maps" in note and "0032.png to 0046.png" in note

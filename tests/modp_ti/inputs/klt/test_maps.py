@@ -1,0 +1,115 @@
+"""Maps that are begun anew after the track was lost, and joined with each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import exp_se3, inverse_se3
+from fields.geometry.similarity import moved_points, moved_pose
+from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
+from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.klt.odometry import Odometry
+from modp_ti.inputs.klt.tracking import View
+from modp_ti.inputs.multiview.reprojection import ray_errors
+from modp_ti.outputs.evaluation import umeyama
+from tests.modp_ti.inputs.klt.conftest import turning_walk
+
+BLACK = np.zeros((240, 320), np.uint8)
+
+
+def processed(box_room, greys: list[NDArray[np.uint8]]) -> tuple[Odometry, dict[int, View], list[list[int]]]:
+    """The odometry, all views, and the numbers of the views that each frame brought."""
+    odometry, views, brought = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=5), {}, []
+    for number, grey in enumerate(greys):
+        found = odometry.process(number, grey)
+        brought.append([view.number for view in found])
+        assert not set(brought[-1]) & set(views)
+        views |= {view.number: view for view in found}
+    brought.append([view.number for view in odometry.finish()])
+    return odometry, views, brought
+
+
+def errors(odometry: Odometry, views: dict[int, View], truth: dict[int, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Distances [m] of camera centres from the true ones after the best similarity."""
+    assert odometry.tracking is not None
+    estimate = np.array([inverse_se3(odometry.tracking.pose(views[i]))[:3, 3] for i in truth])
+    target = np.array([inverse_se3(T)[:3, 3] for T in truth.values()])
+    s, R, t = umeyama(estimate, target)
+    return np.linalg.norm(s * estimate @ R.T + t - target, axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turned_first", [False, True])
+def test_a_map_begun_after_a_cut_is_joined_when_it_shows_the_first_ones_place(box_room, box_walk, turned_first):
+    there, walls = turning_walk(60), box_walk.poses[:30]
+    there_greys, wall_greys = [box_room.grey(T) for T in there], box_walk.grey[:30]
+    if turned_first:  # the second recording begins where the first one ended, and ends where it never was
+        there, there_greys = there[:30], there_greys[:30]
+        poses = [*there, *[None] * 8, *walls, *turning_walk(60)[:29:-1]]
+        greys = [*there_greys, *[BLACK] * 8, *wall_greys, *[box_room.grey(T) for T in turning_walk(60)[:29:-1]]]
+    else:
+        poses, greys = [*walls, *[None] * 8, *there], [*wall_greys, *[BLACK] * 8, *there_greys]
+    odometry, views, brought = processed(box_room, greys)
+    truth = {i: T for i, T in enumerate(poses) if T is not None}
+    assert odometry.joined == 1 and not odometry.waiting
+    assert sorted(views) == sorted(truth)
+    assert errors(odometry, views, truth).max() < 0.03
+    late = max(len(each) for each in brought[10:])
+    assert late >= 10, "the frames of the second map come when it is joined"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("between", [0, 8])
+def test_frames_of_another_place_stay_out_of_the_map(box_room, box_walk, between):
+    other = replace(
+        box_room, textures={wall: sheet[::-1].copy() for wall, sheet in box_room.textures.items()}
+    )  # mirrored
+    greys = [*box_walk.grey[:30], *[BLACK] * between, *(other.grey(T) for T in box_walk.poses[:25])]
+    odometry, views, _ = processed(box_room, greys)
+    assert sorted(views) == list(range(30))
+    assert odometry.joined == 0
+    assert odometry.waiting == [list(range(30 + between, len(greys)))]
+
+
+@pytest.mark.slow
+def test_the_largest_map_is_the_runs_if_the_first_is_lost_at_its_start(box_room, box_walk):
+    other = [np.ascontiguousarray(grey[::-1]) for grey in box_walk.grey[:9]]
+    odometry, views, _ = processed(box_room, [*other, *[BLACK] * 8, *box_walk.grey[:40]])
+    assert sorted(views) == list(range(17, 57))
+    assert odometry.waiting == [list(range(9))]
+
+
+def test_a_map_keeps_its_observations_when_another_absorbs_it():
+    rng = np.random.default_rng(0)
+    lens = Lens.radial(300.0, 0.0, 320, 240)
+    S = np.diag([2.0, 2.0, 2.0, 1.0]) @ exp_se3([0.3, -0.2, 0.5, 0.2, 0.4, -0.1])
+    maps = []
+    for first in (10, 0):  # the absorbed one has the earlier frames
+        xyz = np.c_[rng.uniform(-1, 1, (40, 2)), rng.uniform(3, 5, 40)]
+        poses = [exp_se3([-0.2 * i, 0, 0.05 * i, 0, 0.03 * i, 0]) for i in range(4)]
+        landmarks = LandmarkMap(lens)
+        ids = landmarks.new_ids(40)
+        for i, T in enumerate(poses):
+            pixels = lens.pixels(xyz @ T[:3, :3].T + T[:3, 3])
+            landmarks.add_keyframe(
+                Keyframe(first + i, T, np.zeros((240, 320), np.uint8), ids[i:], pixels[i:], lens.rays(pixels[i:]))
+            )
+        landmarks.xyz[ids], landmarks.known[ids] = xyz, True
+        maps.append((landmarks, xyz))
+    (own, own_xyz), (other, other_xyz) = maps
+    before = [keyframe.T_camera_world.copy() for keyframe in other.keyframes]
+    offset = own.absorb(other, S)
+    assert [keyframe.number for keyframe in own.keyframes] == [0, 1, 2, 3, 10, 11, 12, 13]
+    np.testing.assert_allclose(own.xyz[:40], own_xyz)
+    np.testing.assert_allclose(own.xyz[offset : offset + 40], moved_points(S, other_xyz))
+    for keyframe, T in zip(own.keyframes, before, strict=False):
+        np.testing.assert_allclose(keyframe.T_camera_world, moved_pose(S, T), atol=1e-12)
+    for k, keyframe in enumerate(own.keyframes):
+        assert ray_errors(keyframe.T_camera_world, own.xyz[keyframe.ids], keyframe.rays).max() < 1e-9
+        assert (own.first[keyframe.ids] <= k).all() and (own.last[keyframe.ids] >= k).all()
+    # The first observation is that of the first keyframe of its own map.
+    assert own.first[0] == 4 and own.first[offset] == 0
