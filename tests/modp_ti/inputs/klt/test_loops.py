@@ -86,7 +86,6 @@ def test_a_walk_that_comes_home_with_drift_is_closed(box_room):
     truth = round_walk(132, 1.15)
     odometry, views = followed(box_room, truth, 108)
     assert odometry.loops >= 1
-    print(odometry.loops, error([view.T_camera_world for view in views], truth))
     assert error([view.T_camera_world for view in views], truth) < 0.02  # 0.3 with the drift
 
 
