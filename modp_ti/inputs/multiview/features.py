@@ -68,16 +68,17 @@ class Matches:
         return len(self.pairs)
 
 
-def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES) -> Features:
+def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES, side: int = MAX_SIDE) -> Features:
     """Detect SIFT features with RootSIFT descriptors.
 
     Args:
-        image: (H, W, 3) uint8 RGB. A longer side above 1000 px is reduced to that.
+        image: (H, W, 3) uint8 RGB.
         most: Number of features, the strongest ones.
+        side: A longer side of the image is reduced to this [px].
     """
     import cv2
 
-    grey, pixel, to_stored = shrunk_grey(image, MAX_SIDE)
+    grey, pixel, to_stored = shrunk_grey(image, side)
     # Without the precise upscale, all keypoints are shifted by a quarter of a pixel to the right and down.
     sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     keypoints, raw = sift.detectAndCompute(grey, None)
