@@ -131,6 +131,11 @@ class KltSettings(TrackerSettings):
     follows_streams: ClassVar[bool] = True
 
     kind: Literal["klt"] = Field(default="klt", description="the built-in tracker, which uses only the images")
+    loops: bool = Field(
+        default=False,
+        description="close loops, drift of scale included, where the camera comes back after a long way. Needs "
+        "`pip install 'modp-ti[loops]'`, and half as much time again",
+    )
 
 
 class SfmSettings(TrackerSettings):

@@ -12,7 +12,7 @@ from fields.geometry.similarity import scale_of
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.map_joining import connect
 from modp_ti.inputs.klt.place_recognition import PlaceIndex
-from modp_ti.inputs.klt.pose_graph import Link, closed_loop, solver_is_there
+from modp_ti.inputs.klt.pose_graph import Link, closed_loop
 from modp_ti.inputs.klt.recognition import Recognition, agreeing, recognised
 from modp_ti.inputs.klt.tracking import Tracking
 
@@ -52,7 +52,6 @@ class LoopClosing:
         self._found: list[tuple[int, Recognition]] = []  # with the number of keyframes by then
         self._pause_until = 0
         self._of: Tracking | None = None  # the tracking of the recognitions
-        self._can_solve = solver_is_there()
 
     def attempt(self, tracking: Tracking) -> bool:
         """Compare the last keyframe with older ones that it shares no landmarks with, and close a loop.
@@ -65,7 +64,7 @@ class LoopClosing:
         if tracking is not self._of:
             self._of, self._pause_until = tracking, 0
             self._found.clear()
-        if not self._can_solve or count < max(self._pause_until, YOUNGEST + 2):
+        if count < max(self._pause_until, YOUNGEST + 2):
             return False
         by = landmarks.keyframes[-1]
         seen = np.zeros(len(landmarks.known), dtype=bool)

@@ -49,6 +49,7 @@ class Odometry:
         refinement: When the camera is refined together with the map, for images whose camera is unknown; None for a
             known one.
         begins_anew_after: Number of frames without a pose after which another map may begin; None for never.
+        loops: Whether loops are closed.
 
     Attributes:
         joined: Number of maps that were joined with another one.
@@ -60,6 +61,7 @@ class Odometry:
         seed: int = 0,
         refinement: CameraRefinement | None = None,
         begins_anew_after: int | None = None,
+        loops: bool = False,
     ) -> None:
         self.joined = 0
         self._initialisation: Initialisation | None = Initialisation(lenses, seed)
@@ -68,7 +70,7 @@ class Odometry:
         self._seed = seed
         index = PlaceIndex(seed)
         self._joining = MapJoining(index, seed)
-        self._loops = LoopClosing(index, seed) if begins_anew_after is not None else None
+        self._loops = LoopClosing(index, seed) if loops else None
         self._maps: list[_Submap] = []
         self._active: _Submap | None = None
         self._run: _Submap | None = None

@@ -12,6 +12,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL, estimated_intrinsics, intrinsics_of
 from modp_ti.inputs.klt.camera_refinement import WHILE_TRACKING
@@ -37,7 +38,11 @@ ADVICE = "source.intrinsics or a calibrated camera do better"
 
 
 def open_klt(
-    source: SourceSettings, seed: int = 0, progress: Progress | None = None, images: ImageSource | None = None
+    source: SourceSettings,
+    settings: KltSettings | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    images: ImageSource | None = None,
 ) -> KltTracker:
     """Open the images of a source and return a tracker for them.
 
@@ -47,13 +52,20 @@ def open_klt(
 
     Args:
         source: Settings of the images.
+        settings: Settings of the tracker, None for the defaults.
         seed: Seed of RANSAC.
         progress: Called during the estimation of the camera.
         images: The images, None to open those of the settings.
 
     Raises:
-        InputError: If the images are missing, unreadable or of several sizes, or do not fit the intrinsics.
+        InputError: If the images are missing, unreadable or of several sizes, or do not fit the intrinsics; or if loops
+            are to be closed without `gtsam`.
     """
+    loops = settings is not None and settings.loops
+    if loops and not solver_is_there():
+        raise InputError(
+            "tracker.loops needs gtsam (Linux and macOS, Python 3.11 or newer): pip install 'modp-ti[loops]'"
+        )
     images = open_source(source) if images is None else images
     reader = FrameReader(images, source)
     first = next(images.arriving(source.start, source.stop, source.step), None)
@@ -69,7 +81,7 @@ def open_klt(
     reader.require_fitting([(name, (intrinsics or blank).undistorter(1.0)) for name in there])
     if intrinsics is None and images.arrivals is not None:
         intrinsics, note = _guessed(reader, blank)
-        return KltTracker(reader, intrinsics, seed, [note], is_guess=True)
+        return KltTracker(reader, intrinsics, seed, [note], is_guess=True, loops=loops)
     if intrinsics is None:
         intrinsics, note = _estimated(reader, blank, seed, progress)
         notes.append(note)
@@ -78,7 +90,7 @@ def open_klt(
             f"{images.path / first} is {width}x{height}, the camera {intrinsics.camera.width}x"
             f"{intrinsics.camera.height}: give the intrinsics of the stored images"
         )
-    return KltTracker(reader, intrinsics, seed, notes)
+    return KltTracker(reader, intrinsics, seed, notes, loops=loops)
 
 
 def _there(reader: FrameReader) -> Sequence[str]:
@@ -167,6 +179,7 @@ class KltTracker(Tracker):
         seed: Seed of RANSAC.
         notes: Notes to begin with.
         is_guess: The camera is a guess without lens distortion.
+        loops: Whether loops are closed.
 
     Attributes:
         intrinsics: The camera; if it is estimated, the latest estimate.
@@ -181,6 +194,7 @@ class KltTracker(Tracker):
         seed: int = 0,
         notes: Sequence[str] = (),
         is_guess: bool = False,
+        loops: bool = False,
     ) -> None:
         self._notes = list(notes)
         self.intrinsics = intrinsics
@@ -193,7 +207,7 @@ class KltTracker(Tracker):
             self._lens = Lens.radial(followed.fx, 0.0, followed.width, followed.height)
         else:
             self._lens = Lens.pinhole(followed)
-        self._odometry = Odometry([self._lens], seed, WHILE_TRACKING if is_guess else None, BEGINS_ANEW_AFTER)
+        self._odometry = Odometry([self._lens], seed, WHILE_TRACKING if is_guess else None, BEGINS_ANEW_AFTER, loops)
         self._estimated_from = 0  # images, 0 for a camera that has not been estimated
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable = Unreadable()
@@ -326,10 +340,6 @@ class KltTracker(Tracker):
             raise InputError(
                 f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
                 "and a camera that moves sideways and does not only turn"
-            )
-        if not solver_is_there():
-            self._notes.append(
-                "klt closed no loops, for gtsam is not installed: `pip install gtsam` where it has a wheel"
             )
         if self._odometry.loops:
             self._notes.append(f"klt closed {self._odometry.loops} loops")

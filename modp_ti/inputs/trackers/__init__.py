@@ -45,10 +45,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
             from modp_ti.inputs.tracking_process import TrackingProcess
 
             return TrackingProcess(config, progress)
-        case kinds.KltSettings():
+        case kinds.KltSettings() as tracker:
             from modp_ti.inputs.klt import open_klt
 
-            return open_klt(source, config.seed, progress)
+            return open_klt(source, tracker, config.seed, progress)
         case kinds.SfmSettings() as tracker:
             from modp_ti.inputs.trackers.sfm import open_sfm
 

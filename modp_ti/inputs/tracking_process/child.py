@@ -15,6 +15,7 @@ import cv2
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt.tracker import KltTracker, open_klt
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
@@ -77,7 +78,9 @@ class _Child:
         sender = None
         try:
             self._images = open_source(source, self._job.folder)
-            self._tracker = tracker = open_klt(source, self._job.config.seed, self._prepare, self._images)
+            settings = self._job.config.tracker
+            assert isinstance(settings, KltSettings)  # the one tracker that follows streams
+            self._tracker = tracker = open_klt(source, settings, self._job.config.seed, self._prepare, self._images)
             self._publish()
             self._connection.send(Opened(tracker.notes, tracker.scale, tracker.intrinsics))
             sender = threading.Thread(target=self._send, args=(tracker.undistorter,), name="sender", daemon=True)

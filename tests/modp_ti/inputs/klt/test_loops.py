@@ -61,7 +61,7 @@ def test_a_pose_graph_takes_the_drift_of_direction_and_scale_out_of_a_loop():
 
 def followed(box_room, truth: list[NDArray[np.float64]], bend_at: int | None) -> tuple[Odometry, list]:
     """Follow a walk; `bend_at` is the frame after which the map is given drift."""
-    odometry, views = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=10), {}
+    odometry, views = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=10, loops=True), {}
     for number, T in enumerate(truth):
         views |= {view.number: view for view in odometry.process(number, box_room.grey(T))}
         if number == bend_at:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.klt.calibration import estimated_intrinsics
@@ -220,3 +222,11 @@ def test_a_map_that_is_not_joined_is_named_in_a_note(box_room, box_walk, tmp_pat
     assert [frame.name for frame in tracker] == [f"{i:04d}.png" for i in range(20)]
     note = next(note for note in tracker.notes if "other maps" in note)
     assert "15 of these images are in 1 other maps" in note and "0032.png to 0046.png" in note
+
+
+def test_loops_without_gtsam_are_refused_in_one_line(box_walk, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    source = SourceSettings(path=box_walk.written(tmp_path / "images"))
+    with pytest.raises(InputError) as error:
+        open_klt(source, KltSettings(loops=True))
+    assert str(error.value).endswith("pip install 'modp-ti[loops]'") and "\n" not in str(error.value)

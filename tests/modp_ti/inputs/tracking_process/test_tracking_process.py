@@ -74,7 +74,7 @@ def wait_until(condition) -> None:
 def test_it_delivers_what_the_tracker_delivers_in_this_process(scene, started, tmp_path, box_walk, masked):
     # Dark parts of the images are masked.
     config = scene(masks=box_walk.written(tmp_path / "masks")) if masked else scene()
-    here, there = open_klt(config.source, config.seed), started(config)
+    here, there = open_klt(config.source, seed=config.seed), started(config)
     expected, got = list(here.events()), list(there.events())
     assert masked or sum(isinstance(event, PoseCorrection) for event in expected) > 0
     for one, other in zip(got, expected, strict=True):
