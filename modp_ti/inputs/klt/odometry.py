@@ -50,6 +50,7 @@ class Odometry:
             known one.
         begins_anew_after: Number of frames without a pose after which another map may begin; None for never.
         loops: Whether loops are closed.
+        waits: Whether the frames of the first map wait until it has enough keyframes or frames to be the run's.
 
     Attributes:
         joined: Number of maps that were joined with another one.
@@ -62,11 +63,13 @@ class Odometry:
         refinement: CameraRefinement | None = None,
         begins_anew_after: int | None = None,
         loops: bool = False,
+        waits: bool = True,
     ) -> None:
         self.joined = 0
         self._initialisation: Initialisation | None = Initialisation(lenses, seed)
         self._refinement = refinement
         self._begins_anew_after = begins_anew_after
+        self._waits = waits and begins_anew_after is not None
         self._seed = seed
         index = PlaceIndex(seed)
         self._joining = MapJoining(index, seed)
@@ -171,9 +174,11 @@ class Odometry:
         return []
 
     def _is_established(self, submap: _Submap) -> bool:
-        if self._begins_anew_after is None:
-            return True
-        return len(submap.tracking.map.keyframes) >= ESTABLISHED or len(submap.waiting) >= ESTABLISHED_FRAMES
+        return (
+            not self._waits
+            or len(submap.tracking.map.keyframes) >= ESTABLISHED
+            or len(submap.waiting) >= ESTABLISHED_FRAMES
+        )
 
     def _released(self) -> list[View]:
         assert self._run is not None

@@ -207,7 +207,14 @@ class KltTracker(Tracker):
             self._lens = Lens.radial(followed.fx, 0.0, followed.width, followed.height)
         else:
             self._lens = Lens.pinhole(followed)
-        self._odometry = Odometry([self._lens], seed, WHILE_TRACKING if is_guess else None, BEGINS_ANEW_AFTER, loops)
+        self._odometry = Odometry(
+            [self._lens],
+            seed,
+            WHILE_TRACKING if is_guess else None,
+            BEGINS_ANEW_AFTER,
+            loops,
+            waits=reader.images.arrivals is None,  # a live map begins with its first frames
+        )
         self._estimated_from = 0  # images, 0 for a camera that has not been estimated
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable = Unreadable()

@@ -113,3 +113,15 @@ def test_a_map_keeps_its_observations_when_another_absorbs_it():
         assert (own.first[keyframe.ids] <= k).all() and (own.last[keyframe.ids] >= k).all()
     # The first observation is that of the first keyframe of its own map.
     assert own.first[0] == 4 and own.first[offset] == 0
+
+
+@pytest.mark.slow
+def test_only_the_first_frames_of_a_recording_wait_and_not_those_of_a_camera(box_room, box_walk):
+    """Both know their first map at the same frame. A recording has yet to see that it is no bad start."""
+    first = {}
+    for waits in (False, True):
+        odometry = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=5, waits=waits)
+        brought = [[view.number for view in odometry.process(n, grey)] for n, grey in enumerate(box_walk.grey[:40])]
+        first[waits] = next(n for n, numbers in enumerate(brought) if numbers)
+        assert [number for numbers in brought for number in numbers] == list(range(40))
+    assert first[False] + 5 <= first[True] < 40
