@@ -168,7 +168,7 @@ def test_a_tracker_that_finds_the_poses_itself_finds_them_again(tmp_path: Path, 
     from tests.room import RoomRecording, pinhole, walk
 
     camera = pinhole(160, 120)
-    RoomRecording(room, camera, walk(16)).write(tmp_path)
+    RoomRecording(room, camera, walk(40)).write(tmp_path)
     scene = f"""
 source:  {{path: images, holdout: 8, fps: 10, intrinsics: {{fx: {camera.fx}, fy: {camera.fy}, cx: 80, cy: 60}}}}
 tracker: {{kind: klt}}

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 from fields.geometry.se3 import exp_se3, inverse_se3
-from modp_ti.commands.app import app
 from modp_ti.config.settings import IntrinsicsSettings
-from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.locating.locator import Location, Locator
 from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, photograph, write_run
 from tests.room import Room, walk
@@ -97,31 +92,3 @@ def test_other_places_are_not_located(locator: Locator) -> None:
     for picture in pictures:
         location = locator.locate(picture)
         assert location.T_camera_world is None and location.reason
-
-
-def test_the_command_says_which_pictures_it_has_located(out: Path, room: Room, tmp_path: Path) -> None:
-    T = new_poses()[0]
-    cv2.imwrite(str(tmp_path / "here.png"), photograph(room, CAMERA, T)[..., ::-1])
-    cv2.imwrite(str(tmp_path / "elsewhere.png"), photograph(another_room(), CAMERA, T)[..., ::-1])
-    names = [str(tmp_path / name) for name in ("elsewhere.png", "here.png")]
-
-    alone = CliRunner().invoke(app, ["locate", str(out), names[1], "--device", "cpu"])
-    assert alone.exit_code == 0, alone.output
-    (tmp_path / "found.txt").write_text(alone.stdout)
-    times, poses = read_trajectory(tmp_path / "found.txt")
-    assert times.tolist() == [0.0]
-
-    both = CliRunner().invoke(app, ["locate", str(out), *names, "--device", "cpu", "--json"])
-    assert both.exit_code == 1, both.output
-    missed, found = json.loads(both.stdout)["pictures"]
-    assert not missed["located"] and missed["reason"] and "T_camera_world" not in missed
-    assert found["located"] and found["inliers"] >= 20 and np.shape(found["covariance"]) == (6, 6)
-    np.testing.assert_allclose(poses[0], found["T_camera_world"], atol=1e-9)
-
-
-def test_a_picture_that_cannot_be_read_is_wrong_input(out: Path, tmp_path: Path) -> None:
-    (tmp_path / "text.png").write_text("no picture")
-    result = CliRunner().invoke(app, ["locate", str(out), str(tmp_path / "text.png"), "--device", "cpu"])
-    assert result.exit_code == 2 and "text.png" in result.stderr
-    result = CliRunner().invoke(app, ["locate", str(out), str(tmp_path / "text.png"), "--camera", "fx=5,focus=3"])
-    assert result.exit_code == 2 and "focus" in result.stderr
