@@ -16,7 +16,7 @@ __all__ = ["EXAMPLES", "locate"]
 
 EXAMPLES = examples(
     "modp-ti locate out/room new.jpg",
-    "modp-ti locate out/room new/*.jpg > found.txt   (then: modp-ti render out/room --path found.txt)",
+    "modp-ti locate out/room new/*.jpg > found.txt   (for `render --path`)",
     "modp-ti locate out/room phone.jpg --camera fx=3012,k1=0.03",
     "modp-ti locate out/room new.jpg --json",
 )

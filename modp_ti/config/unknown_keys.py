@@ -64,7 +64,7 @@ class _Refusal:
             if key in elsewhere and key not in fields:
                 *before, last = elsewhere[key]
                 kinds = f"{', '.join(before)} and {last}" if before else last
-                own = ", ".join(f"`{prefix}{name}`" for name in fields if name != told_by) or "no other key"
+                own = ", ".join(f"`{prefix}{name}`" for name in fields if name != told_by)
                 hint = f": it is for {prefix}{told_by}: {kinds}, not {kind}, which has {own}; take it out"
                 raise InputError(f"{self._written(place)}: unknown key `{place}`{hint}")
             if key not in fields:

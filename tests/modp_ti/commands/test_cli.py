@@ -280,7 +280,7 @@ def test_wrong_options_end_with_two(arguments):
     assert "Usage:" in result.stderr
 
 
-COMMANDS = ["run", "cameras", "check", "render", "export", "view", "warmup"]
+COMMANDS = ["run", "cameras", "check", "render", "export", "locate", "view", "warmup"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -373,9 +373,12 @@ def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):
     assert len(set(offered)) == len(offered) and "tracker.kind=colmap" in offered
     defaults = [value for value in offered if not value.endswith("=")]
     assert len(defaults) > 100
-    usable = [value for value in defaults if not value.startswith(("source.vrs", "tracker.kind"))]
-    loaded = load_scene(scene, usable)
+    of_sfm = [f"tracker.{name}" for name in ("order", "mapper", "overlap", "features")]
+    others = ("source.vrs", "tracker.kind", "tracker.loops", *of_sfm)  # for other kinds than the scene's
+    loaded = load_scene(scene, [value for value in defaults if not value.startswith(others)])
     assert loaded == load_scene(scene, [])
+    klt = load_scene(scene, ["tracker={kind: klt}"])
+    assert load_scene(scene, ["tracker={kind: klt}", *(v for v in defaults if v.startswith("tracker.loops"))]) == klt
 
 
 def test_the_completion_of_bash_can_be_had():

@@ -212,7 +212,7 @@ def test_missing_key_is_named_with_its_meaning(scene, text, parts):
             "{kind: colmap, points: x}",
             ["unknown key `tracker.points`", "tum, orbslam3, replica and sevenscenes, not colmap", "`tracker.path`"],
         ),
-        ("{kind: klt, path: x}", ["unknown key `tracker.path`", "not klt, which has no other key; take it out"]),
+        ("{kind: klt, path: x}", ["unknown key `tracker.path`", "not klt, which has `tracker.loops`; take it out"]),
         ("{kind: tum, camera: x}", ["`tracker.camera`: it is for tracker.kind: aria, not tum"]),
         ("{kind: replica, time_offset: 1}", ["`tracker.time_offset`"]),
         ("{kind: colmap, adress: x}", ["did you mean `tracker.address`, which is for tracker.kind: socket?"]),
