@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.landmark_map import Keyframe
 from modp_ti.inputs.klt.relocalisation import described_keyframe
+from modp_ti.inputs.multiview.vlad import nearest_words, vlad
 
 __all__ = ["PlaceIndex"]
 
@@ -65,30 +66,8 @@ def vocabulary(descriptors: NDArray[np.uint8], count: int, seed: int) -> NDArray
         return np.zeros((0, 128), np.float32)
     data = descriptors.astype(np.float32)
     start = data[np.random.default_rng(seed).choice(len(data), count, replace=False)]
-    labels = _nearest(data, start).astype(np.int32)
+    labels = nearest_words(data, start).astype(np.int32)
     # With initial labels and one attempt, the result does not depend on OpenCV's own random numbers.
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
     _, _, centres = cv2.kmeans(data, count, labels, criteria, 1, cv2.KMEANS_USE_INITIAL_LABELS)
     return np.rint(np.asarray(centres, np.float32))
-
-
-def vlad(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Descriptor (count * 128,) of an image from its features (N, 128); zero without features.
-
-    The residuals of each word have length 1 in it, so that repeated structure does not dominate.
-    """
-    if len(descriptors) == 0 or len(words) == 0:
-        return np.zeros(words.size, np.float32)
-    data = descriptors.astype(np.float32)
-    nearest = _nearest(data, words)
-    member = np.zeros((len(words), len(data)), np.float32)
-    member[nearest, np.arange(len(data))] = 1.0
-    residual = member @ data - member.sum(axis=1, keepdims=True) * words  # of integers, and so exact
-    residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-12)
-    vector = residual.reshape(-1)
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
-
-
-def _nearest(data: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The nearest word of each descriptor."""
-    return ((words * words).sum(axis=1) - 2.0 * (data @ words.T)).argmin(axis=1)

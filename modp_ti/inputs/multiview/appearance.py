@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.multiview.features import Features
+from modp_ti.inputs.multiview.vlad import vlad
 
 __all__ = ["Appearance"]
 
@@ -34,27 +35,16 @@ class Appearance:
         described = np.concatenate([image.descriptors for image in features]).astype(np.float32)
         chosen = np.random.default_rng(seed).permutation(len(described))[:TRAINED_WITH]
         self._words = _clustered(described[np.sort(chosen)], seed)
-        self._vectors = np.stack([self._vector(image) for image in features])
+        self._vectors = np.stack([vlad(image.descriptors, self._words) for image in features])
 
     def alike(self, features: Features, count: int) -> list[int]:
         """Return the indices of the `count` images most similar to a picture with these features, best first."""
-        likeness = self._vectors @ self._vector(features)
+        likeness = self._vectors @ vlad(features.descriptors, self._words)
         return [int(k) for k in np.argsort(-likeness, kind="stable")[:count]]
 
     def likeness(self) -> NDArray[np.float32]:
         """Return the likeness (N, N) of all pairs of images, from -1 to 1."""
         return self._vectors @ self._vectors.T
-
-    def _vector(self, features: Features) -> NDArray[np.float32]:
-        """VLAD vector (K * 128,) of unit length; zero without features."""
-        vector = np.zeros_like(self._words)
-        described = features.descriptors.astype(np.float32)
-        if len(described):
-            word = _nearest(described, self._words)
-            np.add.at(vector, word, described - self._words[word])
-        # Normalised by word first, so that no word dominates.
-        vector /= np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-6)
-        return (vector / max(float(np.linalg.norm(vector)), 1e-6)).reshape(-1)
 
 
 def _clustered(described: NDArray[np.float32], seed: int) -> NDArray[np.float32]:
@@ -67,8 +57,3 @@ def _clustered(described: NDArray[np.float32], seed: int) -> NDArray[np.float32]
     _, _, centres = cv2.kmeans(described, count, np.zeros((0, 1), np.int32), criteria, 1, cv2.KMEANS_PP_CENTERS)
     # Rounded, since the threads of k-means may sum in another order.
     return np.round(np.asarray(centres, np.float32))
-
-
-def _nearest(described: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Index (N,) of the word nearest to each descriptor."""
-    return ((words**2).sum(axis=1) - 2.0 * described @ words.T).argmin(axis=1)
