@@ -10,6 +10,8 @@ import numpy as np
 
 __all__ = ["Thinning"]
 
+# Lag [s] below which a short stretch of expensive frames thins nothing: strides follow the mean of COSTS frames.
+CALM_LAG = 0.4
 # Time [s] within which the tracker should have worked off the frames that wait for it.
 HORIZON = 4.0
 # Largest time between two tracked frames [s], as long as the tracker can keep that up and the lag is below LONGEST_LAG.
@@ -77,12 +79,13 @@ class Thinning:
         Args:
             lag: Age of the oldest waiting frame [s]; 0 if none waits.
         """
-        load = ROOM * self.load()
+        needed = ROOM * self.load(COSTS)
+        load = needed if lag < CALM_LAG else ROOM * self.load()
         if load == 0.0:
             return 1
         # The share of the tracker's time that is left for new frames while the waiting ones are worked off.
         share = max(1.0 - lag / HORIZON, 1.0 / HORIZON)
-        needed, largest = ROOM * self.load(COSTS), max(1.0, floor(LARGEST_GAP / self._interval))
+        largest = max(1.0, floor(LARGEST_GAP / self._interval))
         most = max(needed, largest) * min(max(lag / (LONG_LAG if needed > largest else LONGEST_LAG), 1.0), 2.0)
         self._rest += max(1.0, min(load / share, most))
         stride = floor(self._rest)

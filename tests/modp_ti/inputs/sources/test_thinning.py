@@ -150,6 +150,13 @@ def test_a_hiccup_of_a_second_is_absorbed():
     assert max(ages[130:]) < 0.001
 
 
+def test_a_second_of_expensive_frames_thins_nothing_if_the_tracker_keeps_up_on_average():
+    # klt on the demo at 25 frames a second: a second in which it takes longer than a frame lasts, the rest is cheap.
+    numbers, ages, _ = played(at(25, 8), lambda i: 0.046 if 105 <= i < 130 else 0.028)
+    assert numbers == list(range(200))
+    assert 0.1 < max(ages) < 0.4
+
+
 def test_the_backlog_of_a_long_pause_is_worked_off_with_fewer_frames_evenly():
     numbers, ages, _ = played(at(10, 60), lambda i: 8.0 if i == 100 else 0.06)
     gaps = np.diff(numbers)
