@@ -197,7 +197,8 @@ class Tracking:
         if self.map.known[share].sum() < KEYFRAME_SHARE * self.map.known[last.ids].sum():
             return True
         shift = float(np.median(np.linalg.norm(last.pixels[a] - frame.pixels[b], axis=1)))
-        return shift > (1.0 if self._refinement is None else 0.6) * KEYFRAME_SHIFT * max(frame.grey.shape)
+        share_of_shift = 1.0 if self._refinement is None else self._refinement.share_of_shift
+        return shift > share_of_shift * KEYFRAME_SHIFT * max(frame.grey.shape)
 
     def _make_keyframe(self, frame: LocalisedFrame) -> View:
         """Make the last frame a keyframe: realign its landmarks, search for more, and adjust the map."""
