@@ -35,7 +35,7 @@ NO_PATH = "source.path is missing: set it to the folder of the images"
 
 
 class IntrinsicsSettings(StrictModel):
-    """The camera's intrinsics and lens distortion, in pixels of the images as stored."""
+    """The camera's intrinsics and lens distortion, in pixels of the stored images, turned as EXIF says."""
 
     fx: float | None = Field(
         default=None,
