@@ -144,3 +144,18 @@ def test_the_camera_is_found_again_after_frames_of_nothing_but_blur(box_room, bo
     tracking, views = tracked(box_room, greys)
     assert sorted(views) == [*range(30), *range(36, 60)]
     assert errors(tracking, views, {i: T for i, T in enumerate(box_walk.poses) if i in views}).max() < 0.02
+
+
+def test_something_that_walks_through_the_picture_is_no_part_of_the_map(box_room, box_walk):
+    """As wide as a third of the picture, with texture of its own."""
+    walker = np.ascontiguousarray(box_walk.grey[0][:, 100:205][:, ::-1])
+    greys = []
+    for i, grey in enumerate(box_walk.grey):
+        grey, left = grey.copy(), 8 * i - 150
+        shown = slice(max(0, left), max(0, min(320, left + 105)))
+        if shown.stop > shown.start:
+            grey[:, shown] = walker[:, shown.start - left : shown.stop - left]
+        greys.append(grey)
+    tracking, views = tracked(box_room, greys)
+    assert len(views) == 60
+    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.03
