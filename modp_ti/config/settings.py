@@ -35,7 +35,7 @@ NO_PATH = "source.path is missing: set it to the folder of the images"
 
 
 class IntrinsicsSettings(StrictModel):
-    """The camera's intrinsics and lens distortion, in pixels of the images as stored."""
+    """The camera's intrinsics and lens distortion, in pixels of the stored images, turned as EXIF says."""
 
     fx: float | None = Field(
         default=None,
@@ -361,6 +361,11 @@ class SceneConfig(StrictModel):
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
         return self.mode == "online" and not (self.is_live or self.is_realtime or self.source.realtime)
 
+    def of_map(self, place: int) -> SceneConfig:
+        """Return the settings of a run of its own for the map of this place by size, of tracker `klt`."""
+        tracker = self.tracker.model_copy(update={"maps": place})
+        return self.model_copy(update={"tracker": tracker, "output": self.output / f"map-{place}"})
+
     def without_clock(self) -> SceneConfig:
         """Return these settings for all images of a file or folder, however long their processing takes."""
         mapping = self.mapping.model_copy(update={"pace": "complete"})
@@ -388,6 +393,11 @@ class SceneConfig(StrictModel):
             raise ValueError(
                 f"tracker.kind: {tracker.kind} does not follow the images as they arrive; remove source.realtime, or "
                 "take tracker.kind: klt"
+            )
+        if source.follows_clock and tracker.kind == "klt" and tracker.maps != "first":
+            raise ValueError(
+                f"tracker.maps: {tracker.maps} needs all images before the first is mapped; remove it, or record the "
+                "images first"
             )
         if source.stream is not None and not tracker.follows_streams:
             raise ValueError(

@@ -136,6 +136,21 @@ class KltSettings(TrackerSettings):
         description="close loops, drift of scale included, where the camera comes back after a long way. Needs "
         "`pip install 'modp-ti[loops]'`, and half as much time again",
     )
+    maps: Literal["first", "largest", "all"] | Annotated[int, Field(ge=1)] = Field(
+        default="first",
+        description="which map is mapped, where the track is lost and what follows shows no place of what was before. "
+        "`first`: the first one of 8 keyframes or 60 frames, while the images arrive; `largest`: that with the most "
+        "frames, so that all images are tracked before the first is mapped; `all`: the largest, and then each other of "
+        "8 keyframes or 60 frames in a run of its own, to `map-2`, `map-3`, ... in the output folder; a number: the "
+        "map of this place by size",
+    )
+
+    @property
+    def place(self) -> int | None:
+        """Place by size of the map that is mapped; None for the first one."""
+        if isinstance(self.maps, int):
+            return self.maps
+        return None if self.maps == "first" else 1
 
 
 class SfmSettings(TrackerSettings):

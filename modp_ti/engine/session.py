@@ -51,6 +51,7 @@ def run_scene(
     """Map a scene and write its output folder.
 
     The finished map appears in the folder first, its scores and the report after them. Files of either appear together.
+    If the tracker has made further maps (`tracker.maps: all`), each is then mapped to a folder in the output folder.
 
     Args:
         config: The scene's settings.
@@ -73,7 +74,12 @@ def run_scene(
             print((output / "metrics.json").read_text())
     """
     with ExitStack() as held:
-        return _Session(config, console or Console(quiet=True), held, replayed).run(resumed)
+        session = _Session(config, console or Console(quiet=True), held, replayed)
+        output, further = session.run(resumed), session.tracker.further_maps
+    for place in range(2, 2 + further):
+        session.line.note(f"map {place} of {1 + further}")
+        run_scene(config.of_map(place), console)
+    return output
 
 
 class _Session:

@@ -78,6 +78,11 @@ class Tracker(ABC):
         return None
 
     @property
+    def further_maps(self) -> int:
+        """Number of other maps that the tracker made of the images, which are mapped in runs of their own."""
+        return 0
+
+    @property
     def live(self) -> LiveCounts | None:
         """What a tracker that follows a clock has done so far; None for other trackers."""
         return None

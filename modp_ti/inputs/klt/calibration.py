@@ -14,7 +14,9 @@ from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
 
-__all__ = ["TYPICAL_FOCAL", "estimated_intrinsics", "intrinsics_of"]
+__all__ = ["ADVICE", "TYPICAL_FOCAL", "estimated_intrinsics", "estimation_note", "intrinsics_of"]
+
+ADVICE = "source.intrinsics or a calibrated camera do better"
 
 # Focal length as a share of the image's longer side that is typical of phones, webcams and depth cameras.
 TYPICAL_FOCAL = 0.85
@@ -79,3 +81,12 @@ def intrinsics_of(lens: Lens, size: tuple[int, int]) -> Intrinsics:
     focal *= width / lens.width
     distortion = Distortion(numerator=(k,)) if k else NO_DISTORTION
     return Intrinsics(PinholeCamera(focal, focal, width / 2, height / 2, width, height), distortion)
+
+
+def estimation_note(found: Intrinsics, used: int) -> str:
+    """Return the note on an estimated camera."""
+    k = found.distortion.numerator[0] if found.distortion.numerator else 0.0
+    return (
+        f"the camera is not known: focal length {found.camera.fx:.1f} px and radial distortion {k:.4f} are "
+        f"estimated from {used} images; {ADVICE}"
+    )

@@ -105,11 +105,13 @@ class LandmarkMap:
         last_pixel: (C, 2) its pixel there.
         looked: (C,) how often `searched` has looked for the landmark.
         found: (C,) how often it was found.
+        unsolved: Number of adjustments for which Ceres found no usable solution.
     """
 
     def __init__(self, lens: Lens) -> None:
         self.lens = lens
         self.keyframes: list[Keyframe] = []
+        self.unsolved = 0
         self._count = 0
         self.xyz = np.zeros((0, 3))
         self.known = np.zeros(0, dtype=bool)
@@ -149,6 +151,7 @@ class LandmarkMap:
             What its ids have grown by.
         """
         offset, count = self._count, other._count
+        self.unsolved += other.unsolved
         ids = self.new_ids(count)
         mine, others = list(self.keyframes), list(other.keyframes)
         self.keyframes = sorted([*mine, *others], key=lambda keyframe: keyframe.number)
@@ -265,6 +268,7 @@ class LandmarkMap:
         poses = {k: self.keyframes[k].T_camera_world for k in views}
         bundle = adjusted_bundle(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
         if bundle is None:
+            self.unsolved += 1
             return float("inf")
         for k, T in bundle.poses.items():
             self.keyframes[k].T_camera_world[:3] = T[:3]

@@ -51,9 +51,12 @@ class Odometry:
         begins_anew_after: Number of frames without a pose after which another map may begin; None for never.
         loops: Whether loops are closed.
         waits: Whether the frames of the first map wait until it has enough keyframes or frames to be the run's.
+        place: Place by size, from 1, of the map that becomes the run's when all frames are tracked; None for the first
+            one that has enough keyframes or frames, while they are tracked.
 
     Attributes:
         joined: Number of maps that were joined with another one.
+        places: Number of maps that could become the run's by their place, once `finish` was called.
     """
 
     def __init__(
@@ -64,12 +67,14 @@ class Odometry:
         begins_anew_after: int | None = None,
         loops: bool = False,
         waits: bool = True,
+        place: int | None = None,
     ) -> None:
-        self.joined = 0
+        self.joined = self.places = 0
         self._initialisation: Initialisation | None = Initialisation(lenses, seed)
         self._refinement = refinement
         self._begins_anew_after = begins_anew_after
         self._waits = waits and begins_anew_after is not None
+        self._place = place
         self._seed = seed
         index = PlaceIndex(seed)
         self._joining = MapJoining(index, seed)
@@ -92,6 +97,11 @@ class Odometry:
     def loops(self) -> int:
         """Number of loops that were closed."""
         return 0 if self._loops is None else self._loops.closed
+
+    @property
+    def unsolved(self) -> int:
+        """Number of bundle adjustments for which Ceres found no usable solution."""
+        return sum(each.tracking.map.unsolved for each in self._maps)
 
     @property
     def waiting(self) -> list[list[int]]:
@@ -133,11 +143,19 @@ class Odometry:
         return self._placed(submap, views)
 
     def finish(self) -> list[View]:
-        """Choose the largest map, if none has become the run's. Returns its views."""
-        if self._run is not None or not self._maps:
+        """Choose the map of the wanted place, or the largest, if none has become the run's. Returns its views."""
+        ranked = self._ranked()
+        self.places = len(ranked)
+        place = self._place or 1
+        if self._run is not None or place > len(ranked):
             return []
-        self._run = max(self._maps, key=lambda each: len(each.waiting))
+        self._run = ranked[place - 1]
         return self._released()
+
+    def _ranked(self) -> list[_Submap]:
+        """The maps with enough keyframes or frames, or any if there are none, the one with the most frames first."""
+        ranked = sorted(self._maps, key=lambda each: -len(each.waiting))
+        return [each for each in ranked if self._is_established(each)] or ranked[:1]
 
     def _may_begin(self) -> bool:
         return self._active is None or self._active.tracking.lost_for >= (self._begins_anew_after or 0)
@@ -163,22 +181,19 @@ class Odometry:
             if self._loops is not None and submap is self._active:
                 self._loops.attempt(submap.tracking)
         assert self._active is not None
-        if self._run is None and self._is_established(self._active):
+        if self._run is None and self._place is None and (not self._waits or self._is_established(self._active)):
             self._run = self._active
         if submap is self._run or self._active is self._run:
             return self._released()
-        old = len(submap.waiting) - WAITING_WITH_POINTS
+        old = 0 if self._place is not None else len(submap.waiting) - WAITING_WITH_POINTS
         if old > 0:
             view = submap.waiting[old - 1]
             submap.waiting[old - 1] = replace(view, ids=view.ids[:0].copy(), pixels=view.pixels[:0].copy())
         return []
 
-    def _is_established(self, submap: _Submap) -> bool:
-        return (
-            not self._waits
-            or len(submap.tracking.map.keyframes) >= ESTABLISHED
-            or len(submap.waiting) >= ESTABLISHED_FRAMES
-        )
+    @staticmethod
+    def _is_established(submap: _Submap) -> bool:
+        return len(submap.tracking.map.keyframes) >= ESTABLISHED or len(submap.waiting) >= ESTABLISHED_FRAMES
 
     def _released(self) -> list[View]:
         assert self._run is not None

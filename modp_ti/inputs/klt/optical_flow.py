@@ -20,6 +20,10 @@ ROUND_TRIP = 0.7
 # Smallest minimum eigenvalue of a corner's structure tensor, as a share of the best corner's.
 QUALITY = 0.002
 BORDER = 8  # px from the edge, where windows would be cut off
+# Bands of rows and strips of columns whose brightness is compared. The bands are lit apart if the logarithm of their
+# change deviates by UNEVEN between them, and by twice as much as between the strips.
+BANDS, STRIPS = 60, 4
+UNEVEN = 0.04
 
 
 def flow(
@@ -82,12 +86,35 @@ def _flow(
 
 def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Match brightness and contrast of `before` to `after`, since flow mistakes exposure changes for motion."""
+    gains = _gains_of_rows(before, after)
+    if gains is not None:
+        return np.clip(np.rint(before * gains[:, None]), 0, 255).astype(np.uint8)
     (mean,), (deviation,) = (each.ravel() for each in cv2.meanStdDev(before))
     (mean_after,), (deviation_after,) = (each.ravel() for each in cv2.meanStdDev(after))
     gain = float(deviation_after / max(deviation, 1e-6))
     if not 0.5 < gain < 2.0 or (abs(gain - 1.0) < 0.02 and abs(mean - mean_after) < 2.0):
         return before
     return np.asarray(cv2.convertScaleAbs(before, alpha=gain, beta=float(mean_after - gain * mean)), dtype=np.uint8)
+
+
+def _gains_of_rows(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    """Factors (H,) from the brightness of each row of `before` to that of `after`, where bands are lit differently.
+
+    Lamps that flicker with the mains, and a sensor that exposes its rows one after the other, give bands that wander
+    over the image. A scene that moves changes the brightness of rows too, but not alike in all columns.
+
+    Returns:
+        The factors; None if there are no bands.
+    """
+    then, now = (
+        np.log1p(cv2.resize(each, (STRIPS, BANDS), interpolation=cv2.INTER_AREA).astype(np.float32))
+        for each in (before, after)
+    )
+    change = cv2.blur(now - then, (1, 3))
+    common = np.median(change, axis=1)
+    if np.std(common) < max(UNEVEN, 2.0 * float(np.std(change - common[:, None]))):
+        return None
+    return np.exp(cv2.resize(common[:, None], (1, before.shape[0]), interpolation=cv2.INTER_LINEAR)[:, 0])
 
 
 def _levels(grey: NDArray[np.uint8]) -> int:

@@ -47,17 +47,21 @@ warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.TiffImageP
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Size and completeness of an image file.
+    """Size, orientation, depth and completeness of an image file.
 
     Attributes:
         width: Stored width [px], before any EXIF rotation; 0 if the header is damaged.
         height: Stored height [px], likewise.
         complete: Whether the end marker is present.
+        orientation: EXIF orientation of a JPEG file, 1 to 8; 1 if it states none.
+        bits: Bits per channel.
     """
 
     width: int
     height: int
     complete: bool
+    orientation: int = 1
+    bits: int = 8
 
 
 class _Bounded(io.BufferedIOBase):
@@ -104,21 +108,21 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
     signature = file.read(8)
     if signature == PNG_SIGNATURE:
         # Pillow would also unpack the texts and the colour profile that follow. The size is at a fixed offset.
-        chunk = file.read(16)
-        if len(chunk) < 16 or chunk[4:8] != b"IHDR":
+        chunk = file.read(17)
+        if len(chunk) < 17 or chunk[4:8] != b"IHDR":
             return ImageHeader(0, 0, complete=False)
-        width, height = struct.unpack(">II", chunk[8:])
-        return ImageHeader(width, height, _ends_with(file, PNG_END))
+        width, height = struct.unpack(">II", chunk[8:16])
+        return ImageHeader(width, height, _ends_with(file, PNG_END), bits=chunk[16])
     if signature[:2] != JPEG_SIGNATURE:
         return None
     file.seek(0)
     try:
-        width, height = JpegHeader(bounded(file)).size
+        header = JpegHeader(bounded(file))
     except HEADER_ERRORS:
         file.seek(-min(2, file.seek(0, 2)), 2)
         return ImageHeader(0, 0, complete=file.read() == JPEG_END)
     # Coded data never holds FF D9 except as the end marker, so the first one after the scan's start is it.
-    return ImageHeader(width, height, _ends_with(file, JPEG_END))
+    return ImageHeader(*header.size, _ends_with(file, JPEG_END), _orientation(header))
 
 
 def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlugin.ImageFileDirectory_v2:
@@ -140,6 +144,20 @@ def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlug
     return directory
 
 
+def _orientation(header: JpegHeader) -> int:
+    """Return the EXIF orientation that a JPEG file states, or 1."""
+    try:
+        value = read_tiff_directory(_tiff(header))[ExifTags.Base.Orientation]
+    except HEADER_ERRORS:
+        return 1
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def _tiff(header: JpegHeader) -> bytes:
+    """Return the TIFF structure of a JPEG file's EXIF. Raises `HEADER_ERRORS` if there is none."""
+    return header.info["exif"].removeprefix(b"Exif\0\0")
+
+
 def _ends_with(file: BinaryIO, marker: bytes) -> bool:
     """Return whether the marker ends the file, or precedes data appended to it, as in motion photos."""
     here = file.tell()
@@ -154,7 +172,7 @@ def focal_length_35mm(path: Path) -> float | None:
     """Read the focal length in 35 mm equivalent [mm] from a JPEG file, or return None if it is not stated."""
     try:
         with open_file(path) as file:
-            tiff = JpegHeader(bounded(file)).info["exif"].removeprefix(b"Exif\0\0")
+            tiff = _tiff(JpegHeader(bounded(file)))
         inner = read_tiff_directory(tiff)[ExifTags.IFD.Exif]
         value = read_tiff_directory(tiff, inner)[ExifTags.Base.FocalLengthIn35mmFilm]
     except HEADER_ERRORS:  # also raised if EXIF or the tag is missing

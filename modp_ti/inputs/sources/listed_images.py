@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -12,12 +13,16 @@ from numpy.typing import NDArray
 
 from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import UnreadableImageError
+from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced, used_bits
 from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.image_header import read_image_header
+from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header
 from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turns_of
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 
 __all__ = ["ListedImages", "decoded", "decoded_as", "quiet_opencv"]
+
+SAMPLED = 16  # images of 16 bits per channel by which their depth is found
 
 
 class ListedImages(ImageSource):
@@ -67,11 +72,12 @@ class ListedImages(ImageSource):
         return self._by_stem.get(stem)
 
     def size(self, name: str) -> tuple[int, int]:
-        """Return the size (width, height) of the stored image.
+        """Return the size (width, height) of the image, turned upright.
 
         Raises:
             UnreadableImageError: If the image is unreadable or truncated.
         """
+        turn, _ = self.turn(name), self._bits  # both add their notes when the source is opened
         try:
             with open_file(self.path / name) as file:
                 header = read_image_header(file)
@@ -84,14 +90,27 @@ class ListedImages(ImageSource):
             raise self._unreadable(name, "the file is cut off")
         if header.width < 1 or header.height < 1:
             raise self._unreadable(name, "its header is damaged")
-        return header.width, header.height
+        return turn.size(header.width, header.height)
+
+    def turn(self, name: str) -> Turn:
+        """Return how the stored image is turned upright."""
+        return self._turns.get(name, AS_STORED)
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """Decode an image (H, W, 3) uint8 RGB. EXIF rotation is not applied: intrinsics belong to the stored pixels.
+        """Decode an image (H, W, 3) uint8 RGB, turned upright as EXIF says. Of 16 bits, the used ones are reduced to 8.
 
         Raises:
             UnreadableImageError: If the image is unreadable or truncated.
         """
+        turn, bits = self.turn(name), self._bits
+        data = self._checked(name)
+        image = decoded(data, bits)
+        if image is None:
+            raise self._unreadable(name, "it is damaged or no image")
+        return turn.image(image)
+
+    def _checked(self, name: str) -> bytes:
+        """Read an image file and check that it can be decoded. Raises UnreadableImageError."""
         try:
             data = read_bytes(self.path / name)
         except OSError as error:
@@ -102,10 +121,44 @@ class ListedImages(ImageSource):
         if header is not None and not header.complete:
             raise self._unreadable(name, "the file is cut off")
         reason = why_undecodable(data)
-        image = decoded(data) if reason is None else None
-        if image is None:
-            raise self._unreadable(name, reason or "it is damaged or no image")
-        return image
+        if reason is not None:
+            raise self._unreadable(name, reason)
+        return data
+
+    @cached_property
+    def _turns(self) -> dict[str, Turn]:
+        """The turn of each image that is not kept as it is stored, by name."""
+        turns, note = turns_of(self._headers)
+        if note is not None:
+            self.add_note(f"{self.path}: {note}")
+        return turns
+
+    @cached_property
+    def _bits(self) -> int:
+        """How many bits the images of 16 bits per channel use, by some of them; 16 where there are none."""
+        deep = [name for name in self.names if name not in self._headers or self._headers[name].bits > 8]
+        images: list[NDArray] = []
+        for name in deep[:: max(1, len(deep) // SAMPLED)]:
+            with suppress(UnreadableImageError):
+                image = decoded_deep(self._checked(name))
+                if image is None or image.dtype != np.uint16:
+                    break
+                images.append(image)
+        bits = used_bits(images) if images else DEPTHS[-1]
+        if bits < DEPTHS[-1]:
+            self.add_note(f"{self.path}: the images have 16 bits and use {bits}: {(1 << bits) - 1} is taken as white")
+        return bits
+
+    @cached_property
+    def _headers(self) -> dict[str, ImageHeader]:
+        """The header of each JPEG and PNG file that can be read, by name. All are read when the first is needed."""
+        headers = {}
+        for name in self.names:
+            with suppress(OSError), open_file(self.path / name) as file:
+                header = read_image_header(file)
+                if header is not None and header.width > 0:
+                    headers[name] = header
+        return headers
 
     def _unreadable(self, name: str, reason: str) -> UnreadableImageError:
         return UnreadableImageError(
@@ -113,12 +166,26 @@ class ListedImages(ImageSource):
         )
 
 
-def decoded(data: bytes) -> NDArray[np.uint8] | None:
-    """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation; None if that fails."""
+def decoded(data: bytes, bits: int = DEPTHS[-1]) -> NDArray[np.uint8] | None:
+    """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation; None if that fails.
+
+    Args:
+        data: The file's content.
+        bits: How many bits an image of 16 bits per channel uses.
+    """
     import cv2
 
-    image = decoded_as(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = decoded_as(data, flags) if bits == DEPTHS[-1] else decoded_deep(data)
+    return None if image is None else np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def decoded_deep(data: bytes) -> NDArray | None:
+    """Decode an image file's bytes to (H, W, 3) BGR, uint8 or uint16 as it is stored; None if that fails."""
+    import cv2
+
+    image = decoded_as(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 
 def decoded_as(data: bytes, flags: int) -> NDArray | None:

@@ -65,7 +65,7 @@ class MaskFolder:
         if found != (width, height):
             raise InputError(
                 f"{self._images.path / mask} is {found[0]}x{found[1]}, its image {name} is {width}x{height}: "
-                "masks must have the size of the stored images"
+                "masks must have the size of the images, turned as EXIF says"
             )
 
     def read(self, name: str) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
+from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.protocol import ImageSource
 
 __all__ = ["PacedSource"]
@@ -108,6 +109,9 @@ class PacedSource(ImageSource):
 
     def size(self, name: str) -> tuple[int, int]:
         return self._images.size(name)
+
+    def turn(self, name: str) -> Turn:
+        return self._images.turn(name)
 
     def read(self, name: str) -> NDArray[np.uint8]:
         return self._images.read(name)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 
 if TYPE_CHECKING:
     from modp_ti.inputs.sources.backlog import Arrivals
@@ -142,6 +143,10 @@ class ImageSource(ABC):
         """
         assert self._size is not None and name in self._position, name
         return self._size
+
+    def turn(self, name: str) -> Turn:
+        """Return how the stored image is turned before it is delivered. `size` and `read` give the turned image."""
+        return AS_STORED
 
     @abstractmethod
     def read(self, name: str) -> NDArray[np.uint8]:

@@ -14,11 +14,13 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
-from modp_ti.inputs.sources import Undistorter, open_source
+from modp_ti.inputs.sources import Distortion, Undistorter, open_source
 from modp_ti.inputs.sources.distortion import colmap_intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
 from modp_ti.inputs.trackers.given_poses import checked_reader, matched_entries
+from modp_ti.inputs.trackers.stored_cameras import turn_of_camera, turned_note
 
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
@@ -26,10 +28,16 @@ if TYPE_CHECKING:
 __all__ = ["open_colmap"]
 
 
-def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTracker:
+def open_colmap(source: SourceSettings, tracker: ColmapSettings, upright: bool = False) -> ReplayedTracker:
     """Open the images that have a pose in the model, in natural order, with the points that each observes.
 
     `tracker.path` is the model's folder.
+
+    Args:
+        source: Settings of the images.
+        tracker: Settings of the tracker.
+        upright: Whether the model was made from the images turned as their EXIF orientation says. Otherwise the sizes
+            of its cameras tell.
 
     Raises:
         InputError: If the model is missing or damaged, has an unsupported camera model, has no image in the folder, or
@@ -43,16 +51,27 @@ def open_colmap(source: SourceSettings, tracker: ColmapSettings) -> ReplayedTrac
     if not stated:
         raise InputError(f"{folder}: the COLMAP model holds no image{' with a pose' if model.images else ''}")
     posed, notes = matched_entries(images, source, stated, folder, str(folder), "images")
-    undistorters = {i: _undistorter(camera, images.scale, folder) for i, camera in model.cameras.items()}
-    cameras = {name: undistorters[image.camera_id] for name, image in posed.items()}
+    stored = {i: _camera(camera, folder) for i, camera in model.cameras.items()}
+    turns = dict.fromkeys(posed, AS_STORED)
+    undistorters: dict[tuple[int, Turn], Undistorter] = {}
+    cameras = {}
+    for name, image in posed.items():
+        camera, lens = stored[image.camera_id]
+        if not upright:
+            turns[name] = turn_of_camera(images, name, camera.width, camera.height, str(folder))
+        key = image.camera_id, turns[name]
+        if key not in undistorters:
+            undistorters[key] = Undistorter(*turns[name].camera(camera, lens), images.scale)
+        cameras[name] = undistorters[key]
+    notes += turned_note(turns.values(), str(folder))
     reader = checked_reader(images, source, cameras, str(folder))
 
     positions = {i: np.asarray(point.xyz, dtype=np.float64) for i, point in model.points3D.items()}
     frames = []
     for name, image in posed.items():
         matrix = np.vstack([image.cam_from_world().matrix(), (0.0, 0.0, 0.0, 1.0)])
-        T_camera_world = checked_pose(matrix, f"{folder}: image {image.name}")
-        points = _observed_points(image, positions, cameras[name], T_camera_world, folder)
+        T_camera_world = turns[name].T_turned_stored @ checked_pose(matrix, f"{folder}: image {image.name}")
+        points = _observed_points(image, positions, cameras[name], turns[name], T_camera_world, folder)
         frames.append(PosedImage(name, cameras[name], T_camera_world, points))
     return ReplayedTracker(reader, frames, notes)
 
@@ -71,7 +90,7 @@ def _model_folder(images: Path, given: Path | None) -> Path:
     raise InputError(f"{given}: holds no COLMAP model (cameras, images and points3D as .bin or .txt)")
 
 
-def _undistorter(camera: pycolmap.Camera, scale: float, folder: Path) -> Undistorter:
+def _camera(camera: pycolmap.Camera, folder: Path) -> tuple[PinholeCamera, Distortion]:
     model = camera.model.name
     intrinsics = colmap_intrinsics(model, camera.params.tolist())
     if intrinsics is None:
@@ -80,13 +99,14 @@ def _undistorter(camera: pycolmap.Camera, scale: float, folder: Path) -> Undisto
     if not (np.isfinite(camera.params).all() and fx > 0 and fy > 0 and camera.width > 0 and camera.height > 0):
         raise InputError(f"{folder}: camera {camera.camera_id} has impossible intrinsics: {camera.params_to_string()}")
     pinhole = PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height))
-    return Undistorter(*require_plausible(pinhole, distortion, f"{folder}: camera {camera.camera_id}"), scale)
+    return require_plausible(pinhole, distortion, f"{folder}: camera {camera.camera_id}")
 
 
 def _observed_points(
     image: pycolmap.Image,
     positions: dict[int, NDArray[np.float64]],
     undistorter: Undistorter,
+    turn: Turn,
     T_camera_world: NDArray[np.float64],
     folder: Path,
 ) -> SparsePoints:
@@ -98,5 +118,6 @@ def _observed_points(
         raise InputError(f"{folder}: points3D is incomplete: image {image.name} observes points that it lacks")
     # A track may have two observations in one image. The first one is used.
     ids, first = np.unique(ids, return_index=True)
-    pixels = undistorter.points(np.array([point.xy for point in observed])[first])
+    pixels = np.array([point.xy for point in observed])[first]
+    pixels = undistorter.points(turn.pixels(pixels, *turn.size(undistorter.raw.width, undistorter.raw.height)))
     return points_inside(np.array([positions[int(i)] for i in ids]), pixels, ids, undistorter, T_camera_world)

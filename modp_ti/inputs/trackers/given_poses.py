@@ -168,7 +168,7 @@ def checked_reader(
         advice = "give source.path the images that belong to these intrinsics"
         ratio = width / raw.width
         if (width, height) == (raw.height, raw.width):
-            advice = "the image lies on its side: turn the pixels (an EXIF orientation is not applied)"
+            advice = "the image lies on its side: give the intrinsics of the upright image"
         elif abs(ratio * raw.height - height) <= 1.0:
             advice = (
                 f"the image is the same view at {ratio:.4g} of the size: {advice}"

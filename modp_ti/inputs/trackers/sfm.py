@@ -28,7 +28,7 @@ __all__ = ["open_sfm"]
 
 # The fingerprint of what a kept model was made of. A change of the method must change METHOD.
 MADE_OF = "made_of.txt"
-METHOD = "1"
+METHOD = "2"
 
 
 def open_sfm(
@@ -55,7 +55,7 @@ def open_sfm(
         _reconstruct(reader, names, tracker, folder, seed, progress or _silent)
         replace_text(folder / MADE_OF, made_of)
     images.close()
-    opened = open_colmap(source, ColmapSettings(path=folder))
+    opened = open_colmap(source, ColmapSettings(path=folder), upright=True)
     if kept:
         opened.notes.append(f"structure from motion: {folder} is of these images and settings, and is used again")
     return opened

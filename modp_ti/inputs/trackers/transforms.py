@@ -24,6 +24,7 @@ from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter, open_so
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, matched_entries, read_entries, solving
 from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
+from modp_ti.inputs.trackers.stored_cameras import turn_of_camera, turned_note
 
 __all__ = ["open_transforms"]
 
@@ -55,11 +56,15 @@ def open_transforms(
     entries, notes = matched_entries(images, source, stated, file, file.name, "frames")
 
     undistorters: dict[tuple[PinholeCamera, Distortion], Undistorter] = {}
-    frames = []
+    frames, turns = [], []
     for name, entry in entries.items():
         raw, distortion = _intrinsics({**data, **entry}, images, name, file)
+        turn = turn_of_camera(images, name, raw.width, raw.height, str(file))
+        turns.append(turn)
+        raw, distortion = turn.camera(raw, distortion)
         undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, images.scale))
-        frames.append(PosedImage(name, undistorter, _pose(entry, file)))
+        frames.append(PosedImage(name, undistorter, turn.T_turned_stored @ _pose(entry, file)))
+    notes += turned_note(turns, str(file))
     reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(file))
 
     cloud = data.get("ply_file_path")
@@ -103,7 +108,7 @@ def _intrinsics(
 
     width, height = number("w"), number("h")
     if width is None or height is None:
-        stored = images.size(name)
+        stored = images.turn(name).size(*images.size(name))
         width, height = float(width or stored[0]), float(height or stored[1])
     if width < 1 or height < 1 or width != int(width) or height != int(height):
         raise InputError(f"{file}: `w` and `h` must be whole numbers of pixels, not {width:g} and {height:g}")

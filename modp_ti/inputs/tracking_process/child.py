@@ -17,7 +17,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.klt.tracker import KltTracker, open_klt
+from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout
 from modp_ti.inputs.tracking_process.messages import (

@@ -38,7 +38,7 @@ class PictureCamera:
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
-    """Decode an image file (H, W, 3) uint8 RGB, without EXIF rotation, as the images of a run.
+    """Decode an image file (H, W, 3) uint8 RGB, turned as EXIF says, as the images of a run.
 
     Raises:
         UnreadableImageError: If the file cannot be read as an image.

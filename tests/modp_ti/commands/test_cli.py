@@ -373,12 +373,13 @@ def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):
     assert len(set(offered)) == len(offered) and "tracker.kind=colmap" in offered
     defaults = [value for value in offered if not value.endswith("=")]
     assert len(defaults) > 100
+    of_klt = ("tracker.loops", "tracker.maps")
     of_sfm = [f"tracker.{name}" for name in ("order", "mapper", "overlap", "features")]
-    others = ("source.vrs", "tracker.kind", "tracker.loops", *of_sfm)  # for other kinds than the scene's
+    others = ("source.vrs", "tracker.kind", *of_klt, *of_sfm)  # for other kinds than the scene's
     loaded = load_scene(scene, [value for value in defaults if not value.startswith(others)])
     assert loaded == load_scene(scene, [])
     klt = load_scene(scene, ["tracker={kind: klt}"])
-    assert load_scene(scene, ["tracker={kind: klt}", *(v for v in defaults if v.startswith("tracker.loops"))]) == klt
+    assert load_scene(scene, ["tracker={kind: klt}", *(v for v in defaults if v.startswith(of_klt))]) == klt
 
 
 def test_the_completion_of_bash_can_be_had():

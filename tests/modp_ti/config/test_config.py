@@ -212,7 +212,10 @@ def test_missing_key_is_named_with_its_meaning(scene, text, parts):
             "{kind: colmap, points: x}",
             ["unknown key `tracker.points`", "tum, orbslam3, replica and sevenscenes, not colmap", "`tracker.path`"],
         ),
-        ("{kind: klt, path: x}", ["unknown key `tracker.path`", "not klt, which has `tracker.loops`; take it out"]),
+        (
+            "{kind: klt, path: x}",
+            ["unknown key `tracker.path`", "not klt, which has `tracker.loops`, `tracker.maps`; take it out"],
+        ),
         ("{kind: tum, camera: x}", ["`tracker.camera`: it is for tracker.kind: aria, not tum"]),
         ("{kind: replica, time_offset: 1}", ["`tracker.time_offset`"]),
         ("{kind: colmap, adress: x}", ["did you mean `tracker.address`, which is for tracker.kind: socket?"]),
@@ -366,6 +369,12 @@ def test_live_frames_set_the_pace_unless_the_scene_says_otherwise(scene, text: s
     config = load_scene(scene(f"{text}\noutput: out\n"))
     assert config.is_realtime is realtime
     assert not (config.is_realtime and config.can_be_resumed)
+
+
+@pytest.mark.parametrize("source", ["{stream: 0}", "{path: images, realtime: true}"])
+def test_the_largest_map_of_images_that_follow_a_clock_cannot_be_waited_for(scene, source: str) -> None:
+    text = failure(scene(f"source: {source}\ntracker: {{kind: klt, maps: largest}}\noutput: out\n"))
+    assert "tracker.maps: largest needs all images before the first is mapped" in text
 
 
 def test_a_realtime_run_has_no_snapshots(scene) -> None:

@@ -127,6 +127,21 @@ def test_bundle_adjustment_finds_the_scene_and_leaves_held_keyframes():
     np.testing.assert_allclose(landmarks.xyz[:150], xyz, atol=1e-3)
 
 
+def test_an_adjustment_without_a_solution_leaves_the_map_and_is_counted():
+    landmarks, _, _ = small_map(np.random.default_rng(5), 0.01)
+    landmarks.keyframes[3].pixels = landmarks.keyframes[3].pixels.copy()
+    landmarks.keyframes[3].pixels[7] = np.nan  # Ceres cannot evaluate the cost
+    before = landmarks.state()
+    assert landmarks.adjust(free=[2, 3, 4, 5], held=[0, 1], steps=50) == np.inf
+    np.testing.assert_array_equal(landmarks.xyz, before.landmarks["xyz"])
+    assert landmarks.unsolved == 1
+    other, _, _ = small_map(np.random.default_rng(6), 0.0)
+    for keyframe in landmarks.keyframes:
+        keyframe.number += 10
+    other.absorb(landmarks, np.eye(4))
+    assert other.unsolved == 1
+
+
 def test_bundle_adjustment_finds_the_focal_length():
     landmarks, _, _ = small_map(np.random.default_rng(6), 0.0, Lens.radial(430.0, 0.0, 640, 480))
     landmarks.adjust(range(6), steps=100, refined=["focal"])

@@ -125,3 +125,28 @@ def test_only_the_first_frames_of_a_recording_wait_and_not_those_of_a_camera(box
         first[waits] = next(n for n, numbers in enumerate(brought) if numbers)
         assert [number for numbers in brought for number in numbers] == list(range(40))
     assert first[False] + 5 <= first[True] < 40
+
+
+@pytest.fixture(scope="module")
+def two_places(box_room, box_walk) -> tuple[list[NDArray[np.uint8]], list[int], list[int]]:
+    """Grey images of a place, of nothing, and for longer of another; with the frames of both."""
+    other = replace(box_room, textures={wall: sheet[::-1].copy() for wall, sheet in box_room.textures.items()})
+    greys = [*(other.grey(T) for T in box_walk.poses[:45]), *[BLACK] * 8, *box_walk.grey]
+    return greys, list(range(45)), list(range(53, 113))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [1, 2, 3])
+def test_the_map_of_a_place_by_size_is_chosen_when_all_frames_are_tracked(box_room, box_walk, two_places, place):
+    greys, first, second = two_places
+    odometry = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=5, place=place)
+    assert [view for number, grey in enumerate(greys) for view in odometry.process(number, grey)] == []
+    views = {view.number: view for view in odometry.finish()}
+    assert odometry.places == 2
+    if place == 3:
+        assert views == {} and odometry.tracking is None
+        return
+    expected, others = (second, first) if place == 1 else (first, second)
+    assert list(views) == expected and odometry.waiting == [others]
+    truth = dict(zip(expected, box_walk.poses, strict=False))
+    assert errors(odometry, views, truth).max() < 0.02

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -123,3 +124,38 @@ def test_light_that_changes_does_not_lose_the_camera(box_room, box_walk):
     tracking, views = tracked(box_room, greys)
     assert len(views) == 60
     assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.02
+
+
+def banded(grey: NDArray[np.uint8], phase: float, depth: float = 0.3) -> NDArray[np.uint8]:
+    """The image under a lamp that flickers while the rows are exposed one after the other."""
+    rows = np.arange(len(grey))[:, None]
+    return np.clip(grey * (0.75 + depth * np.sin(2 * np.pi * (rows / 100.0 + phase))), 0, 255).astype(np.uint8)
+
+
+def test_bands_of_light_that_wander_over_the_rows_do_not_lose_the_camera(box_room, box_walk):
+    tracking, views = tracked(box_room, [banded(grey, 0.37 * i) for i, grey in enumerate(box_walk.grey)])
+    assert len(views) == 60
+    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.03
+
+
+def test_the_camera_is_found_again_after_frames_of_nothing_but_blur(box_room, box_walk):
+    kernel = np.full((81, 81), 1 / 81**2, np.float32)
+    greys = [cv2.filter2D(grey, -1, kernel) if 30 <= i < 36 else grey for i, grey in enumerate(box_walk.grey)]
+    tracking, views = tracked(box_room, greys)
+    assert sorted(views) == [*range(30), *range(36, 60)]
+    assert errors(tracking, views, {i: T for i, T in enumerate(box_walk.poses) if i in views}).max() < 0.02
+
+
+def test_something_that_walks_through_the_picture_is_no_part_of_the_map(box_room, box_walk):
+    """As wide as a third of the picture, with texture of its own."""
+    walker = np.ascontiguousarray(box_walk.grey[0][:, 100:205][:, ::-1])
+    greys = []
+    for i, grey in enumerate(box_walk.grey):
+        grey, left = grey.copy(), 8 * i - 150
+        shown = slice(max(0, left), max(0, min(320, left + 105)))
+        if shown.stop > shown.start:
+            grey[:, shown] = walker[:, shown.start - left : shown.stop - left]
+        greys.append(grey)
+    tracking, views = tracked(box_room, greys)
+    assert len(views) == 60
+    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.03

@@ -12,7 +12,7 @@ import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import SourceSettings
+from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
@@ -230,3 +230,42 @@ def test_loops_without_gtsam_are_refused_in_one_line(box_walk, tmp_path, monkeyp
     with pytest.raises(InputError) as error:
         open_klt(source, KltSettings(loops=True))
     assert str(error.value).endswith("pip install 'modp-ti[loops]'") and "\n" not in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def two_places(box_room, box_walk, tmp_path_factory) -> SourceSettings:
+    """A recording of a place, of nothing, and for longer of another."""
+    other = replace(box_room, textures={wall: sheet[::-1].copy() for wall, sheet in box_room.textures.items()})
+    black = [np.zeros((240, 320, 3), np.uint8)] * 12
+    walk = Walk([], [*(other.image(T) for T in box_walk.poses[:45]), *black, *box_walk.images])
+    camera = box_room.camera
+    intrinsics = IntrinsicsSettings(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+    folder = walk.written(tmp_path_factory.mktemp("places") / "images")
+    return SourceSettings(path=folder, intrinsics=intrinsics, scale=0.25)
+
+
+@pytest.mark.parametrize(
+    ("maps", "numbers", "further", "said"),
+    [
+        ("first", range(45), 0, "tracker.maps: all maps each in a run of its own"),
+        ("largest", range(57, 117), 0, "tracker.maps: all maps each in a run of its own"),
+        ("all", range(57, 117), 1, "1 of them are mapped in runs of their own"),
+        (2, range(45), 0, "tracker.maps: all maps each in a run of its own"),
+    ],
+)
+def test_the_frames_of_the_wanted_map_are_delivered_and_the_others_told(two_places, maps, numbers, further, said):
+    told = []
+    tracker = open_klt(two_places, KltSettings(maps=maps), progress=lambda what, *_: told.append(what))
+    if maps != "first":
+        assert tracker.frame_count == len(numbers) and set(told) == {"tracking"}
+    frames = [event for event in tracker.events() if isinstance(event, TrackedFrame)]
+    assert [frame.name for frame in frames] == [f"{number:04d}.png" for number in numbers]
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    assert all(len(frame.points) > 60 for frame in frames)
+    assert tracker.further_maps == further
+    assert any(said in note for note in tracker.notes)
+
+
+def test_a_map_that_is_not_there_is_named(two_places):
+    with pytest.raises(InputError, match=r"tracker\.maps: 3: klt made 2 maps"):
+        open_klt(two_places, KltSettings(maps=3))

@@ -56,18 +56,6 @@ def test_grey_sixteen_bit_and_transparent_images_become_rgb_bytes(folder, tmp_pa
     assert made.read("a.png")[0, 0].tolist() == [3, 2, 1]
 
 
-def test_exif_orientation_is_not_applied(folder, tmp_path):
-    made = folder("a.jpg")
-    data = (tmp_path / "a.jpg").read_bytes()
-    # TIFF header, one entry: tag 0x0112 (orientation), SHORT, 1 value, 6 = turn by 90 degrees
-    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
-    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
-    (tmp_path / "a.jpg").write_bytes(data[:2] + segment + data[2:])
-    assert cv2.imread(str(tmp_path / "a.jpg")).shape == (30, 20, 3), "the file asks to be turned"
-    assert made.read("a.jpg").shape == (20, 30, 3)
-    assert made.size("a.jpg") == (30, 20)
-
-
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
 @pytest.mark.parametrize("part", [0.0, 0.1, 0.6, 0.98])
 def test_image_that_was_cut_off_is_named(folder, tmp_path, suffix, part, capfd):

@@ -1,0 +1,123 @@
+"""Opening of the tracker `klt`: checks the images, and finds their camera if it is unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import KltSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.klt.calibration import ADVICE, TYPICAL_FOCAL, estimated_intrinsics, estimation_note
+from modp_ti.inputs.klt.pose_graph import solver_is_there
+from modp_ti.inputs.klt.selected_images import available, followed_scale, read_image, require_size
+from modp_ti.inputs.klt.tracker import KltTracker
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import readable_sizes
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
+from modp_ti.inputs.sources.image_header import focal_length_35mm
+
+__all__ = ["open_klt"]
+
+CALIBRATION_FRAMES = 300
+CALIBRATION_STRIDE = 3
+DIAGONAL_35MM = 43.27  # mm
+
+
+def open_klt(
+    source: SourceSettings,
+    settings: KltSettings | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    images: ImageSource | None = None,
+) -> KltTracker:
+    """Open the images of a source and return a tracker for them.
+
+    If the source has no intrinsics, they are estimated from its first images; the focal length in EXIF, or a typical
+    one, is the initial value. Frames of a source that follows a clock do not wait for that: they are delivered with the
+    initial value, and corrections bring the estimates.
+
+    Args:
+        source: Settings of the images.
+        settings: Settings of the tracker, None for the defaults.
+        seed: Seed of RANSAC.
+        progress: Called during the estimation of the camera.
+        images: The images, None to open those of the settings.
+
+    Raises:
+        InputError: If the images are missing, unreadable or of several sizes, or do not fit the intrinsics; or if loops
+            are to be closed without `gtsam`.
+    """
+    settings = settings or KltSettings()
+    loops = settings.loops
+    if loops and not solver_is_there():
+        raise InputError(
+            "tracker.loops needs gtsam (Linux and macOS, Python 3.11 or newer): pip install 'modp-ti[loops]'"
+        )
+    images = open_source(source) if images is None else images
+    reader = FrameReader(images, source)
+    first = next(images.arriving(source.start, source.stop, source.step), None)
+    if first is None:
+        raise InputError(f"{images.path}: brought no image")
+    width, height = images.size(first)
+    there = available(reader)
+    for name, size in readable_sizes(images, there):
+        require_size(images, name, size, (width, height))
+    notes = []
+    intrinsics = None if images.intrinsics is None else require_intrinsics(images)
+    blank = Intrinsics(PinholeCamera(max(width, height), max(width, height), width / 2, height / 2, width, height))
+    reader.require_fitting([(name, (intrinsics or blank).undistorter(1.0)) for name in there])
+    if intrinsics is None and images.arrivals is not None:
+        intrinsics, note = _guessed(reader, blank)
+        return KltTracker(reader, intrinsics, seed, [note], is_guess=True, loops=loops)
+    if intrinsics is None:
+        intrinsics, note = _estimated(reader, blank, seed, progress)
+        notes.append(note)
+    elif (intrinsics.camera.width, intrinsics.camera.height) != (width, height):
+        raise InputError(
+            f"{images.path / first} is {width}x{height}, the camera {intrinsics.camera.width}x"
+            f"{intrinsics.camera.height}: give the intrinsics of the stored images"
+        )
+    return KltTracker(
+        reader,
+        intrinsics,
+        seed,
+        notes,
+        loops=loops,
+        place=settings.place,
+        further=settings.maps == "all",
+        progress=progress,
+    )
+
+
+def _guessed(reader: FrameReader, blank: Intrinsics) -> tuple[Intrinsics, str]:
+    """Guess the camera from EXIF, or take a typical one. Returns it with a note for the user."""
+    width, height = blank.camera.width, blank.camera.height
+    film = focal_length_35mm(reader.images.path / available(reader)[0])
+    focal = (
+        TYPICAL_FOCAL * max(width, height) if film is None else film / DIAGONAL_35MM * float(np.hypot(width, height))
+    )
+    origin = "is what EXIF says" if film is not None else "is a guess, for the images do not tell"
+    camera = PinholeCamera(focal, focal, width / 2, height / 2, width, height)
+    return Intrinsics(camera), f"the camera is not known: focal length {focal:.1f} px {origin}; {ADVICE}"
+
+
+def _estimated(reader: FrameReader, blank: Intrinsics, seed: int, progress: Progress | None) -> tuple[Intrinsics, str]:
+    """Estimate the camera from EXIF and the images. Returns it with a note for the user."""
+    width, height = blank.camera.width, blank.camera.height
+    there = available(reader)
+    guess, note = _guessed(reader, blank)
+    stride = int(np.clip(len(there) // CALIBRATION_FRAMES, 1, CALIBRATION_STRIDE))
+    undistorter = blank.undistorter(followed_scale(width, height))
+
+    def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]:
+        for name in there[: stride * CALIBRATION_FRAMES : stride]:
+            raw = read_image(reader.images, name, width, height)
+            yield undistorter.grey(raw, reader.valid(name, raw))
+
+    total = min(CALIBRATION_FRAMES, len(there))
+    found, used = estimated_intrinsics(images(), (width, height), guess.camera.fx, seed, progress, total)
+    return (guess, note) if found is None else (found, estimation_note(found, used))
