@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_pose, scale_of
 from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.loop_closing import LoopClosing, closed_map
+from modp_ti.inputs.klt.loop_closing import LoopClosing
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.pose_graph import Link, closed_loop
 from modp_ti.inputs.klt.recognition import Recognition
@@ -105,17 +105,17 @@ def test_a_loop_that_the_map_contradicts_is_not_closed(box_room, monkeypatch):
     found = []
 
     def wrong(_, landmarks, since):
+        if found or since == len(landmarks.keyframes):
+            return []
         of, by = landmarks.keyframes[0], landmarks.keyframes[-3:]
         nothing = np.zeros((0, 2), np.int64)
-        found[:] = [Recognition(of, each, nothing, np.eye(4), of.T_camera_world, 1.0) for each in by]
-        assert since < len(landmarks.keyframes)
-        assert closed_map(landmarks, found) is None
+        found.extend(Recognition(of, each, nothing, np.eye(4), of.T_camera_world, 1.0) for each in by)
         return found
 
     truth = round_walk(60, 0.5)
     _, views = followed(box_room, truth, None)
     monkeypatch.setattr("modp_ti.inputs.klt.loop_closing.LoopDetection.search", wrong)
     odometry, again = followed(box_room, truth, None)
-    assert found and odometry.loops == 0 and odometry.undone >= 1
+    assert found and (odometry.loops, odometry.undone) == (0, 1)
     for view, other in zip(views, again, strict=True):
         np.testing.assert_array_equal(view.T_camera_world, other.T_camera_world)
