@@ -134,7 +134,7 @@ class KltSettings(TrackerSettings):
     loops: bool = Field(
         default=False,
         description="close loops, drift of scale included, where the camera comes back after a long way. Needs "
-        "`pip install 'modp-ti[loops]'`, and half as much time again",
+        "`pip install 'modp-ti[loops]'`, and a second core",
     )
     maps: Literal["first", "largest", "all"] | Annotated[int, Field(ge=1)] = Field(
         default="first",

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.multiview.adjustment_process import adjusted_apart
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
-__all__ = ["Keyframe", "LandmarkMap", "MapState"]
+__all__ = ["LANDMARKS", "Keyframe", "LandmarkMap"]
 
 # Observations with a larger reprojection error [px] are outliers.
 MAX_ERROR = 2.5
@@ -73,21 +74,6 @@ class Keyframe:
         self.rays = np.concatenate([self.rays, rays])
 
 
-@dataclass(frozen=True)
-class MapState:
-    """What a map was at some time.
-
-    Attributes:
-        lens: The camera.
-        landmarks: Copies of the arrays of the landmarks, by name.
-        keyframes: Copies of the keyframes.
-    """
-
-    lens: Lens
-    landmarks: dict[str, NDArray]
-    keyframes: list[Keyframe]
-
-
 class LandmarkMap:
     """Keyframes and landmarks. The id of a feature is its index in the arrays, and is never reused.
 
@@ -97,6 +83,7 @@ class LandmarkMap:
     Attributes:
         lens: The camera.
         keyframes: The keyframes in order.
+        count: Number of ids that were given.
         xyz: (C, 3) positions in the world.
         known: (C,) whether the feature is triangulated, and so is a landmark.
         first: (C,) keyframe that saw the feature first; -1 for none.
@@ -112,7 +99,7 @@ class LandmarkMap:
         self.lens = lens
         self.keyframes: list[Keyframe] = []
         self.unsolved = 0
-        self._count = 0
+        self.count = 0
         self.xyz = np.zeros((0, 3))
         self.known = np.zeros(0, dtype=bool)
         self.first = np.zeros(0, dtype=np.int64)
@@ -124,10 +111,10 @@ class LandmarkMap:
 
     def new_ids(self, count: int) -> NDArray[np.int64]:
         """Reserve ids (count,) for new features."""
-        ids = np.arange(self._count, self._count + count, dtype=np.int64)
-        self._count += count
-        if self._count > len(self.known):
-            extra = max(self._count, 2 * len(self.known), 1024) - len(self.known)
+        ids = np.arange(self.count, self.count + count, dtype=np.int64)
+        self.count += count
+        if self.count > len(self.known):
+            extra = max(self.count, 2 * len(self.known), 1024) - len(self.known)
             for name in LANDMARKS:
                 array, value = getattr(self, name), EMPTY.get(name, 0)
                 setattr(self, name, np.concatenate([array, np.full((extra, *array.shape[1:]), value, array.dtype)]))
@@ -150,7 +137,7 @@ class LandmarkMap:
         Returns:
             What its ids have grown by.
         """
-        offset, count = self._count, other._count
+        offset, count = self.count, other.count
         self.unsolved += other.unsolved
         ids = self.new_ids(count)
         mine, others = list(self.keyframes), list(other.keyframes)
@@ -244,7 +231,12 @@ class LandmarkMap:
             self.note_observations(k, keyframe.ids[slots], keyframe.pixels[slots])
 
     def adjust(
-        self, free: Sequence[int], held: Sequence[int] = (), steps: int = 10, refined: Collection[Refinable] = ()
+        self,
+        free: Sequence[int],
+        held: Sequence[int] = (),
+        steps: int = 10,
+        refined: Collection[Refinable] = (),
+        apart: bool = False,
     ) -> float:
         """Minimise the robust reprojection error over keyframes and the landmarks that they see, in place.
 
@@ -253,9 +245,10 @@ class LandmarkMap:
             held: Keyframes that take part with fixed poses. Without any, the first two of `free` fix the gauge.
             steps: Levenberg-Marquardt steps at most.
             refined: Parts of the camera that are optimised too.
+            apart: Solve in a process of its own, so that other threads go on.
 
         Returns:
-            The mean cost per observation [px^2 / 2]; infinite if there are too few observations.
+            The mean cost per observation [px^2 / 2]; infinite if there are too few observations, or no solution.
         """
         views = sorted({*free, *held})
         of, ids, pixels = self.observations(views)
@@ -266,7 +259,8 @@ class LandmarkMap:
         if len(ids) < 12:
             return float("inf")
         poses = {k: self.keyframes[k].T_camera_world for k in views}
-        bundle = adjusted_bundle(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
+        solve = adjusted_apart if apart else adjusted_bundle
+        bundle = solve(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
         if bundle is None:
             self.unsolved += 1
             return float("inf")
@@ -285,29 +279,31 @@ class LandmarkMap:
         for keyframe, S in zip(self.keyframes, moves, strict=True):
             keyframe.move(S)
 
-    def state(self) -> MapState:
-        """The camera, the landmarks and the keyframes with their observations, for `restore`."""
-        arrays = {name: getattr(self, name).copy() for name in LANDMARKS}
-        keyframes = [
+    def copy(self) -> LandmarkMap:
+        """A copy that can change by itself. The images and SIFT features of the keyframes are shared."""
+        other = LandmarkMap(self.lens)
+        other.count, other.unsolved = self.count, self.unsolved
+        for name in LANDMARKS:
+            setattr(other, name, getattr(self, name).copy())
+        other.keyframes = [
             replace(each, T_camera_world=each.T_camera_world.copy(), described_ids=each.described_ids.copy())
             for each in self.keyframes
         ]
-        return MapState(self.lens, arrays, keyframes)
+        return other
 
-    def restore(self, state: MapState) -> None:
-        """Take back what has changed since `state`, if no keyframe has been added. Ids that were given stay taken."""
-        for name, array in state.landmarks.items():
-            getattr(self, name)[: len(array)] = array
-            getattr(self, name)[len(array) :] = EMPTY.get(name, 0)
-        for keyframe, before in zip(self.keyframes, state.keyframes, strict=True):
-            keyframe.T_camera_world[:] = before.T_camera_world
-            keyframe.ids, keyframe.pixels, keyframe.rays = before.ids, before.pixels, before.rays
-            keyframe.scale = before.scale
-            if before.described is not None:
-                keyframe.described_ids = before.described_ids
+    def adopt(self, other: LandmarkMap) -> None:
+        """Become what a copy of this map is, which has the same keyframes and must not be used afterwards."""
+        self.lens, self.count, self.unsolved = other.lens, other.count, other.unsolved
+        for name in LANDMARKS:
+            setattr(self, name, getattr(other, name))
+        for keyframe, now in zip(self.keyframes, other.keyframes, strict=True):
+            keyframe.T_camera_world[:] = now.T_camera_world
+            keyframe.ids, keyframe.pixels, keyframe.rays = now.ids, now.pixels, now.rays
+            keyframe.scale = now.scale
+            if now.described is not None:
+                keyframe.described, keyframe.described_ids = now.described, now.described_ids
             else:
                 keyframe.described_ids = np.full_like(keyframe.described_ids, -1)
-        self.lens = state.lens
 
     def _take(self, lens: Lens) -> None:
         """Replace the camera, and with it the rays of all observations."""

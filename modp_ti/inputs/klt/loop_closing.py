@@ -1,8 +1,10 @@
-"""Loop closing: a keyframe that shows a place which the map has, but not where the map says, corrects the drift."""
+"""Loop closing: a place that is recognised corrects the drift since it was seen, while tracking goes on."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,114 +12,136 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import inverse_se3
 from fields.geometry.similarity import scale_of
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
-from modp_ti.inputs.klt.map_joining import connect
-from modp_ti.inputs.klt.place_recognition import PlaceIndex
+from modp_ti.inputs.klt.loop_detection import YOUNGEST, LoopDetection
+from modp_ti.inputs.klt.map_connection import connected
 from modp_ti.inputs.klt.pose_graph import Link, closed_loop
-from modp_ti.inputs.klt.recognition import Recognition, agreeing, recognised
+from modp_ti.inputs.klt.recognition import Recognition
 from modp_ti.inputs.klt.tracking import Tracking
 
-__all__ = ["LoopClosing"]
+__all__ = ["LoopClosing", "closed_map"]
 
-YOUNGEST = 15  # keyframes between the two ends of a loop, at least
-SHARED = 10  # landmarks: keyframes that share more are connected
-NOTABLE = 5.0  # px: with less drift, the search for landmarks finds those of the other end
-CANDIDATES = 2  # keyframes with which a keyframe is compared
-# Cosine of the image descriptors from which keyframes are compared. It is 0.1 to 0.8 for overlapping pictures of
-# redkitchen, and below 0.07 for others.
-LEAST_LIKENESS = 0.05
-AGREEING = 3  # keyframes that must agree
-REMEMBERED = 12  # keyframes for which a recognition counts
-PAUSE = 5  # keyframes after a loop in which none is sought
+EVERY = 5  # new keyframes that are compared together, at least
+# A search is given EVERY keyframes of time, and one for each GROWTH keyframes of the map, whose adjustment takes longer
+# the larger the map is.
+GROWTH = 20
 NEAR_SHARED = 60  # landmarks that keyframes share whose relation a loop preserves
-# A loop is undone if the adjusted map contradicts more of the connected observations, or of those from before.
-LARGEST_LOSS, LARGEST_DAMAGE = 0.5, 0.08
+
+
+@dataclass(frozen=True)
+class _Search:
+    """A search for a loop that is in progress.
+
+    Attributes:
+        tracking: The tracking whose map is searched.
+        copy: A copy of the map.
+        due: Number of keyframes at which the result is taken.
+        result: The copy after it was adjusted, or None without a loop; and whether a loop was found.
+    """
+
+    tracking: Tracking
+    copy: LandmarkMap
+    due: int
+    result: Future[tuple[LandmarkMap | None, bool]]
 
 
 class LoopClosing:
     """Closes the loops of a map while it grows.
 
+    A thread searches a copy of the map. If there is a loop, it adjusts the copy, and the map then moves like that.
+
     Args:
-        index: Finds keyframes that look alike.
         seed: Seed of RANSAC.
+        waits: Whether the result of a search is taken at a certain keyframe, even if tracking has to wait for it, so
+            that results can be reproduced. Otherwise it is taken at the first keyframe at which it is there.
 
     Attributes:
         closed: Number of loops that were closed.
-        undone: Number of loops that were undone because the adjusted map contradicted them.
+        undone: Number of loops that were not closed because the adjusted map contradicted them.
     """
 
-    def __init__(self, index: PlaceIndex, seed: int) -> None:
+    def __init__(self, seed: int, waits: bool = True) -> None:
         self.closed = self.undone = 0
-        self._index = index
-        self._seed = seed
-        self._found: list[tuple[int, Recognition]] = []  # with the number of keyframes by then
-        self._pause_until = 0
-        self._of: Tracking | None = None  # the tracking of the recognitions
+        self._waits = waits
+        self._detection = LoopDetection(seed)
+        self._thread = ThreadPoolExecutor(1, "loops")
+        self._search: _Search | None = None
+        self._tracking: Tracking | None = None
+        self._since = 0  # the first keyframe that has not been compared
 
-    def attempt(self, tracking: Tracking) -> bool:
-        """Compare the last keyframe with older ones that it shares no landmarks with, and close a loop.
+    def at_keyframe(self, tracking: Tracking) -> None:
+        """Take the result of a search that is due, and begin the next one. The last frame is a keyframe."""
+        search, count = self._search, len(tracking.map.keyframes)
+        if search is not None:
+            waits = search.tracking is tracking and count < search.due if self._waits else not search.result.done()
+            if waits:
+                return
+            self._take(search, tracking)
+        if tracking is not self._tracking:
+            self._tracking, self._since = tracking, count - 1
+            self._thread.submit(self._detection.begin_anew)
+        if count - max(self._since, YOUNGEST + 1) >= EVERY:
+            self._begin(tracking)
 
-        Returns:
-            Whether a loop was closed.
-        """
-        landmarks = tracking.map
-        count = len(landmarks.keyframes)
-        if tracking is not self._of:
-            self._of, self._pause_until = tracking, 0
-            self._found.clear()
-        if count < max(self._pause_until, YOUNGEST + 2):
-            return False
-        by = landmarks.keyframes[-1]
-        seen = np.zeros(len(landmarks.known), dtype=bool)
-        seen[by.ids[landmarks.known[by.ids]]] = True
-        old = [each for each in landmarks.keyframes[:-YOUNGEST] if seen[each.ids].sum() < SHARED]
-        if not old:
-            return False
-        likeness = self._index.likeness(by, old)
-        self._found = [each for each in self._found if count - each[0] <= REMEMBERED]
-        for at in np.argsort(-likeness, kind="stable")[:CANDIDATES]:
-            if likeness[at] < LEAST_LIKENESS:
-                break
-            found = recognised(landmarks, old[at], landmarks, by, self._seed)
-            if found is None or _offset(found) * landmarks.lens.focal < NOTABLE:
-                continue
-            self._found.append((count, found))
-            same = agreeing([each for _, each in self._found], found)
-            if len({each.by.number for each in same}) >= AGREEING:
-                self._found.clear()
-                self._pause_until = count + PAUSE
-                return self.close(tracking, same)
-        return False
+    def begin_anew(self) -> None:
+        """Drop a search in progress, because its map has been joined with another one."""
+        self._tracking = None
 
-    def close(self, tracking: Tracking, found: Sequence[Recognition]) -> bool:
-        """Close a loop, and undo that if the adjusted map contradicts it.
+    def finish(self, tracking: Tracking) -> None:
+        """Search the last keyframes too. There are no more frames."""
+        if self._search is not None:
+            self._take(self._search, tracking)
+        if tracking is self._tracking and self._since < len(tracking.map.keyframes):
+            self._take(self._begin(tracking), tracking)
+        self._thread.shutdown()
 
-        Args:
-            tracking: The tracking, whose last frame is the last keyframe.
-            found: Recognitions that agree.
+    def _begin(self, tracking: Tracking) -> _Search:
+        copy, since = tracking.map.copy(), self._since
+        self._since = count = len(copy.keyframes)
+        result = self._thread.submit(self._searched, copy, since)
+        self._search = _Search(tracking, copy, count + EVERY + count // GROWTH, result)
+        return self._search
 
-        Returns:
-            Whether the loop is closed.
-        """
-        landmarks, motion = tracking.map, tracking.motion
-        before = landmarks.state()
-        place = {keyframe.number: k for k, keyframe in enumerate(landmarks.keyframes)}
-        links = [Link(place[each.of.number], place[each.by.number], _relation(each)) for each in found]
-        depth = float(np.median([each.depth for each in found]))
-        poses = [keyframe.T_camera_world for keyframe in landmarks.keyframes]
-        tracking.move(closed_loop(poses, connected_keyframes(landmarks), links, depth))
-        observed = sum(len(keyframe.ids) for keyframe in landmarks.keyframes)
-        made = connect(landmarks, found)
-        tracking.settle()
-        kept = sum(int(np.isin(ids, keyframe.ids).sum()) for keyframe, ids in made)
-        remaining = sum(len(keyframe.ids) for keyframe in landmarks.keyframes) - kept
-        loss = 1.0 - kept / max(1, sum(len(ids) for _, ids in made))
-        if loss > LARGEST_LOSS or remaining < (1.0 - LARGEST_DAMAGE) * observed:
-            landmarks.restore(before)
-            tracking.motion = motion
+    def _searched(self, landmarks: LandmarkMap, since: int) -> tuple[LandmarkMap | None, bool]:
+        """What the thread does."""
+        found = self._detection.search(landmarks, since)
+        return (closed_map(landmarks, found), True) if found else (None, False)
+
+    def _take(self, search: _Search, tracking: Tracking) -> None:
+        """Wait for the result of a search and take it, unless the map has been joined or has another camera since."""
+        self._search = None
+        after, found = search.result.result()
+        if search.tracking is not tracking or self._tracking is not tracking:
+            self._tracking = None
+            return
+        for keyframe, copy in zip(tracking.map.keyframes, search.copy.keyframes, strict=False):
+            if keyframe.described is None and copy.described is not None:
+                keyframe.described, keyframe.described_ids = copy.described, np.full_like(copy.described_ids, -1)
+        if tracking.map.lens is not search.copy.lens:
+            return
+        if after is not None:
+            tracking.revise(search.copy, after)
+            self.closed += 1
+        elif found:
             self.undone += 1
-            return False
-        self.closed += 1
-        return True
+
+
+def closed_map(landmarks: LandmarkMap, found: Sequence[Recognition]) -> LandmarkMap | None:
+    """Close a loop in a copy of a map.
+
+    Args:
+        landmarks: The map.
+        found: Recognitions that agree.
+
+    Returns:
+        The adjusted copy; None if it contradicts the loop.
+    """
+    place = {keyframe.number: k for k, keyframe in enumerate(landmarks.keyframes)}
+    links = [Link(place[each.of.number], place[each.by.number], _relation(each)) for each in found]
+    depth = float(np.median([each.depth for each in found]))
+    poses = [keyframe.T_camera_world for keyframe in landmarks.keyframes]
+    after = landmarks.copy()
+    after.move(closed_loop(poses, connected_keyframes(landmarks), links, depth))
+    return after if connected(after, found, apart=True) else None
 
 
 def connected_keyframes(landmarks: LandmarkMap) -> list[tuple[int, int]]:
@@ -129,13 +153,6 @@ def connected_keyframes(landmarks: LandmarkMap) -> list[tuple[int, int]]:
     shared = seen @ seen.T
     pairs = np.argwhere(np.triu(shared >= NEAR_SHARED, 2)).tolist()
     return [*((k, k + 1) for k in range(len(seen) - 1)), *((int(a), int(b)) for a, b in pairs)]
-
-
-def _offset(found: Recognition) -> float:
-    """Approximate motion of the picture, in focal lengths, from where the map has `by` to where it was recognised."""
-    off = found.T_camera_world @ inverse_se3(found.by.T_camera_world)
-    turn = float(np.arccos(np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-    return turn + float(np.linalg.norm(off[:3, 3])) / found.depth
 
 
 def _relation(found: Recognition) -> NDArray[np.float64]:

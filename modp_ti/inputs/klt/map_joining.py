@@ -7,19 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.klt.frame import LocalisedFrame
-from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.klt.localisation import searched
+from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.place_recognition import PlaceIndex
 from modp_ti.inputs.klt.recognition import Recognition, agreeing, recognised
-from modp_ti.inputs.klt.relocalisation import described_keyframe, inherited, world_points
+from modp_ti.inputs.klt.relocalisation import described_keyframe, world_points
 from modp_ti.inputs.klt.tracking import Tracking
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
-__all__ = ["MapJoining", "connect", "inverse_similarity", "joint_similarity"]
+__all__ = ["MapJoining", "inverse_similarity", "joint_similarity"]
 
 CANDIDATES = 3  # keyframes of another map with which a keyframe is compared
 AGREEING = 3  # keyframes that must agree
+PAUSE = 5  # keyframes after a join that was refused in which none is sought
 MAX_ERROR_3D = 0.05  # of corresponding points, relative to their depth
 MAX_ERROR = 5.0  # px
 
@@ -28,13 +27,17 @@ class MapJoining:
     """Finds out which map shows the place of the map that is being tracked.
 
     Args:
-        index: Finds keyframes that look alike.
-        seed: Seed of RANSAC.
+        seed: Seed of RANSAC and of the vocabulary.
+
+    Attributes:
+        refused: Number of joins that the joint map contradicted.
     """
 
-    def __init__(self, index: PlaceIndex, seed: int) -> None:
-        self._index = index
+    def __init__(self, seed: int) -> None:
+        self.refused = 0
+        self._index = PlaceIndex(seed)
         self._seed = seed
+        self._pause: tuple[Tracking, int] | None = None  # a map, and its number of keyframes until which it rests
         self._found: list[tuple[Tracking, Tracking, Recognition]] = []
 
     def found(self, active: Tracking, others: Sequence[Tracking]) -> tuple[Tracking, list[Recognition]] | None:
@@ -44,6 +47,8 @@ class MapJoining:
             The other map with at least AGREEING recognitions that agree; None if there is none.
         """
         by = active.map.keyframes[-1]
+        if self._pause is not None and active is self._pause[0] and len(active.map.keyframes) < self._pause[1]:
+            return None
         candidates = [(other, keyframe) for other in others for keyframe in other.map.keyframes]
         if not candidates:
             return None
@@ -60,6 +65,11 @@ class MapJoining:
                 self._found.clear()  # the maps change
                 return other, same
         return None
+
+    def refuse(self, active: Tracking) -> None:
+        """Note that the joint map contradicted what was found, so that the same is not found again at once."""
+        self.refused += 1
+        self._pause = active, len(active.map.keyframes) + PAUSE
 
 
 def joint_similarity(
@@ -104,29 +114,6 @@ def joint_similarity(
         return count
 
     return max(candidates, key=fitting)
-
-
-def connect(landmarks: LandmarkMap, found: Sequence[Recognition]) -> list[tuple[Keyframe, NDArray[np.int64]]]:
-    """Let keyframes observe the landmarks of the keyframes that they recognise, in one map and one world.
-
-    Returns:
-        The keyframes with the ids (N,) of their new observations.
-    """
-    place = {keyframe.number: k for k, keyframe in enumerate(landmarks.keyframes)}
-    made = []
-    for each in found:
-        of, by = place[each.of.number], place[each.by.number]
-        keyframe = each.by
-        T = keyframe.T_camera_world
-        frame = LocalisedFrame(keyframe.number, keyframe.grey, None, keyframe.ids, keyframe.pixels, T_camera_world=T)
-        before = len(frame.ids)
-        frame.append(*inherited(landmarks, of, described_keyframe(keyframe), each.pairs, T))
-        frame.append(*searched(landmarks, frame))
-        ids, pixels = frame.ids[before:], frame.pixels[before:]
-        keyframe.append(ids, pixels, landmarks.lens.rays(pixels))
-        landmarks.note_observations(by, ids, pixels)
-        made.append((keyframe, ids))
-    return made
 
 
 def inverse_similarity(S: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,8 +15,8 @@ from modp_ti.inputs.klt.initialisation import Initialisation
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.loop_closing import LoopClosing
-from modp_ti.inputs.klt.map_joining import MapJoining, connect, inverse_similarity, joint_similarity
-from modp_ti.inputs.klt.place_recognition import PlaceIndex
+from modp_ti.inputs.klt.map_connection import connected
+from modp_ti.inputs.klt.map_joining import MapJoining, inverse_similarity, joint_similarity
 from modp_ti.inputs.klt.tracking import Tracking, View
 
 __all__ = ["Odometry"]
@@ -50,7 +50,8 @@ class Odometry:
             known one.
         begins_anew_after: Number of frames without a pose after which another map may begin; None for never.
         loops: Whether loops are closed.
-        waits: Whether the frames of the first map wait until it has enough keyframes or frames to be the run's.
+        waits: Whether the frames of the first map wait until it has enough keyframes or frames to be the run's, and
+            whether tracking waits for a loop that is closed at a certain keyframe. Otherwise results depend on time.
         place: Place by size, from 1, of the map that becomes the run's when all frames are tracked; None for the first
             one that has enough keyframes or frames, while they are tracked.
 
@@ -76,9 +77,8 @@ class Odometry:
         self._waits = waits and begins_anew_after is not None
         self._place = place
         self._seed = seed
-        index = PlaceIndex(seed)
-        self._joining = MapJoining(index, seed)
-        self._loops = LoopClosing(index, seed) if loops else None
+        self._joining = MapJoining(seed)
+        self._loops = LoopClosing(seed, waits) if loops else None
         self._maps: list[_Submap] = []
         self._active: _Submap | None = None
         self._run: _Submap | None = None
@@ -102,6 +102,11 @@ class Odometry:
     def unsolved(self) -> int:
         """Number of bundle adjustments for which Ceres found no usable solution."""
         return sum(each.tracking.map.unsolved for each in self._maps)
+
+    @property
+    def undone(self) -> int:
+        """Number of loops and joins that adjustment contradicted."""
+        return self._joining.refused + (0 if self._loops is None else self._loops.undone)
 
     @property
     def waiting(self) -> list[list[int]]:
@@ -143,13 +148,20 @@ class Odometry:
         return self._placed(submap, views)
 
     def finish(self) -> list[View]:
-        """Choose the map of the wanted place, or the largest, if none has become the run's. Returns its views."""
+        """Choose the map of the wanted place, or the largest, if none has become the run's, and close its last loops.
+
+        Returns:
+            Its views.
+        """
         ranked = self._ranked()
         self.places = len(ranked)
-        place = self._place or 1
-        if self._run is not None or place > len(ranked):
-            return []
-        self._run = ranked[place - 1]
+        if self._run is None:
+            place = self._place or 1
+            if place > len(ranked):
+                return []
+            self._run = ranked[place - 1]
+        if self._loops is not None:
+            self._loops.finish(self._run.tracking)
         return self._released()
 
     def _ranked(self) -> list[_Submap]:
@@ -179,7 +191,7 @@ class Odometry:
         if views[-1].number == views[-1].keyframe.number:
             self._join(submap)
             if self._loops is not None and submap is self._active:
-                self._loops.attempt(submap.tracking)
+                self._loops.at_keyframe(submap.tracking)
         assert self._active is not None
         if self._run is None and self._place is None and (not self._waits or self._is_established(self._active)):
             self._run = self._active
@@ -201,7 +213,10 @@ class Odometry:
         return views
 
     def _join(self, active: _Submap) -> None:
-        """Join the map that is tracked with another one, if its last keyframe completes the evidence."""
+        """Join the map that is tracked with another one, if its last keyframe completes the evidence.
+
+        Nothing changes if the joint map contradicts that.
+        """
         others = [each for each in self._maps if each is not active]
         found = self._joining.found(active.tracking, [each.tracking for each in others])
         if found is None:
@@ -213,10 +228,16 @@ class Odometry:
         stays, goes = other, active
         if active is self._run or (other is not self._run and self._maps.index(active) < self._maps.index(other)):
             stays, goes, S = active, other, inverse_similarity(S)
+        joint = stays.tracking.map.copy()
+        joint.absorb(goes.tracking.map.copy(), S)
+        if not connected(joint, recognitions):
+            self._joining.refuse(active.tracking)
+            return
         offset = stays.tracking.absorb(goes.tracking, S, follows=goes is active)
+        stays.tracking.map.adopt(joint)
         stays.waiting += [replace(view, ids=view.ids + offset) for view in goes.waiting]
-        connect(stays.tracking.map, recognitions)
-        stays.tracking.settle()
+        if self._loops is not None:
+            self._loops.begin_anew()
         self._maps.remove(goes)
         self._active = stays
         self.joined += 1

@@ -241,6 +241,8 @@ class KltTracker(Tracker):
             )
         if self._odometry.loops:
             self._notes.append(f"klt closed {self._odometry.loops} loops")
+        if self._odometry.undone:
+            self._notes.append(f"klt undid {self._odometry.undone} loops or joins, which the adjusted map contradicted")
         if self._estimated_from:
             self._notes.append(estimation_note(self.intrinsics, self._estimated_from))
         placed = {frame.name for frame in self._trajectory.frames} | set(self._unreadable)

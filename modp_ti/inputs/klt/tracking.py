@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from modp_ti.inputs.klt.camera_refinement import CameraRefinement, is_plausible
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, realigned, searched
+from modp_ti.inputs.klt.map_revision import carry_over
 from modp_ti.inputs.klt.relocalisation import alike_keyframes, inherited, place_by_features, thumbnail
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.reprojection import refine_pose
@@ -267,10 +268,10 @@ class Tracking:
     def _refine_camera_in_use(self) -> None:
         """Refine the camera, and undo that if the result is implausible. The last refinement makes it final."""
         assert self._refinement is not None
-        before = self.map.state()
+        before = self.map.copy()
         self.refine_camera()
         if not is_plausible(self.map.lens):
-            self.map.restore(before)
+            self.map.adopt(before)
         if len(self.map.keyframes) >= self._refinement.at[-1]:
             self._refinement = None
 
@@ -321,18 +322,17 @@ class Tracking:
                 self._last.ids = self._last.ids + offset
         return offset
 
-    def move(self, moves: Sequence[NDArray[np.float64]]) -> None:
-        """Move the map, whose last keyframe is the last frame, by a similarity S_after_before (4, 4) per keyframe."""
-        self.map.move(moves)
+    def revise(self, before: LandmarkMap, after: LandmarkMap) -> None:
+        """Take the adjustment of an earlier copy of the map, when the last frame is a keyframe or there are no more.
+
+        Args:
+            before: The copy.
+            after: The copy after its adjustment.
+        """
+        moves = carry_over(self.map, before, after)
         self.motion = self.motion.copy()
         self.motion[:3, 3] *= float(scale_of(moves[-1]))
-
-    def settle(self) -> None:
-        """Bundle adjust the whole map, after it has absorbed another one or closed a loop."""
-        every = range(len(self.map.keyframes))
-        for _ in range(2):
-            self.map.adjust(every, steps=10)
-            self.map.discard_outliers(every)
+        self._wide_is_due = True
 
     # ------------------------------------------------------------------------------------------------- gaps
 

@@ -12,7 +12,9 @@ from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.klt.map_joining import MapJoining
 from modp_ti.inputs.klt.odometry import Odometry
+from modp_ti.inputs.klt.recognition import Recognition
 from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.multiview.reprojection import ray_errors
 from modp_ti.outputs.evaluation import umeyama
@@ -60,6 +62,33 @@ def test_a_map_begun_after_a_cut_is_joined_when_it_shows_the_first_ones_place(bo
     assert errors(odometry, views, truth).max() < 0.03
     late = max(len(each) for each in brought[10:])
     assert late >= 10, "the frames of the second map come when it is joined"
+    if not turned_first:
+        _, again, _ = processed(box_room, greys)
+        assert all(views[i].T_camera_world.tobytes() == again[i].T_camera_world.tobytes() for i in truth)
+
+
+@pytest.mark.slow
+def test_a_join_that_the_map_contradicts_leaves_both_maps_as_they_are(box_room, box_walk, monkeypatch):
+    tried = []
+
+    def wrong(_, active, others):
+        if not others or len(active.map.keyframes) < 5 or tried:
+            return None
+        of, pairs = others[0].map.keyframes[0], np.c_[np.arange(40), np.arange(40)]
+        tried[:] = [Recognition(of, by, pairs, np.eye(4), of.T_camera_world, 1.0) for by in active.map.keyframes[-3:]]
+        return others[0], list(tried)
+
+    other = replace(box_room, textures={wall: sheet[::-1].copy() for wall, sheet in box_room.textures.items()})
+    greys = [*box_walk.grey[:30], *[BLACK] * 8, *(other.grey(T) for T in box_walk.poses[:30])]
+    results = []
+    for found in (lambda *_: None, wrong):
+        monkeypatch.setattr(MapJoining, "found", found)
+        odometry, views, _ = processed(box_room, greys)
+        apart = [view.T_camera_world for submap in odometry._maps for view in submap.waiting]
+        results.append([*(views[i].T_camera_world for i in sorted(views)), *apart])
+        assert odometry.joined == 0 and odometry.undone == (1 if tried else 0)
+    assert tried
+    assert [T.tobytes() for T in results[0]] == [T.tobytes() for T in results[1]]
 
 
 @pytest.mark.slow
