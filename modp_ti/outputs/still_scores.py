@@ -14,7 +14,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from pipelines.pipeline import Pipeline
 from pipelines.transients.evidence import CoarseView, moving
 from pipelines.transients.masks import soft_mask
-from pipelines.transients.sweep import compared, neighbours, place_of
+from pipelines.transients.sweep import compared, neighbours, place_of, without
 
 __all__ = ["StillScore", "StillScorer"]
 
@@ -62,7 +62,8 @@ class StillScorer:
         self._coarse: list[CoarseView] = []
         for view in self._views:
             T, exposure = version.trajectory[view.index], version.exposures[view.index]
-            self._coarse.append(compared(pipeline.renderer, view, T, exposure, pipeline.near))
+            coarse = compared(pipeline.renderer, view, T, exposure, pipeline.near)
+            self._coarse.append(without(coarse, view.transient))
 
     def score(self, frame: TrackedFrame) -> StillScore:
         """Score a frame. The renderer's images are overwritten."""

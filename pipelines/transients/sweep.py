@@ -21,7 +21,10 @@ __all__ = ["TransientSweep", "compared", "neighbours", "place_of", "without"]
 # been optimised too little, and are only asked about the others.
 WINDOW, EVERY, YOUNG = 48, 8, 4
 # Distances of the neighbours in the order of the keyframes: near ones see the same surfaces, far ones another moment.
-DISTANCES = (2, 3, 5, 7, 10, 13, 17, 21, 26, 31)
+# FAR others are spread over all keyframes, for cameras that come back.
+DISTANCES, FAR = (2, 3, 5, 7, 10, 13, 17, 21, 26, 31), 16
+# Rounds of a sweep. Cells that one round masks do not vote in the next.
+ROUNDS = 2
 
 
 def compared(
@@ -50,8 +53,9 @@ def compared(
 
 def neighbours(place: int, count: int) -> list[int]:
     """Return the places of the neighbours of a view among `count` keyframes; `place` may lie between two of them."""
-    both = [place + sign * distance for distance in DISTANCES for sign in (-1, 1)]
-    return [other for other in both if 0 <= other < count]
+    both = {place + sign * distance for distance in DISTANCES for sign in (-1, 1)}
+    both |= {other * count // FAR for other in range(FAR) if abs(other * count // FAR - place) > 1}
+    return sorted(other for other in both if 0 <= other < count)
 
 
 class TransientSweep:
@@ -88,9 +92,15 @@ class TransientSweep:
         if len(self.gaussians) == 0:
             return
         coarse = [compared(self.renderer, view, view.T_camera_world, view.exposure, near) for view in views]
-        for place, view in enumerate(views[: len(views) - young]):
-            others = [coarse[other] for other in neighbours(place, len(views))]
-            mask = soft_mask(*moving(coarse[place], others, kept=True), before=view.transient)
+        masks = [view.transient for view in views]
+        for _ in range(ROUNDS):
+            voters = [without(c, mask) for c, mask in zip(coarse, masks, strict=True)]
+            for place, view in enumerate(views[: len(views) - young]):
+                others = [voters[other] for other in neighbours(place, len(views))]
+                masks[place] = soft_mask(*moving(coarse[place], others, kept=True), before=view.transient)
+            if not any(mask is not None for mask in masks):
+                break
+        for view, mask in zip(views, masks, strict=True):
             if mask is not None or view.transient is not None:
                 self.keyframes.mask(view, mask)
         self._remove(views, coarse)

@@ -40,10 +40,14 @@ def test_nothing_is_masked_in_a_still_room() -> None:
     assert all(view.transient is None for view in mapper.keyframes)
 
 
-def test_neighbours_are_other_keyframes() -> None:
-    assert sorted(neighbours(0, 9)) == [2, 3, 5, 7]
-    assert sorted(neighbours(4, 9)) == [1, 2, 6, 7]
-    assert all(place not in neighbours(place, 100) for place in range(100))
+def test_neighbours_are_other_keyframes_near_and_far() -> None:
+    for count in (1, 2, 9, 40, 200):
+        for place in range(count):
+            found = neighbours(place, count)
+            assert len(set(found)) == len(found) <= 36
+            assert all(0 <= other < count and abs(other - place) > 1 for other in found)
+    far = neighbours(0, 200)
+    assert np.diff(far).max() <= 13 and far[-1] >= 187
 
 
 def test_a_frame_between_keyframes_has_the_place_of_the_next() -> None:
