@@ -103,6 +103,8 @@ class OnlineMapper(OnlineMap):
         psnr = self.optimise(plan.steps, level)
         with self.stopwatch.measure("remove"):
             self.hidden.sweep(plan.swept, self.near)
+            if self.transients is not None:
+                self.transients.after_keyframe(self.near)
         return psnr, plan.steps
 
     def _draw_level(self, view: Keyframe) -> int:
@@ -190,6 +192,8 @@ class OnlineMapper(OnlineMap):
         Returns:
             Mean PSNR of the last step; None if nothing was optimised.
         """
+        if self.settled == 0:
+            self.mask_transients()
         order = np.argsort(np.arange(len(self.keyframes)) * GOLDEN_RATIO % 1.0)
         total = self.pace.last_views(len(order)) if len(self.gaussians) else 0
         views = np.resize(order, total)

@@ -25,6 +25,7 @@ from pipelines.select.keyframes import KeyframeSelector
 from pipelines.select.views import LocalGlobalViews, ViewSelection
 from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
+from pipelines.transients.sweep import TransientSweep
 
 __all__ = ["OnlineMap"]
 
@@ -44,6 +45,7 @@ class OnlineMap(Pipeline):
     Attributes:
         frame_count: Number of frames processed so far.
         settled: Number of views that `finish` has optimised since the last frame.
+        transients: Masks what moves; None if the settings disable it.
     """
 
     can_be_refined: ClassVar[bool] = True
@@ -74,6 +76,7 @@ class OnlineMap(Pipeline):
         self.budget = self.densifier.budget
         contribution = Contribution(self.gaussians, self.renderer)
         self.hidden = HiddenGaussians(contribution, self.densifier, settings.densify.min_contribution)
+        self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer) if settings.transients else None
         self.pace = pace or CompletePace(settings)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self.corrector = MapCorrector(self.keyframes, self.densifier)
@@ -96,6 +99,12 @@ class OnlineMap(Pipeline):
             Number of Gaussians removed.
         """
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
+
+    def mask_transients(self) -> None:
+        """Mask what moves in all keyframes, and remove its Gaussians. Does nothing if the settings disable it."""
+        if self.transients is not None:
+            with self.stopwatch.measure("remove"):
+                self.transients.sweep(list(self.keyframes), self.near)
 
     def caught(self) -> Safeguards:
         """Return the safeguards' counts so far. Waits for the device."""

@@ -19,6 +19,7 @@ from pipelines.render.renderer import Renderer
 from pipelines.settings import RefineSettings
 from pipelines.state import MapState
 from pipelines.stopwatch import Stopwatch
+from pipelines.transients.sweep import TransientSweep
 
 __all__ = ["FrameReport", "NothingToMapError", "Pipeline"]
 
@@ -64,6 +65,8 @@ class Pipeline(ABC):
     renderer: Renderer
     loss: PhotometricLoss
     stopwatch: Stopwatch
+    transients: TransientSweep | None = None
+    """Masks what moves; None if it is not masked."""
 
     @property
     @abstractmethod

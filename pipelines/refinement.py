@@ -81,6 +81,8 @@ def refine(
         schedule = in_steps(settings.steps) if settings.seconds is None else in_seconds(settings.seconds)
     step, share = done, schedule(done)
     removes = settings.min_contribution > 0 and not (by_the_clock and len(store) > MOST_SWEPT)
+    if not done and share is not None:
+        mapper.mask_transients()
     if removes and not done and share is not None:
         with mapper.stopwatch.measure("refine"):
             mapper.hidden.remove(settings.min_contribution, mapper.near)

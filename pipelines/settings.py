@@ -345,6 +345,7 @@ class MappingSettings(StrictModel):
         gt=0,
         description="longest time from a frame's arrival to the map that holds it, for `pace: realtime` [s]",
     )
+    transients: bool = Field(default=False, description="mask what moves in keyframes, and score without it as well")
     gate: GateSettings = GateSettings()
     keyframes: KeyframeSettings = KeyframeSettings()
     densify: DensifySettings = DensifySettings()

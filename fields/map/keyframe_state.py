@@ -30,6 +30,7 @@ NUMBERS: dict[str, tuple[int, ...]] = {
 FIELDS = {"lag": "pending_motion"}
 WHOLE = ("index", "pose_steps", "exposure_steps")
 POINTS = {"xyz": 3, "pixels": 2}
+NO_MASK = np.zeros((0, 0), dtype=np.uint8)
 
 
 def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
@@ -41,7 +42,8 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
     Returns:
         One array per field of `NUMBERS`, `exposure` and `is_between`, with one row per keyframe. The rows of `exposure`
         are NaN for keyframes without one. `points` holds the number of tracked points of each keyframe; `xyz` (P, 3),
-        `pixels` (P, 2) and `ids` (P,) hold the points of all keyframes, concatenated.
+        `pixels` (P, 2) and `ids` (P,) hold the points of all keyframes, concatenated. If anything moves, `transient`
+        holds the masks of all keyframes, concatenated, and `transient_size` (N, 2) their sizes, 0 without a mask.
     """
     views = list(store)
     arrays = {
@@ -59,6 +61,10 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
         parts = [getattr(view.points, name) for view in views]
         arrays[name] = np.concatenate([*parts, np.zeros((0, width))])
     arrays["ids"] = np.concatenate([*(view.points.ids for view in views), np.zeros(0, dtype=np.int64)])
+    masks = [NO_MASK if view.transient is None else view.transient for view in views]
+    if any(mask.size for mask in masks):
+        arrays["transient"] = np.concatenate([mask.ravel() for mask in masks])
+        arrays["transient_size"] = np.array([mask.shape for mask in masks], dtype=np.int64)
     return arrays
 
 
@@ -90,6 +96,12 @@ class KeyframeRows:
         total = int(arrays["points"].sum())
         if arrays["points"].shape != (count,) or (arrays["points"] < 0).any() or len(arrays["ids"]) != total:
             raise ValueError(f"{len(arrays['ids'])} tracked points, {total} are announced")
+        self._masks = arrays.get("transient", NO_MASK.ravel())
+        self._mask_size = arrays.get("transient_size", np.zeros((count, 2), dtype=np.int64))
+        areas = self._mask_size.prod(axis=-1)
+        if self._mask_size.shape != (count, 2) or (self._mask_size < 0).any() or areas.sum() != len(self._masks):
+            raise ValueError(f"{len(self._masks)} pixels of masks of what moves, {areas.sum()} are announced")
+        self._first_mask = np.concatenate([[0], np.cumsum(areas)])
         self._arrays = arrays
         self._first = np.concatenate([[0], np.cumsum(arrays["points"])])
         self.rows = {int(index): row for row, index in enumerate(arrays["index"])}
@@ -116,3 +128,6 @@ class KeyframeRows:
         view.exposure = None if np.isnan(exposure).all() else np.array(exposure)
         own = slice(self._first[row], self._first[row + 1])
         view.points = SparsePoints(*(np.array(self._arrays[name][own]) for name in ("xyz", "pixels", "ids")))
+        mask = self._masks[self._first_mask[row] : self._first_mask[row + 1]].astype(np.uint8)
+        if mask.size:
+            store.mask(view, mask.reshape(self._mask_size[row]))

@@ -6,6 +6,7 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,7 +41,8 @@ class Keyframe:
 
     Attributes:
         index: Index of the frame.
-        rgba: Image (H, W, 4) uint8; the last channel is 255 at valid pixels.
+        rgba: Image (H, W, 4) uint8; the last channel is 255 at valid pixels, and between 0 and 255 at the edge of
+            what moves.
         camera: Camera of `rgba`.
         trajectory: The tracked poses of all frames.
         T_camera_world: Refined pose (4, 4).
@@ -61,6 +63,9 @@ class Keyframe:
             Gaussians have not followed yet.
         is_between: Whether it is a frame between keyframes. The map is optimised on it as on a keyframe, but gets only
             its tracked points.
+        transient: Weights (h, w) uint8 of the parts of the image that move, on a coarse grid: 0 where the image shows
+            something that moves, 255 elsewhere. None if nothing moves. `rgba` and `pyramid` contain them.
+        unmasked: The pyramid without these weights; empty if nothing moves.
     """
 
     index: int
@@ -82,6 +87,8 @@ class Keyframe:
     exposure_steps: int = 0
     pending_motion: NDArray[np.float64] = field(default_factory=lambda: NO_MOTION)
     is_between: bool = False
+    transient: NDArray[np.uint8] | None = None
+    unmasked: tuple[ImageLevel, ...] = ()
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -96,6 +103,19 @@ class Keyframe:
     def image(self, level: int) -> ImageLevel:
         """Return the image of a pyramid level, or the coarsest one if there are fewer levels."""
         return self.pyramid[min(level, len(self.pyramid) - 1)]
+
+    def whole_image(self, level: int) -> ImageLevel:
+        """Return `image(level)` without the weights of `transient`."""
+        pyramid = self.unmasked or self.pyramid
+        return pyramid[min(level, len(pyramid) - 1)]
+
+    def mask(self, transient: NDArray[np.uint8] | None) -> None:
+        """Replace `transient`, and weight the images by it."""
+        whole = self.unmasked or self.pyramid
+        self.transient = transient
+        self.unmasked = () if transient is None else whole
+        self.pyramid = whole if transient is None else tuple(_weighted(image, transient) for image in whole)
+        self.rgba = self.pyramid[0].rgba
 
     def at_level(self, level: int) -> Keyframe:
         """Return a read-only copy of this view at a pyramid level."""
@@ -138,12 +158,14 @@ class Keyframe:
     def revise_camera(self, revision: CameraRevision, vignette: NDArray[np.float32] | None) -> None:
         """Take a new camera: the image with its pyramid, the vignette and the tracked points change with it.
 
-        The points keep their depths at the tracked pose. Those whose pixels leave the image are dropped.
+        The points keep their depths at the tracked pose. Those whose pixels leave the image are dropped, and so is the
+        mask of what moves.
 
         Args:
             revision: The new camera.
             vignette: The vignette of its images.
         """
+        self.mask(None)
         T, points, rgba = self.T_tracked, self.points, revision.image(self.rgba)
         there = revision.points(points.xyz @ T[:3, :3].T + T[:3, 3], self.camera)
         pixels = revision.pixels(points.pixels)
@@ -163,6 +185,15 @@ def _median_depth(points: SparsePoints, T_camera_world: NDArray[np.float64], oth
     depth = points.depths(T_camera_world)
     depth = depth[depth > 0]
     return float(np.median(depth)) if len(depth) else otherwise
+
+
+def _weighted(image: ImageLevel, weights: NDArray[np.uint8]) -> ImageLevel:
+    """Multiply the validity of an image by weights (h, w) of any size, 0 to 255."""
+    size = (image.camera.width, image.camera.height)
+    fine = np.asarray(cv2.resize(weights, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+    rgba = image.rgba.copy()
+    rgba[..., 3] = np.where(rgba[..., 3] == 255, fine, rgba[..., 3])
+    return ImageLevel(rgba, image.camera)
 
 
 def _nbytes(pyramid: tuple[ImageLevel, ...], points: SparsePoints) -> int:
@@ -253,6 +284,12 @@ class KeyframeStore:
                 revised[id(vignette)] = revision.vignette(vignette)
             keyframe.revise_camera(revision, None if vignette is None else revised[id(vignette)])
         self.nbytes = sum(_nbytes(keyframe.pyramid, keyframe.points) for keyframe in self._keyframes)
+
+    def mask(self, keyframe: Keyframe, transient: NDArray[np.uint8] | None) -> None:
+        """Replace the mask of what moves in a keyframe of the store, see `Keyframe.mask`."""
+        self.nbytes -= _nbytes(keyframe.unmasked, keyframe.points)
+        keyframe.mask(transient)
+        self.nbytes += _nbytes(keyframe.unmasked, keyframe.points)
 
     def take_in_depths(self) -> None:
         """Recompute `scene_depth` after median depths have changed."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -14,6 +14,7 @@ from fields.geometry.se3 import camera_centres
 from fields.map.keyframes import Keyframe
 from modp_ti.outputs.detail import explained_detail
 from modp_ti.outputs.lpips import Lpips
+from modp_ti.outputs.still_scores import StillScore, StillScorer
 from pipelines.optimise.losses import LossValues
 from pipelines.pipeline import Pipeline
 
@@ -64,6 +65,7 @@ class FrameScore:
         lpips: LPIPS, None if its weights are not available.
         detail: Share of the image's finest band that the render explains, see `explained_detail`. None if the image
             has no detail.
+        still: Scores without what moves; None if `mapping.transients` is off. They are not in `scores.csv`.
     """
 
     index: int
@@ -74,14 +76,24 @@ class FrameScore:
     ssim: float
     lpips: float | None
     detail: float | None = None
+    still: StillScore | None = None
 
 
 def summary(scores: Sequence[FrameScore]) -> dict[str, float | int | None]:
-    """Return the mean scores over the frames, as in metrics.json. A mean is None if there is nothing to average."""
+    """Return the mean scores over the frames, as in metrics.json. A mean is None if there is nothing to average.
+
+    If what moves was masked, `psnr_still` and `ssim_still` are the means without it, and `moving` is its share of the
+    images.
+    """
     means: dict[str, float | int | None] = {}
     for name, digits in (("psnr", 4), ("ssim", 5), ("lpips", 5), ("detail", 5)):
         known = [value for score in scores if (value := getattr(score, name)) is not None]
         means[name] = round(float(np.mean(known)), digits) if known and len(known) == len(scores) else None
+    still = [score.still for score in scores if score.still is not None]
+    if still:
+        means["psnr_still"] = round(float(np.mean([s.psnr for s in still])), 4)
+        means["ssim_still"] = round(float(np.mean([s.ssim for s in still])), 5)
+        means["moving"] = round(float(np.mean([s.moving for s in still])), 5)
     return means | {"count": len(scores)}
 
 
@@ -159,13 +171,18 @@ def evaluate(
         The scores, ordered by version.
     """
     scores: dict[str, list[FrameScore]] = {name: [] for name in versions}
+    still: dict[str, StillScorer] = {}
     frames = iter(frames)
     while batch := list(islice(frames, EVALUATED_TOGETHER)):
         for name, version in versions.items():
             pipeline.gaussians.load(version.gaussians)
+            if pipeline.transients is not None and name not in still:
+                still[name] = StillScorer(pipeline, version)
             for frame in batch:
                 T, exposure = version.trajectory[frame.index], version.exposures[frame.index]
                 score, render = score_frame(pipeline, frame, T, name, lpips, exposure)
+                if name in still:
+                    score = replace(score, still=still[name].score(frame))
                 scores[name].append(score)
                 rendered(name, frame, render)
     return [score for of in scores.values() for score in of]

@@ -15,7 +15,7 @@ from modp_ti.outputs.evaluation import FrameScore
 
 __all__ = ["read_scores", "write_scores"]
 
-COLUMNS = [field.name for field in dataclasses.fields(FrameScore)]
+COLUMNS = [field.name for field in dataclasses.fields(FrameScore) if field.name != "still"]
 # Columns of version 0.1.0, which had no `detail`.
 OLD_COLUMNS = COLUMNS[:-1]
 
@@ -30,7 +30,8 @@ def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> 
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for score in scores:
-            writer.writerow(int(v) if isinstance(v, bool) else v for v in dataclasses.astuple(score))
+            values = (getattr(score, name) for name in COLUMNS)
+            writer.writerow(int(v) if isinstance(v, bool) else v for v in values)
 
 
 def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:

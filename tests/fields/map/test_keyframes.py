@@ -139,3 +139,66 @@ def test_frames_between_keyframes_are_told_apart_also_after_they_were_saved() ->
     for index in range(5):
         rows.put(frame(index), old)
     assert len(old.selected) == 5 and old.latest == 4
+
+
+def masked_store() -> KeyframeStore:
+    """Three keyframes with a pyramid; of the middle one the left half is masked, and the last row is invalid."""
+    camera = PinholeCamera(80.0, 80.0, 32.0, 32.0, 64, 64)
+    valid = np.ones((64, 64), dtype=bool)
+    valid[-1] = False
+    store = KeyframeStore(levels=2)
+    for i in range(3):
+        image = np.full((64, 64, 3), 0.5, np.float32)
+        store.append(TrackedFrame(i, i / 30, f"{i}", image, camera, np.eye(4), frame(i).points, mask=valid))
+    mask = np.full((16, 16), 255, dtype=np.uint8)
+    mask[:, :8] = 0
+    store.mask(store[1], mask)
+    return store
+
+
+def test_a_mask_weights_every_level_of_the_image_and_can_be_lifted() -> None:
+    store = masked_store()
+    view, plain = store[1], store[0]
+    for level, width in ((0, 64), (1, 32)):
+        alpha, before = view.image(level).rgba[..., 3], plain.image(level).rgba[..., 3]
+        assert (alpha[:, : width // 2 - 4] == 0).all()
+        np.testing.assert_array_equal(alpha[:, width // 2 + 4 :], before[:, width // 2 + 4 :])
+        np.testing.assert_array_equal(view.image(level).rgba[..., :3], plain.image(level).rgba[..., :3])
+        assert view.whole_image(level) is view.unmasked[level]
+    assert view.rgba is view.image(0).rgba
+    assert (view.rgba[-1] == plain.rgba[-1]).all()  # invalid before, invalid now
+    store.mask(view, None)
+    assert view.transient is None and view.unmasked == ()
+    np.testing.assert_array_equal(view.rgba, plain.rgba)
+
+
+def test_a_mask_counts_towards_the_memory() -> None:
+    store = masked_store()
+    view = store[1]
+    with_mask = store.nbytes
+    store.mask(view, view.transient)  # again: not counted twice
+    assert store.nbytes == with_mask
+    store.mask(view, None)
+    assert with_mask - store.nbytes == sum(image.rgba.nbytes for image in view.pyramid)
+
+
+def test_masks_are_saved_and_restored() -> None:
+    store = masked_store()
+    arrays = keyframe_arrays(store)
+    again, rows = KeyframeStore(levels=2), KeyframeRows(arrays)
+    plain = KeyframeStore(levels=2)
+    for view in store:
+        whole = view.whole_image(0).rgba
+        image = (whole[..., :3] / 255).astype(np.float32)
+        source = TrackedFrame(view.index, 0.0, "", image, view.camera, np.eye(4), view.points, mask=whole[..., 3] > 0)
+        rows.put(source, again)
+        plain.append(source)
+    assert [view.transient is None for view in again] == [True, False, True]
+    for view, expected in zip(again, store, strict=True):
+        for level in range(2):
+            np.testing.assert_array_equal(view.image(level).rgba, expected.image(level).rgba)
+    assert again.nbytes == store.nbytes
+    assert "transient" not in keyframe_arrays(plain)
+    arrays["transient"] = arrays["transient"][1:]
+    with pytest.raises(ValueError, match="255 pixels of masks of what moves, 256 are announced"):
+        KeyframeRows(arrays)

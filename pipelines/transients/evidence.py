@@ -1,0 +1,172 @@
+"""What a view and its neighbours tell about things that move.
+
+A view shows something that moves where it differs from the map's render although the surface that the map has there is
+rendered rightly in most other views that see it. Where the other views are wrong too, the map is wrong: it is not
+optimised enough, or has kept a ghost of what moved. A ghost is recognised by the reverse: the view is right, and most
+others are wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3
+
+__all__ = ["Ballot", "CoarseView", "coarse_view", "moving", "votes"]
+
+# Width of the grid on which views are compared [cells].
+CELLS = 80
+# Standard deviation of the window in which differences are averaged [image widths]. Texture that is slightly out of
+# place averages to zero; something else does not.
+WINDOW = 0.01
+# Relative difference of depths below which two views show the same surface.
+SAME_DEPTH = 0.08
+# Opacity from which a render has a depth.
+MIN_OPACITY = 0.7
+# Difference from which a view is wrong [1 = white], and as a factor on its median difference. Half of it is right.
+WRONG, FACTOR = 0.06, 4.0
+# Number of other views that must see a surface, and the share of them that must agree.
+MIN_LOOKS, MAJORITY = 3, 0.65
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseView:
+    """A view compared with the map, on a coarse grid.
+
+    Attributes:
+        camera: Camera of the grid.
+        T_camera_world: Pose (4, 4).
+        difference: Magnitude (h, w) of the difference between render and image, averaged in a window [1 = white]; 0
+            where the image has no valid pixels.
+        depth: Rendered depth (h, w); 0 where it is unknown [scene units].
+        valid: Whether the image is valid (h, w).
+        wrong: Difference from which the view is wrong [1 = white]; half of it is right.
+    """
+
+    camera: PinholeCamera
+    T_camera_world: NDArray[np.float64]
+    difference: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    wrong: float
+
+
+def coarse_view(
+    render: NDArray[np.floating],
+    depth: NDArray[np.floating],
+    opacity: NDArray[np.floating],
+    rgba: NDArray[np.uint8],
+    camera: PinholeCamera,
+    T_camera_world: NDArray[np.float64],
+) -> CoarseView:
+    """Compare a render with its image.
+
+    Args:
+        render: Rendered and developed colour (H, W, 3).
+        depth: Composited depth (H, W), not divided by opacity.
+        opacity: Opacity (H, W).
+        rgba: Image (H, W, 4) with its mask in the last channel.
+        camera: Camera of the image.
+        T_camera_world: Pose (4, 4).
+    """
+    width = min(CELLS, camera.width)
+    size = (width, max(round(camera.height * width / camera.width), 1))
+    valid = rgba[..., 3] > 0
+    difference = np.clip(render, 0.0, 1.0).astype(np.float32) - rgba[..., :3] / np.float32(255.0)
+    difference[~valid] = 0.0
+    mean = cv2.GaussianBlur(difference, (0, 0), max(WINDOW * camera.width, 0.5))
+    magnitude = np.asarray(cv2.resize(np.abs(mean).mean(axis=2), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    solid = np.where(opacity >= MIN_OPACITY, depth / np.maximum(opacity, 1e-6), 0.0).astype(np.float32)
+    known = np.asarray(cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST), dtype=bool)
+    usual = float(np.median(magnitude[known])) if known.any() else 0.0
+    return CoarseView(
+        camera=camera.resized(*size),
+        T_camera_world=T_camera_world,
+        difference=magnitude,
+        depth=np.asarray(cv2.resize(solid, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32),
+        valid=known,
+        wrong=max(WRONG, FACTOR * usual),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Ballot:
+    """Votes of views about surface points.
+
+    Attributes:
+        looks: Number (N,) of views that see the point.
+        right: Number (N,) of them in which its render is right.
+        wrong: Number (N,) of them in which it is wrong.
+    """
+
+    looks: NDArray[np.int64]
+    right: NDArray[np.int64]
+    wrong: NDArray[np.int64]
+
+    @property
+    def mostly_right(self) -> NDArray[np.bool_]:
+        """Whether enough views see the point (N,) and most are right."""
+        return (self.looks >= MIN_LOOKS) & (self.right >= MAJORITY * self.looks)
+
+    @property
+    def mostly_wrong(self) -> NDArray[np.bool_]:
+        """Whether enough views see the point (N,) and most are wrong."""
+        return (self.looks >= MIN_LOOKS) & (self.wrong >= MAJORITY * self.looks)
+
+
+def votes(xyz: NDArray[np.float64], views: Sequence[CoarseView]) -> Ballot:
+    """Ask views whether surface points are rendered rightly in them.
+
+    Args:
+        xyz: Points (N, 3) in the world frame.
+        views: The views.
+    """
+    looks, right, wrong = np.zeros((3, len(xyz)), dtype=np.int64)
+    for view in views:
+        there = xyz @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+        seen = np.flatnonzero(there[:, 2] > 0)
+        pixels = view.camera.project(there[seen])
+        inside = view.camera.contains(pixels)
+        seen = seen[inside]
+        column, row = pixels[inside].astype(np.int64).T
+        z = there[seen, 2]
+        same = view.valid[row, column] & (np.abs(view.depth[row, column] - z) < SAME_DEPTH * z)
+        seen, difference = seen[same], view.difference[row[same], column[same]]
+        looks[seen] += 1
+        right[seen] += difference < 0.5 * view.wrong
+        wrong[seen] += difference >= view.wrong
+    return Ballot(looks, right, wrong)
+
+
+def moving(view: CoarseView, others: Sequence[CoarseView], kept: bool) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Decide where a view shows something that moves.
+
+    Args:
+        view: The view.
+        others: Other views of the same surfaces, from other times.
+        kept: Whether the map was optimised on the view, so that it may contain ghosts of what moved there.
+
+    Returns:
+        Two masks (h, w): where it is certain, and where it is likely. The second contains the first.
+    """
+    certain = np.zeros(view.depth.shape, dtype=bool)
+    likely = certain.copy()
+    row, column = np.nonzero(view.valid & (view.depth > 0))
+    pixels = np.stack([column + 0.5, row + 0.5], axis=1)
+    T_world_camera = inverse_se3(view.T_camera_world)
+    there = view.camera.unproject(pixels, view.depth[row, column])
+    ballot = votes(there @ T_world_camera[:3, :3].T + T_world_camera[:3, 3], others)
+    difference = view.difference[row, column]
+    certain[row, column] = (difference >= view.wrong) & ballot.mostly_right
+    likely[row, column] = (difference >= 0.5 * view.wrong) & ballot.mostly_right
+    if kept:
+        ghost = np.zeros_like(certain)
+        ghost[row, column] = (difference < view.wrong) & ballot.mostly_wrong
+        certain |= ghost
+    return certain, likely | certain

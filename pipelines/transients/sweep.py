@@ -1,0 +1,139 @@
+"""`TransientSweep`: masks what moves in the keyframes of a map, and removes the Gaussians that it has left."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import TrackedFrame
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import Keyframe, KeyframeStore
+from pipelines.render.renderer import Renderer
+from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
+from pipelines.transients.masks import soft_mask
+
+__all__ = ["TransientSweep", "compared", "neighbours", "place_of", "without"]
+
+# While frames arrive, the last WINDOW keyframes are compared after every EVERY keyframes. The last YOUNG of them have
+# been optimised too little, and are only asked about the others.
+WINDOW, EVERY, YOUNG = 48, 8, 4
+# Distances of the neighbours in the order of the keyframes: near ones see the same surfaces, far ones another moment.
+# FAR others are spread over all keyframes, for cameras that come back.
+DISTANCES, FAR = (2, 3, 5, 7, 10, 13, 17, 21, 26, 31), 16
+# Rounds of a sweep. Cells that one round masks do not vote in the next.
+ROUNDS = 2
+
+
+def compared(
+    renderer: Renderer,
+    view: Keyframe | TrackedFrame,
+    T_camera_world: NDArray[np.float64],
+    exposure: NDArray[np.float64] | None,
+    near: float,
+) -> CoarseView:
+    """Render a view and compare it with its image, without its mask of what moves.
+
+    Args:
+        renderer: Renderer of the map. Its images are overwritten.
+        view: A keyframe, at half its size if its pyramid has that, or a frame.
+        T_camera_world: Pose (4, 4) to render from.
+        exposure: Exposure (3, 4); None for the identity.
+        near: Depth below which nothing is drawn [scene units].
+    """
+    image = view.whole_image(1) if isinstance(view, Keyframe) else view.pyramid[0]
+    renderer.forward(image.camera, T_camera_world, near)
+    renderer.develop(exposure, view.vignette)
+    images = renderer.images
+    parts = images.colour_to_numpy(), images.depth_to_numpy(), images.opacity_to_numpy()
+    return coarse_view(*parts, image.rgba, image.camera, T_camera_world)
+
+
+def neighbours(place: int, count: int) -> list[int]:
+    """Return the places of the neighbours of a view among `count` keyframes; `place` may lie between two of them."""
+    both = {place + sign * distance for distance in DISTANCES for sign in (-1, 1)}
+    both |= {other * count // FAR for other in range(FAR) if abs(other * count // FAR - place) > 1}
+    return sorted(other for other in both if 0 <= other < count)
+
+
+class TransientSweep:
+    """Masks what moves in keyframes, and removes its Gaussians.
+
+    Args:
+        gaussians: The Gaussians of the map.
+        keyframes: The keyframes of the map.
+        renderer: Renderer of the map.
+    """
+
+    def __init__(self, gaussians: GaussianField, keyframes: KeyframeStore, renderer: Renderer) -> None:
+        self.gaussians = gaussians
+        self.keyframes = keyframes
+        self.renderer = renderer
+
+    def after_keyframe(self, near: float) -> None:
+        """Sweep over the latest keyframes, if enough have come since the last time.
+
+        Args:
+            near: Depth below which nothing is drawn [scene units].
+        """
+        if len(self.keyframes.selected) % EVERY == 0:
+            self.sweep(list(self.keyframes)[-WINDOW:], near, young=YOUNG)
+
+    def sweep(self, views: Sequence[Keyframe], near: float, young: int = 0) -> None:
+        """Mask what moves in keyframes, and remove the Gaussians that most of them contradict.
+
+        Args:
+            views: Consecutive keyframes.
+            near: Depth below which nothing is drawn [scene units].
+            young: Number of the last ones whose masks stay as they are.
+        """
+        if len(self.gaussians) == 0:
+            return
+        coarse = [compared(self.renderer, view, view.T_camera_world, view.exposure, near) for view in views]
+        masks = [view.transient for view in views]
+        for _ in range(ROUNDS):
+            voters = [without(c, mask) for c, mask in zip(coarse, masks, strict=True)]
+            for place, view in enumerate(views[: len(views) - young]):
+                others = [voters[other] for other in neighbours(place, len(views))]
+                masks[place] = soft_mask(*moving(coarse[place], others, kept=True), before=view.transient)
+            if not any(mask is not None for mask in masks):
+                break
+        for view, mask in zip(views, masks, strict=True):
+            if mask is not None or view.transient is not None:
+                self.keyframes.mask(view, mask)
+        self._remove(views, coarse)
+
+    def _remove(self, views: Sequence[Keyframe], coarse: Sequence[CoarseView]) -> None:
+        """Remove Gaussians that masks cover in some views, and that are wrong in most of the others that see them."""
+        masked = [_only(c, v.transient) for c, v in zip(coarse, views, strict=True) if v.transient is not None]
+        if not masked:
+            return
+        position = self.gaussians.to_numpy()["position"].astype(np.float64)
+        suspect = np.flatnonzero(votes(position, masked).looks > 0)
+        free = [without(c, v.transient) for c, v in zip(coarse, views, strict=True)]
+        ballot = votes(position[suspect], free)
+        inside = votes(position[suspect], masked).looks
+        keep = np.ones(len(position), dtype=bool)
+        keep[suspect] = 2 * (ballot.wrong + inside) < ballot.looks + inside
+        self.gaussians.remove(keep)
+
+
+def _only(view: CoarseView, mask: NDArray[np.uint8] | None) -> CoarseView:
+    """The view with only its masked cells valid."""
+    return _with_valid(view, view.valid & (mask == 0))
+
+
+def without(view: CoarseView, mask: NDArray[np.uint8] | None) -> CoarseView:
+    """Return the view without its masked cells, which do not vote."""
+    return view if mask is None else _with_valid(view, view.valid & (mask > 0))
+
+
+def _with_valid(view: CoarseView, valid: NDArray[np.bool_]) -> CoarseView:
+    return CoarseView(view.camera, view.T_camera_world, view.difference, view.depth, valid, view.wrong)
+
+
+def place_of(views: Sequence[Keyframe], index: int) -> int:
+    """Return the place that frame `index` has, or would have, among keyframes."""
+    return bisect_left(views, index, key=lambda view: view.index)

@@ -1,0 +1,96 @@
+"""Views of a textured wall, rendered analytically: what moves, what the map lacks, and ghosts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fields.geometry.camera import PinholeCamera
+from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
+
+CAMERA = PinholeCamera(150.0, 150.0, 80.0, 60.0, 160, 120)
+DEPTH = 2.0
+STEPS = np.arange(9) * 0.05  # positions of the cameras along x
+
+
+def wall(x: float, blot: float | None = None) -> NDArray[np.float64]:
+    """Image (H, W, 3) of the wall z = 2 from a camera at `x`, with a red square of width 0.3 around x = `blot`."""
+    u, v = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
+    X, Y = (u - 80) / 150 * DEPTH + x, (v - 60) / 150 * DEPTH
+    colour = np.stack([0.5 + 0.2 * np.sin(9 * X + k) * np.cos(7 * Y + 2 * k) for k in range(3)], axis=-1)
+    if blot is not None:
+        colour[(np.abs(X - blot) < 0.15) & (np.abs(Y) < 0.15)] = [0.95, 0.05, 0.05]
+    return colour
+
+
+def view(x: float, render: NDArray[np.float64], image: NDArray[np.float64], valid: object = True) -> CoarseView:
+    T = np.eye(4)
+    T[0, 3] = -x
+    rgba = np.dstack([np.rint(255 * image), np.full((120, 160), 255)]).astype(np.uint8)
+    rgba[..., 3] *= np.broadcast_to(valid, (120, 160)).astype(np.uint8)
+    return coarse_view(render, np.full((120, 160), DEPTH), np.ones((120, 160)), rgba, CAMERA, T)
+
+
+def found(views: list[CoarseView], place: int, kept: bool) -> NDArray[np.bool_]:
+    """The certain cells of one of the views, all others being asked."""
+    others = [other for i, other in enumerate(views) if i != place]
+    certain, likely = moving(views[place], others, kept)
+    assert not (certain & ~likely).any()
+    return certain
+
+
+def square(x: float, blot: float, half: float) -> NDArray[np.bool_]:
+    """Cells (60, 80) whose centres lie in the square of half the width `half` around `blot`, seen from `x`."""
+    u, v = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    X, Y = (2 * u - 80) / 150 * DEPTH + x, (2 * v - 60) / 150 * DEPTH
+    return (np.abs(X - blot) < half) & (np.abs(Y) < half)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_what_one_image_shows_and_the_map_does_not_moves(kept: bool) -> None:
+    views = [view(x, wall(x), wall(x, 0.2 if i == 4 else None)) for i, x in enumerate(STEPS)]
+    cells = found(views, 4, kept)
+    assert cells[square(STEPS[4], 0.2, 0.12)].all()
+    assert not cells[~square(STEPS[4], 0.2, 0.2)].any()
+    assert not any(found(views, i, kept).any() for i in range(9) if i != 4)
+
+
+def test_what_the_map_lacks_in_all_images_does_not_move() -> None:
+    views = [view(x, wall(x), wall(x, 0.2)) for x in STEPS]
+    assert not any(found(views, i, kept=True).any() for i in range(9))
+
+
+def test_a_ghost_in_the_map_moved_in_the_image_that_it_came_from() -> None:
+    views = [view(x, wall(x, 0.2), wall(x, 0.2 if i == 4 else None)) for i, x in enumerate(STEPS)]
+    cells = found(views, 4, kept=True)
+    assert cells[square(STEPS[4], 0.2, 0.12)].all() and not cells[~square(STEPS[4], 0.2, 0.2)].any()
+    assert not any(found(views, i, kept=True).any() for i in range(9) if i != 4)
+    assert not found(views, 4, kept=False).any()  # the map saw no image of a held-out frame
+
+
+def test_two_other_views_are_too_few_to_decide() -> None:
+    views = [view(x, wall(x), wall(x, 0.2 if i == 0 else None)) for i, x in enumerate(STEPS[:3])]
+    assert not found(views, 0, kept=True).any()
+
+
+def test_masked_pixels_neither_move_nor_vote() -> None:
+    left = np.arange(160)[None] < 80
+    images = [wall(x, 0.2 if i == 4 else None) for i, x in enumerate(STEPS)]
+    views = [
+        view(x, wall(x), image, ~left if i == 4 else True)
+        for i, (x, image) in enumerate(zip(STEPS, images, strict=True))
+    ]
+    assert not found(views, 4, kept=True)[:, :40].any()
+    blind = [view(x, wall(x), image, False) for x, image in zip(STEPS, images, strict=True)]
+    assert not votes(np.array([[0.2, 0.0, DEPTH]]), blind).looks.any()
+
+
+def test_a_point_gets_the_votes_of_the_views_that_see_its_surface() -> None:
+    views = [view(x, wall(x), wall(x, 0.2 if i < 3 else None)) for i, x in enumerate(STEPS)]
+    there, before, behind = np.array([0.2, 0.0, DEPTH]), np.array([0.2, 0.0, 1.0]), np.array([0.2, 0.0, -1.0])
+    ballot = votes(np.stack([there, before, behind]), views)
+    assert ballot.looks.tolist() == [9, 0, 0]
+    assert ballot.wrong.tolist() == [3, 0, 0]
+    assert ballot.right.tolist() == [6, 0, 0]
+    assert ballot.mostly_right.tolist() == [True, False, False]
