@@ -12,6 +12,7 @@ from fields.map.gaussians import NO_ANCHOR
 from fields.map.keyframes import Keyframe, KeyframeStore
 from pipelines.densify.densifier import Anchor
 from pipelines.online_map import OnlineMap
+from pipelines.render.cpu.photometric_model import IDENTITY
 
 __all__ = ["go_on_with", "placed_by"]
 
@@ -42,6 +43,7 @@ def go_on_with(
         ValueError: If the Gaussians do not fit the settings, or none of the keyframes is among the frames.
     """
     mapper.gaussians.load(dict(gaussians))
+    unexposed = np.array(IDENTITY) if mapper.settings.exposure.enabled is True else None
     for frame in frames:
         mapper.trajectory.add(frame)
         if frame.held_out:
@@ -49,7 +51,7 @@ def go_on_with(
         mapper.frame_count += 1
         view = _view_of(mapper, frame, frame.index in keyframes)
         if view is not None:
-            view.exposure = exposures.get(frame.index)
+            view.exposure = exposures.get(frame.index, unexposed)
             if len(view.points) == 0:
                 view.median_depth = scene_depth
     if len(mapper.keyframes) == 0:

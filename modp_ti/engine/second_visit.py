@@ -48,41 +48,48 @@ class SecondVisit:
 
     Args:
         config: The settings of the second recording, whose `onto` names the output folder of the finished run.
-        tracker: The opened tracker of the second recording. Its first frames are taken.
         line: Shows the progress.
 
-    Attributes:
-        tracker: Delivers the frames of the finished run, and then those of the recording in the world of the map.
-        alignment: The similarity between the two worlds.
-
     Raises:
-        InputError: If there is no finished run, or the recording cannot be located in it.
+        InputError: If there is no finished run, or a damaged one.
     """
 
-    def __init__(self, config: SceneConfig, tracker: Tracker, line: ProgressLine) -> None:
+    def __init__(self, config: SceneConfig, line: ProgressLine) -> None:
         assert config.onto is not None
         if config.onto.resolve() == config.output.resolve():
             raise InputError(f"{config.output}: the finished run of onto stays as it is; choose another output")
-        self._run = run = open_run(config.onto)
-        self._earlier = FinishedFrames(run, line.prepare)
-        self._exposures = read_exposures(run.folder / "exposure.json")
-        events = tracker.events()
-        locator = Locator(run.folder, config.device, line.console)
-        taken, self.alignment = _settled(locator, events, line)
+        self._config = config
+        self._line = line
+        self._run = open_run(config.onto)
+        self._earlier = FinishedFrames(self._run, line.prepare)
+        self._exposures = read_exposures(self._run.folder / "exposure.json")
+        self._alignment: WorldAlignment
+
+    def join(self, tracker: Tracker) -> Tracker:
+        """Locate the first frames of a tracker in the map. The device is started again.
+
+        Args:
+            tracker: The opened tracker of the second recording, whose events nobody has taken yet.
+
+        Returns:
+            A tracker of the frames of the finished run, and then those of the recording in the world of the map.
+
+        Raises:
+            InputError: If the recording cannot be located.
+        """
+        config, run, events = self._config, self._run, tracker.events()
+        locator = Locator(run.folder, config.device, self._line.console)
+        taken, self._alignment = _settled(locator, events, self._line)
         initialise(config.device, config.mapper_threads, config.seed)  # frees what the locator has taken
         first = next(event for event in taken if isinstance(event, TrackedFrame))
-        placement = Placement(
-            self.alignment.S_map_tracker,
-            len(run),
-            shift_after(self._earlier.end, first.timestamp),
-            prefix_for(run.names),
-        )
-        self.tracker = JoinedTracker(self._earlier, tracker, placement, taken, events)
+        shift = shift_after(self._earlier.end, first.timestamp)
+        placement = Placement(self._alignment.S_map_tracker, len(run), shift, prefix_for(run.names))
+        return JoinedTracker(self._earlier, tracker, placement, taken, events)
 
     @property
     def note(self) -> str:
         """One line on how the recording was joined."""
-        found = self.alignment
+        found = self._alignment
         return (
             f"joined to {self._run.folder}: {found.agreeing} of {found.placed} located frames agree within "
             f"{found.residual:.2f} px, at a scale of {found.scale:.5g}"
@@ -91,7 +98,7 @@ class SecondVisit:
     @property
     def metrics(self) -> dict[str, Any]:
         """The entry `onto` of `metrics.json`."""
-        found = self.alignment
+        found = self._alignment
         return {
             "frames": len(self._run),
             "located": found.placed,

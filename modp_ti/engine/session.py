@@ -121,12 +121,13 @@ class _Session:
         """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
         self.held.enter_context(self.stop)
+        if self.config.onto is not None:
+            self.visit = SecondVisit(self.config, self.line)
         self.tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
-        if self.config.onto is not None:
-            self.visit = SecondVisit(self.config, self.tracker, self.line)
-            self.tracker = self.visit.tracker
+        if self.visit is not None:
+            self.tracker = self.visit.join(self.tracker)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
         if self.config.is_realtime:
             self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
