@@ -144,7 +144,7 @@ def _metric(frame: PlacedFrame) -> NDArray[np.float64]:
 def _motion(S: NDArray[np.float64], frame: PlacedFrame) -> NDArray[np.float64]:
     """Image motion (6,) [px] from a frame's pose in the map to its pose by the tracker."""
     xi = log_se3(moved_pose(S, frame.T_camera_tracker) @ inverse_se3(frame.T_camera_map))
-    return np.asarray(np.linalg.solve(_metric(frame), xi))
+    return np.asarray(np.linalg.solve(_metric(frame), xi), dtype=np.float64)
 
 
 def _apart(S: NDArray[np.float64], frame: PlacedFrame) -> float:

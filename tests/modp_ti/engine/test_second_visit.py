@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,9 +17,11 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose
+from modp_ti.engine.snapshots.file import FILE
 from modp_ti.outputs.formats.scores_csv import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.finished_run import open_run
+from tests.modp_ti.engine.snapshots.test_resume import position, stop_midway
 from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, write_run
 from tests.modp_ti.runs import run
 from tests.room import Room, RoomRecording, walk, write_colmap
@@ -112,6 +117,20 @@ def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, room: Ro
     assert third.returncode == 0, third.stderr
     again = open_run(tmp_path / "third")
     assert again.names[: len(out)] == out.names and again.names[-1] == "visit3/0005.png"
+
+
+def test_a_second_visit_that_is_killed_goes_on_as_one_in_peace(first: Path, room: Room, tmp_path: Path) -> None:
+    """It locates the recording again, and comes to the same place."""
+    scene = second_scene(room, tmp_path)
+    options = ["--onto", str(first), "--set", "source.stop=6", "snapshot_every=2"]
+    assert run(scene, *options).returncode == 0
+    peace = (tmp_path / "out").rename(tmp_path / "peace")
+    out = tmp_path / "out"
+    stop_midway([str(scene), *options], out, lambda: position(out / FILE)[0] > FIRST, signal.SIGKILL)
+    result = subprocess.run([sys.executable, "-m", "modp_ti.run", "--resume", str(out)], check=False)
+    assert result.returncode == 0
+    for name in ("splats.ply", "trajectory.txt", "scores.csv"):
+        assert (out / name).read_bytes() == (peace / name).read_bytes(), name
 
 
 def test_a_recording_of_another_place_is_refused_in_one_line(first: Path, tmp_path: Path) -> None:
