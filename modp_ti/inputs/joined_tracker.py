@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +87,8 @@ class Placement:
 class JoinedTracker(Tracker):
     """Delivers the frames of an earlier map, and then those of a tracker in the world of that map.
 
+    The tracker must be one that reads ahead, as all are that follow no clock.
+
     Args:
         earlier: The frames of the earlier map.
         tracker: The tracker of the new frames.
@@ -94,6 +96,8 @@ class JoinedTracker(Tracker):
         taken: Frames and corrections that were taken from the tracker before.
         rest: Those that are still to come.
     """
+
+    reads_ahead: ClassVar[bool] = True
 
     def __init__(
         self,
