@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframes import Keyframe
-from pipelines import online_state
+from pipelines import finished_map, online_state
 from pipelines.corrections import CorrectionReport
 from pipelines.online_map import OnlineMap
 from pipelines.pipeline import FrameReport
@@ -221,6 +221,17 @@ class OnlineMapper(OnlineMap):
         schedule: Schedule | None = None,
     ) -> None:
         refine(self, settings, progress, done, schedule)
+
+    def go_on_with(
+        self,
+        gaussians: Mapping[str, NDArray],
+        frames: Iterable[TrackedFrame],
+        keyframes: Collection[int],
+        exposures: Mapping[int, NDArray[np.float64]],
+        scene_depth: float,
+    ) -> None:
+        """Put a finished map into this new one, see `pipelines.finished_map`."""
+        finished_map.go_on_with(self, gaussians, frames, keyframes, exposures, scene_depth)
 
     def state(self) -> MapState:
         return online_state.state_of(self)

@@ -24,6 +24,7 @@ EXAMPLES = examples(
     "modp-ti run room.mp4 --fast   (or a folder of images; the map is in out/room)",
     "modp-ti run --stream 0 --view   (a camera; modp-ti cameras lists them)",
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
+    "modp-ti run second.yaml --onto OUT   (go on with a finished map; OUT stays as it is)",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
     "modp-ti run --replay OUT   (repeat a recorded realtime run)",
@@ -59,6 +60,12 @@ def run(
             "--replay", metavar="OUT", help="repeat the realtime run whose output folder this is, from its session.zip"
         ),
     ] = None,
+    onto: Annotated[
+        Path | None,
+        typer.Option(
+            "--onto", metavar="OUT", help="go on with the finished map of this output folder (docs/second_visit.md)"
+        ),
+    ] = None,
     fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
     best: Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")] = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
@@ -77,6 +84,10 @@ def run(
         )
     with outcome(as_json) as result:
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
+        if onto is not None:
+            overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
+        if onto is not None and (resume is not None or replay is not None):
+            raise InputError("--onto is for a scene: a run that goes on or is repeated has its settings already")
         preset = _preset(resume or replay, scene, fast, best)
         if len(sources) > 1 and (stream is not None or replay is not None):
             raise InputError("--stream and --replay need no scene file and no --resume: give one of them")

@@ -1,7 +1,8 @@
 """The settings of a scene as one strict model, `SceneConfig`.
 
-`modp_ti.config.scene_file` reads and writes its files. The `tracker` section is defined in
-`modp_ti.config.tracker_settings`; `mapping`, `refine` and `offline` are defined in `pipelines.settings`.
+`modp_ti.config.scene_file` reads and writes its files. The cameras of `source` are defined in
+`modp_ti.config.camera_settings`, the `tracker` section in `modp_ti.config.tracker_settings`; `mapping`, `refine` and
+`offline` in `pipelines.settings`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from fields.runtime.parallel import available_cores
+from modp_ti.config.camera_settings import IntrinsicsSettings, VrsSettings
 from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
 from pipelines.offline_settings import OfflineSettings
@@ -32,66 +34,6 @@ LONGER_SIDE = 480
 """Longest side [px] of a mapped image where `source.scale` is `auto`."""
 
 NO_PATH = "source.path is missing: set it to the folder of the images"
-
-
-class IntrinsicsSettings(StrictModel):
-    """The camera's intrinsics and lens distortion, in pixels of the stored images, turned as EXIF says."""
-
-    fx: float | None = Field(
-        default=None,
-        gt=0,
-        description="horizontal focal length in pixels of the stored images. If it is set, this section replaces the "
-        "intrinsics that the source provides",
-    )
-    fy: float | None = Field(default=None, gt=0, description="vertical focal length; empty: the same as fx")
-    cx: float | None = Field(
-        default=None,
-        description="horizontal principal point. Pixel centres are at +0.5: add 0.5 to a calibration by OpenCV or "
-        "ROS. Empty: the image centre",
-    )
-    cy: float | None = Field(default=None, description="vertical principal point, as cx")
-    k1: float = Field(default=0.0, description="radial distortion, as in OpenCV")
-    k2: float = Field(default=0.0, description="as k1")
-    p1: float = Field(default=0.0, description="tangential distortion, as in OpenCV")
-    p2: float = Field(default=0.0, description="as p1")
-    k3: float = Field(default=0.0, description="as k1")
-    k4: float = Field(default=0.0, description="as k1; only with `fisheye`")
-    fisheye: bool = Field(default=False, description="use OpenCV's fisheye model with k1 to k4")
-    width: int | None = Field(
-        default=None,
-        ge=1,
-        description="image width of the calibration. If it is set, the size of the images is checked",
-    )
-    height: int | None = Field(default=None, ge=1, description="image height of the calibration")
-
-    @property
-    def given(self) -> bool:
-        """Whether the scene has this section."""
-        return self.fx is not None
-
-    @model_validator(mode="after")
-    def _one_model(self) -> IntrinsicsSettings:
-        if not self.given and self.model_fields_set - {"fx"} and self != IntrinsicsSettings():
-            raise ValueError("source.intrinsics.fx is missing: set the focal length in pixels of the stored images")
-        if self.fisheye and (self.p1 or self.p2):
-            raise ValueError("source.intrinsics: OpenCV's fisheye model has no p1 and p2; remove them")
-        if self.k4 and not self.fisheye:
-            raise ValueError("source.intrinsics.k4 is only for `fisheye: true`; remove it")
-        if (self.width is None) != (self.height is None):
-            raise ValueError("source.intrinsics: set both width and height, or neither")
-        return self
-
-
-class VrsSettings(StrictModel):
-    """The pinhole camera to which Aria's fisheye images are undistorted."""
-
-    width: int = Field(default=800, ge=8, description="width of the undistorted image (Aria VRS only)")
-    height: int = Field(default=800, ge=8, description="height of the undistorted image (Aria VRS only)")
-    focal: float = Field(
-        default=400.0,
-        gt=0,
-        description="focal length of the undistorted image in pixels; 400 at 800x800 is a field of view of 90 degrees",
-    )
 
 
 class SourceSettings(StrictModel):
@@ -299,6 +241,11 @@ class SceneConfig(StrictModel):
     source: SourceSettings = SourceSettings()
     tracker: AnyTrackerSettings
     output: Path = Field(description="output folder, which is created if it does not exist")
+    onto: Path | None = Field(
+        default=None,
+        description="output folder of a finished run whose map this recording goes on with (docs/second_visit.md): it "
+        "is located there, and `output` gets the map of both. The finished run stays as it is. Empty: a new map",
+    )
     device: Literal["cpu", "cuda", "vulkan", "metal", "auto"] = Field(
         default="auto", description="`auto`: the GPU by CUDA, by Metal (macOS) or by Vulkan, otherwise the CPU"
     )
@@ -380,6 +327,18 @@ class SceneConfig(StrictModel):
             if not self.is_live:
                 raise ValueError("snapshot_every is for `mapping.pace: complete`; remove one of them")
             raise ValueError("snapshot_every: live frames cannot be read again; record them, or remove the key")
+        return self
+
+    @model_validator(mode="after")
+    def _goes_on_with_another_run(self) -> SceneConfig:
+        if self.onto is None:
+            return self
+        if self.mode != "online":
+            raise ValueError(f"onto is for mode: online, not {self.mode}; remove one of them")
+        if self.is_live or self.is_realtime or self.source.realtime:
+            raise ValueError("onto needs frames that wait while they are located: record them, or remove onto")
+        if self.tracker.kind == "klt" and self.tracker.maps == "all":
+            raise ValueError("onto goes on with one map: set tracker.maps to first, largest or a number")
         return self
 
     @model_validator(mode="after")

@@ -1,20 +1,22 @@
-"""The parts of a run that its settings choose: the mapper, and the conductor that takes the frames to it."""
+"""The parts of a run that its settings choose: the mapper, the conductor that takes the frames to it, the observer."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.settings import SceneConfig
+from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.engine.conductor import Conductor
 from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.observer import Observer
 from modp_ti.engine.realtime import RealtimeRun
 from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
 from pipelines.pace import CompletePace, Pace
 
-__all__ = ["build_mapper", "open_conductor"]
+__all__ = ["build_mapper", "open_conductor", "open_observer"]
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None = None) -> Mapper:
@@ -57,3 +59,24 @@ def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Co
         recorder = SessionRecorder()
         held.callback(recorder.close)
     return RealtimeRun(config.mapping, tracker, recorder)
+
+
+def open_observer(
+    view: ViewSettings, say: Callable[..., None], note: Callable[[str], None], held: ExitStack
+) -> Observer:
+    """Start the live viewer if the settings ask for it, and return what observes the run.
+
+    Args:
+        view: Settings of the viewer.
+        say: Called with remarks for the user, which the report repeats.
+        note: Called with the address of the viewer.
+        held: Closes the viewer when the run ends.
+    """
+    if not view.enabled:
+        return Observer()
+    from modp_ti.engine.live_viewer import LiveViewer  # here, because viser is an optional dependency
+
+    viewer = LiveViewer(view, say)
+    held.callback(viewer.close)
+    note(f"viewer: {viewer.url}")
+    return viewer

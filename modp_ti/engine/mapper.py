@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -94,9 +94,7 @@ class Mapper:
         if self.frames.index and frame.index <= self.frames.index[-1]:
             raise ValueError(f"{frame.name} has index {frame.index}, the frame before it {self.frames.index[-1]}")
         report = None if frame.held_out else self.pipeline.process(frame)
-        # The frame's metadata are kept, and its points as far as the memory budget allows.
-        self.frames.add(frame, with_points=self.pipeline.takes_observations(len(frame.points)))
-        self.pipeline.count_beside(self.frames.points.nbytes)
+        self._note(frame)
         self.finished = False
         return report
 
@@ -189,6 +187,42 @@ class Mapper:
         self.frames = frames
         self.pipeline.count_beside(frames.points.nbytes)
         self.finished = finished
+
+    def go_on_with(
+        self,
+        gaussians: Mapping[str, NDArray],
+        frames: Iterable[TrackedFrame],
+        keyframes: Collection[int],
+        exposures: Mapping[int, NDArray[np.float64]],
+        scene_depth: float,
+    ) -> None:
+        """Go on with a finished map in this new mapper. More frames may follow.
+
+        Args:
+            gaussians: The finished map, as from `read_splats`.
+            frames: All of its frames in order, with their refined poses.
+            keyframes: Indices of its keyframes.
+            exposures: Exposure (3, 4) by frame index, for the frames that have one.
+            scene_depth: Depth of keyframes without tracked points [scene units].
+
+        Raises:
+            ValueError: If the map does not fit the settings of this mapper, or this mapper is for offline maps.
+        """
+        if not isinstance(self.pipeline, OnlineMapper):
+            raise ValueError("an offline map cannot go on with a finished one")
+        self.pipeline.go_on_with(gaussians, self._noted(frames), keyframes, exposures, scene_depth)
+        self.finished = True
+
+    def _noted(self, frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
+        """Yield the frames, and keep their metadata."""
+        for frame in frames:
+            yield frame
+            self._note(frame)
+
+    def _note(self, frame: TrackedFrame) -> None:
+        """Keep the metadata of a frame that was mapped, and its points as far as the memory budget allows."""
+        self.frames.add(frame, with_points=self.pipeline.takes_observations(len(frame.points)))
+        self.pipeline.count_beside(self.frames.points.nbytes)
 
     def trajectory(self) -> list[NDArray[np.float64]]:
         """Return the refined T_camera_world (4, 4) of every frame so far."""

@@ -15,16 +15,16 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.build import build_mapper, open_conductor
+from modp_ti.engine.build import build_mapper, open_conductor, open_observer
 from modp_ti.engine.conductor import Conductor, Event
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.observer import Observer
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.remarks import remarks
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
+from modp_ti.engine.second_visit import SecondVisit
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
@@ -94,7 +94,9 @@ class _Session:
         self.clock, self.record = RunClock(), RunRecord()
         self.line = ProgressLine(console)
         self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
-        self.observer = self._open_observer()  # opened first, as what follows may take minutes
+        self.observer = open_observer(
+            config.view, self._say, self.line.note, self.held
+        )  # opened first, as what follows may take minutes
         self.stop = Interruption(lambda: self.line.note("stopping after this step; Ctrl-C again stops at once"))
         try:
             self.backend = initialise(config.device, config.mapper_threads, config.seed)
@@ -104,6 +106,7 @@ class _Session:
         self.line.note(f"device: {self.record.device}")
         # Set once the first frame has arrived.
         self.tracker: Tracker
+        self.visit: SecondVisit | None = None
         self.conductor: Conductor
         self.mapper: Mapper
         self.after_mapping: TimeAfterMapping
@@ -124,9 +127,13 @@ class _Session:
         """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
         self.held.enter_context(self.stop)
+        if self.config.onto is not None:
+            self.visit = SecondVisit(self.config, self.line)
         self.tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
         self.config = self.config.resolved(self.tracker.scale)
+        if self.visit is not None:
+            self.tracker = self.visit.join(self.tracker)
         self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
         if self.config.is_realtime:
             self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
@@ -144,7 +151,7 @@ class _Session:
             side = min(first.camera.width, first.camera.height)
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
-            self._say(*notes)
+            self._say(*notes, *([self.visit.note] if self.visit is not None else []))
             if undistorter is None:
                 self._make_mapper(first.camera)
             seconds = self.mapper.pipeline.stopwatch.seconds
@@ -164,6 +171,9 @@ class _Session:
         self._say(*(note for note in self.tracker.notes if note not in notes))
 
     def _make_mapper(self, camera: PinholeCamera) -> None:
+        """Make the mapper for images of this camera, and for those of an earlier map that the run goes on with."""
+        before = self.tracker.before
+        camera = camera.resized(max(camera.width, before.width), max(camera.height, before.height))
         self.mapper = build_mapper(self.config, camera, self.conductor.pace)
         with self.line.working("compiling kernels (the first time on this machine takes longest)"):
             self.mapper.pipeline.compile()
@@ -175,8 +185,12 @@ class _Session:
             with self.line.working(f"reading again what {resumed.path} was made of"):
                 replay(resumed, self.mapper, arriving, checkpointer.digest)
             checkpointer.go_on_from(resumed)
-        elif checkpointer.path.exists():
+            return
+        if checkpointer.path.exists():
             self._say(f"{checkpointer.path} is of an earlier run: the first one of this run takes its place")
+        if self.visit is not None:
+            with self.line.working(f"going on with {self.config.onto}"):
+                self.visit.go_on(self.mapper, arriving, checkpointer.digest)
 
     def _map(self, arriving: FramesAhead[Event]) -> None:
         """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
@@ -329,7 +343,7 @@ class _Session:
         pipeline, frames, checkpointer = self.mapper.pipeline, self.mapper.frames, self.checkpointer
         truth: list[NDArray[np.float64]] = []  # of every frame, NaN where it is unknown; empty without ground truth
         if self.truth is not None:
-            truth, note = true_poses(self.truth, frames.timestamp)
+            truth, note = true_poses(self.truth, frames.timestamp, self.tracker.before)
             self._say(*([note] if note else []))
         caught = pipeline.caught()
         if warning := caught.warning():
@@ -340,11 +354,12 @@ class _Session:
             "gaussians": len(pipeline.gaussians),
             "backend": self.backend,
             "seed": self.config.seed,
-            "frames_per_second": round(len(frames) / self.clock.mapping, 4),
+            "frames_per_second": round((len(frames) - self.tracker.before.frames) / self.clock.mapping, 4),
             "peak_memory_mb": peak_memory_mb(),
             "snapshots": {name: getattr(checkpointer, name) for name in ("written", "failed", "resumed")},
             "guards": caught.counts(),
             "frames_left_out": {"unreadable": len(self.tracker.unreadable), **pipeline.refused},
+            "onto": None if self.visit is None else self.visit.metrics,
             "lpips_note": self.no_lpips,
             "breakdown_percent": self.breakdown,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
@@ -383,17 +398,6 @@ class _Session:
             return self.checkpointer.way_on()
         results, pipeline = Results(self.config, self.mapper.frames, self.tracker.undistorter), self.mapper.pipeline
         return results.elsewhere(version, pipeline.keyframes, pipeline.near)
-
-    def _open_observer(self) -> Observer:
-        """Start the live viewer if the settings ask for it."""
-        if not self.config.view.enabled:
-            return Observer()
-        from modp_ti.engine.live_viewer import LiveViewer  # here, because viser is an optional dependency
-
-        viewer = LiveViewer(self.config.view, self._say)
-        self.held.callback(viewer.close)
-        self.line.note(f"viewer: {viewer.url}")
-        return viewer
 
     def _say(self, *notes: str) -> None:
         """Print notes, and keep them for the report."""

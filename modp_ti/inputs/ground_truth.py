@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.protocol import Before
 from modp_ti.inputs.trackers.trajectory import MAX_DIFFERENCE, TimedPoses, associate, read_trajectory_file
 
 __all__ = ["open_ground_truth", "true_poses"]
@@ -30,26 +31,31 @@ def open_ground_truth(path: Path | None) -> TimedPoses | None:
     return read_trajectory_file(path)
 
 
-def true_poses(truth: TimedPoses, timestamps: Sequence[float]) -> tuple[list[NDArray[np.float64]], str | None]:
+def true_poses(
+    truth: TimedPoses, timestamps: Sequence[float], before: Before | None = None
+) -> tuple[list[NDArray[np.float64]], str | None]:
     """Associate a trajectory with frames by time, within `MAX_DIFFERENCE`.
 
     Args:
         truth: The true trajectory.
         timestamps: Times (N,) of the frames [s].
+        before: Frames of an earlier map that come first, which have no true poses; None for none.
 
     Returns:
         The true T_camera_world (4, 4) of every frame, NaN where the trajectory has none; empty if fewer than three
         frames have one. And a note for the user if frames have none.
     """
-    pairs = associate(timestamps, truth.times, MAX_DIFFERENCE)
+    before = before or Before()
+    own = [time - before.shift for time in timestamps[before.frames :]]
+    pairs = associate(own, truth.times, MAX_DIFFERENCE)
     note = None
-    if len(pairs) < len(timestamps):
+    if len(pairs) < len(own):
         note = (
-            f"{len(timestamps) - len(pairs)} of {len(timestamps)} frames have no pose in {truth.path} within "
+            f"{len(own) - len(pairs)} of {len(own)} frames have no pose in {truth.path} within "
             f"{MAX_DIFFERENCE:g} s: not in the trajectory errors"
         )
     if len(pairs) < LEAST_FRAMES:
         return [], note
     poses = np.full((len(timestamps), 4, 4), np.nan)
-    poses[pairs[:, 0]] = truth.T_camera_world[pairs[:, 1]]
+    poses[before.frames + pairs[:, 0]] = truth.T_camera_world[pairs[:, 1]]
     return list(poses), note

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from fields.frames.pose_correction import PoseCorrection
@@ -14,10 +15,27 @@ from modp_ti.inputs.live_counts import LiveCounts
 if TYPE_CHECKING:
     from modp_ti.inputs.sources import Undistorter
 
-__all__ = ["Progress", "Tracker"]
+__all__ = ["Before", "Progress", "Tracker"]
 
 Progress = Callable[[str, int, int], None]
 """Progress callback, called as progress(what, done, total) while a tracker prepares."""
+
+
+@dataclass(frozen=True)
+class Before:
+    """What comes before the frames of a tracker.
+
+    Attributes:
+        frames: Number of frames of an earlier map that come first.
+        width: Largest width of their images [px].
+        height: Largest height of their images [px].
+        shift: Added to the times of the tracker's own frames, so that they are later [s].
+    """
+
+    frames: int = 0
+    width: int = 0
+    height: int = 0
+    shift: float = 0.0
 
 
 class Tracker(ABC):
@@ -81,6 +99,11 @@ class Tracker(ABC):
     def further_maps(self) -> int:
         """Number of other maps that the tracker made of the images, which are mapped in runs of their own."""
         return 0
+
+    @property
+    def before(self) -> Before:
+        """What comes before the tracker's own frames; nothing, but on a second visit to a map."""
+        return Before()
 
     @property
     def live(self) -> LiveCounts | None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.atomic import write_picture
+from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.tracked_points import TrackedPoints
 
 __all__ = ["image_names", "write_colmap", "write_image"]
@@ -83,8 +84,8 @@ def write_colmap(
     model.write_binary(str(folder))
 
 
-def write_image(folder: Path, name: str, frame: TrackedFrame) -> None:
-    """Write a frame's undistorted image as `images/NAME` (PNG), and its mask, if any, as `masks/NAME.png`.
+def write_image(folder: Path, name: str, frame: TrackedFrame | Picture) -> None:
+    """Write the undistorted image of a frame as `images/NAME` (PNG), and its mask, if any, as `masks/NAME.png`.
 
     Masks follow COLMAP's convention: ignored pixels are black.
     """

@@ -6,15 +6,18 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import IntrinsicsSettings
-from modp_ti.outputs.locating.map_views import MapViews
+from modp_ti.outputs.locating.map_views import MapViews, map_depth
 from modp_ti.outputs.locating.picture import camera_of, read_picture
 from modp_ti.outputs.locating.search import Search
+from modp_ti.outputs.locating.world_alignment import PlacedFrame
 from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.progress import ProgressLine
@@ -90,7 +93,7 @@ class Locator:
         shown = [keyframes[i * len(keyframes) // count] for i in range(count)]
         cameras = [run.cameras[index] for index in shown]
         self._side = max(max(camera.width, camera.height) for camera in cameras)
-        renderer = MapRenderer(gaussians, self._side, self._side, run.record.near)
+        self._renderer = renderer = MapRenderer(gaussians, self._side, self._side, run.record.near)
         shots = list(zip(cameras, run.poses[shown], strict=True))
         views = MapViews(renderer, line.through("rendering the map", shots, len(shots)))
         self._search = Search(renderer, views)
@@ -133,3 +136,26 @@ class Locator:
             found.camera.resized(width, height),
             chosen.note,
         )
+
+    def place(self, frame: TrackedFrame) -> PlacedFrame | str:
+        """Locate a frame of a tracker, and find the depths of its points in the map.
+
+        Returns:
+            The located frame, or why it was not located.
+        """
+        camera, image, valid = frame.camera, frame.image, frame.mask
+        factor = min(1.0, self._side / max(camera.width, camera.height))
+        if factor < 1.0:  # larger than the map's renders
+            size = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+            camera = camera.resized(*size)
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+            valid = None if valid is None else cv2.resize(valid.astype(np.float32), size) >= 0.5
+        found = self._search.find(image, valid, camera)
+        if isinstance(found, str):
+            return found
+        points = frame.points
+        pixels = points.pixels * np.divide((camera.width, camera.height), (frame.camera.width, frame.camera.height))
+        depth = map_depth(self._renderer, camera, found.T_camera_world, pixels)
+        known = depth > 0
+        T_map, T_tracker = found.T_camera_world, frame.T_camera_world
+        return PlacedFrame(frame.index, camera, T_map, T_tracker, points.ids[known], depth[known], points.xyz[known])

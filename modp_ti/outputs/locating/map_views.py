@@ -12,8 +12,9 @@ from modp_ti.inputs.multiview.appearance import Appearance
 from modp_ti.inputs.multiview.features import Features, detect_features, match_anywhere
 from modp_ti.outputs.formats.mesh import without_edges
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits
+from pipelines.render.renderer import RenderedView
 
-__all__ = ["MapViews", "PlacedFeatures", "matched", "rendered_features"]
+__all__ = ["MapViews", "PlacedFeatures", "map_depth", "matched", "rendered_features"]
 
 # A feature has a place if the map is this opaque there.
 MIN_OPACITY = 0.9
@@ -55,12 +56,23 @@ def rendered_features(
     """Detect features in a render of the map, and place them by its depth. Those without a sound depth are dropped."""
     view = renderer.view(camera, T_camera_world)
     features = detect_features(eight_bits(view.colour))
-    depth = without_edges(view.expected_depth(MIN_OPACITY).astype(np.float32))
-    column, row = np.minimum(np.floor(features.pixels).astype(int), [camera.width - 1, camera.height - 1]).T
-    z = depth[row, column].astype(np.float64)
+    z = _depth_at(view, camera, features.pixels)
     kept = z > 0
     xyz = camera.unproject(features.pixels[kept], z[kept]) - T_camera_world[:3, 3]
     return Features(features.pixels[kept], features.descriptors[kept], features.pixel), xyz @ T_camera_world[:3, :3]
+
+
+def map_depth(
+    renderer: MapRenderer, camera: PinholeCamera, T_camera_world: NDArray[np.float64], pixels: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the depth (N,) of the map at pixels (N, 2) of a view; 0 where there is no sound one."""
+    return _depth_at(renderer.view(camera, T_camera_world), camera, pixels)
+
+
+def _depth_at(view: RenderedView, camera: PinholeCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    depth = without_edges(view.expected_depth(MIN_OPACITY).astype(np.float32))
+    column, row = np.minimum(np.floor(pixels).astype(int), [camera.width - 1, camera.height - 1]).T
+    return depth[row, column].astype(np.float64)
 
 
 def matched(view: PlacedFeatures, features: Features) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

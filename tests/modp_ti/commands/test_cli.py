@@ -95,6 +95,16 @@ def test_overrides_may_follow_each_other_or_repeat_the_option(scene, session):
     assert (session[0].seed, session[0].source.scale, session[0].threads) == (4, 0.5, 1)
 
 
+def test_a_map_to_go_on_with_is_relative_to_the_working_folder(scene, session, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = invoke(scene, "--onto", "first: a/map")
+    assert result.exit_code == 0, result.output
+    assert session[0].onto == (tmp_path / "first: a" / "map").resolve()
+    for option in ("--resume", "--replay"):
+        refused = invoke(option, "out", "--onto", "first")
+        assert refused.exit_code == 2 and refused.stderr.startswith("error: --onto is for a scene")
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_set_what_is_not_given(scene, session, preset):
     invoke(scene, f"--{preset}", "--set", "refine.steps=9")

@@ -380,3 +380,20 @@ def test_the_largest_map_of_images_that_follow_a_clock_cannot_be_waited_for(scen
 def test_a_realtime_run_has_no_snapshots(scene) -> None:
     text = failure(scene(MINIMAL), "mapping.pace=realtime", "snapshot_every=10")
     assert "snapshot_every is for `mapping.pace: complete`; remove one of them" in text
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("mode=offline", "onto is for mode: online, not offline; remove one of them"),
+        ("mapping.pace=realtime", "onto needs frames that wait while they are located"),
+        ("tracker={kind: socket}", "onto needs frames that wait while they are located"),
+    ],
+)
+def test_a_run_that_goes_on_with_another_map_waits_for_no_clock(scene, override: str, said: str) -> None:
+    assert said in failure(scene(MINIMAL), "onto=first", override)
+
+
+def test_the_run_to_go_on_with_is_relative_to_the_scene_file(scene) -> None:
+    file = scene(MINIMAL + "onto: first\n")
+    assert load_scene(file).onto == (file.parent / "first").resolve()

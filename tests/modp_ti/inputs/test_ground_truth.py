@@ -9,6 +9,7 @@ import pytest
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
+from modp_ti.inputs.protocol import Before
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 
 
@@ -32,6 +33,14 @@ def test_frames_get_the_pose_of_their_time_and_others_do_not_count(file: Path) -
 def test_times_that_do_not_match_leave_the_errors_empty(file: Path) -> None:
     truth = open_ground_truth(file)
     assert truth is not None and true_poses(truth, [0.0, 1.0, 2.0])[0] == []
+
+
+def test_frames_of_an_earlier_map_have_no_true_pose_and_the_others_that_of_their_own_time(file: Path) -> None:
+    truth = open_ground_truth(file)
+    assert truth is not None
+    poses, note = true_poses(truth, [0.0, 0.1, 10.1, 10.2, 10.4], Before(frames=2, shift=10.0))
+    assert [-pose[0, 3] for pose in poses] == pytest.approx([np.nan, np.nan, 1, 2, 4], nan_ok=True)
+    assert note is None
 
 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:

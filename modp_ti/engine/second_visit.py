@@ -1,0 +1,200 @@
+"""A second visit: a new recording is located in a finished map, joined to it, and mapped on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.frames.tracked_frame import TrackedFrame
+from fields.runtime.backend import initialise
+from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.snapshots.snapshot import StreamDigest
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.joined_tracker import JoinedTracker, Placement, prefix_for, shift_after
+from modp_ti.inputs.protocol import Tracker
+from modp_ti.outputs.formats.exposure import read_exposures
+from modp_ti.outputs.locating.locator import Locator
+from modp_ti.outputs.locating.world_alignment import (
+    AGREEING,
+    LEAST_POINTS,
+    PlacedFrame,
+    WorldAlignment,
+    image_motion,
+    world_alignment,
+)
+from modp_ti.outputs.playback.finished_frames import FinishedFrames
+from modp_ti.outputs.playback.finished_run import open_run
+from modp_ti.outputs.progress import ProgressLine
+
+__all__ = ["SecondVisit"]
+
+# Located frames that settle the place of the recording.
+SETTLING = 8
+# Most frames that are tried and that wait for it.
+MOST_TRIED, MOST_WAITING = 40, 240
+# Least image motion between two frames that are tried, relative to the diagonal: frames from one place say little.
+APART = 0.08
+
+
+class SecondVisit:
+    """Finds the place of a recording in a finished map, and goes on with that map.
+
+    The finished run's folder is only read.
+
+    Args:
+        config: The settings of the second recording, whose `onto` names the output folder of the finished run.
+        line: Shows the progress.
+
+    Raises:
+        InputError: If there is no finished run, or a damaged one.
+    """
+
+    def __init__(self, config: SceneConfig, line: ProgressLine) -> None:
+        assert config.onto is not None
+        if config.onto.resolve() == config.output.resolve():
+            raise InputError(f"{config.output}: the finished run of onto stays as it is; choose another output")
+        self._config = config
+        self._line = line
+        self._run = open_run(config.onto)
+        self._earlier = FinishedFrames(self._run, line.prepare)
+        self._exposures = read_exposures(self._run.folder / "exposure.json")
+        self._alignment: WorldAlignment
+
+    def join(self, tracker: Tracker) -> Tracker:
+        """Locate the first frames of a tracker in the map. The device is started again.
+
+        Args:
+            tracker: The opened tracker of the second recording, whose events nobody has taken yet.
+
+        Returns:
+            A tracker of the frames of the finished run, and then those of the recording in the world of the map.
+
+        Raises:
+            InputError: If the recording cannot be located.
+        """
+        config, run, events = self._config, self._run, tracker.events()
+        locator = Locator(run.folder, config.device, self._line.console)
+        taken, self._alignment = _settled(locator, events, self._line)
+        initialise(config.device, config.mapper_threads, config.seed)  # frees what the locator has taken
+        first = next(event for event in taken if isinstance(event, TrackedFrame))
+        shift = shift_after(self._earlier.end, first.timestamp)
+        placement = Placement(self._alignment.S_map_tracker, len(run), shift, prefix_for(run.names))
+        return JoinedTracker(self._earlier, tracker, placement, taken, events)
+
+    @property
+    def note(self) -> str:
+        """One line on how the recording was joined."""
+        found = self._alignment
+        return (
+            f"joined to {self._run.folder}: {found.agreeing} of {found.placed} located frames agree within "
+            f"{found.residual:.2f} px, at a scale of {found.scale:.5g}"
+        )
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The entry `onto` of `metrics.json`."""
+        found = self._alignment
+        return {
+            "frames": len(self._run),
+            "located": found.placed,
+            "agreeing": found.agreeing,
+            "residual_px": round(found.residual, 4),
+            "scale": found.scale,
+        }
+
+    def go_on(self, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest) -> None:
+        """Take the frames of the finished run from the joined tracker, and put its map into the mapper.
+
+        Raises:
+            InputError: If the map does not fit the settings.
+        """
+
+        def frames() -> Iterator[TrackedFrame]:
+            for _ in range(len(self._run)):
+                frame = next(arriving)
+                assert isinstance(frame, TrackedFrame), "the finished run's frames come first"
+                digest.add(frame)
+                yield frame
+
+        record = self._run.record
+        try:
+            mapper.go_on_with(self._run.gaussians, frames(), set(record.keyframes), self._exposures, record.scene_depth)
+        except ValueError as error:
+            raise InputError(
+                f"{self._run.folder}: its map does not fit these settings ({error}); map both with the same ones"
+            ) from None
+
+
+def _settled(
+    locator: Locator, events: Iterator[TrackedFrame | PoseCorrection], line: ProgressLine
+) -> tuple[list[TrackedFrame | PoseCorrection], WorldAlignment]:
+    """Take frames until enough of them are located. Returns what was taken, and the alignment of the two worlds."""
+    taken: list[TrackedFrame | PoseCorrection] = []
+    placed: list[PlacedFrame] = []
+    last: TrackedFrame | None = None
+    tried = 0
+    reason = "it has no frame with tracked points"
+    with line.working("locating the recording in the map"):
+        for event in events:
+            taken.append(event)
+            if isinstance(event, PoseCorrection):
+                placed = [_corrected(frame, event) for frame in placed]
+            elif _is_worth_trying(event, last):
+                last, tried = event, tried + 1
+                found = locator.place(event)
+                if isinstance(found, str):
+                    reason = found
+                else:
+                    placed.append(found)
+            if len(placed) >= SETTLING or tried == MOST_TRIED or len(taken) == MOST_WAITING:
+                alignment = world_alignment(placed)
+                if alignment is not None:
+                    return taken, alignment
+                if tried == MOST_TRIED or len(taken) == MOST_WAITING:
+                    break
+        else:
+            alignment = world_alignment(placed)
+            if alignment is not None:
+                return taken, alignment
+    raise InputError(_not_located(len(placed), tried, reason))
+
+
+def _not_located(placed: int, tried: int, reason: str) -> str:
+    if placed < AGREEING:
+        said = f"{placed} of {tried} frames of the recording were located in the map, {AGREEING} are needed"
+        return f"onto: {said} (the last was not: {reason}); begin the recording where the map is, or map it by itself"
+    return (
+        f"onto: the {placed} located frames of the recording do not agree on its place in the map: check its tracking, "
+        "or map it by itself"
+    )
+
+
+def _is_worth_trying(frame: TrackedFrame, last: TrackedFrame | None) -> bool:
+    """Whether a frame that may touch the map shows something else than the last one that was tried."""
+    depth = frame.points.depths(frame.T_camera_world)
+    depth = depth[depth > 0]
+    if frame.held_out or len(depth) < LEAST_POINTS:
+        return False
+    if last is None:
+        return True
+    camera = frame.camera
+    moved = image_motion(camera, float(np.median(depth)), last.T_camera_world, frame.T_camera_world)
+    return moved > APART * float(np.hypot(camera.width, camera.height))
+
+
+def _corrected(frame: PlacedFrame, correction: PoseCorrection) -> PlacedFrame:
+    """Apply a correction of the tracker to a located frame."""
+    T, xyz = frame.T_camera_tracker, frame.xyz.copy()
+    at = np.flatnonzero(correction.index == frame.index)
+    if len(at):
+        T = correction.T_camera_world[at[0]]
+    places = {number: place for place, number in enumerate(correction.ids.tolist())}
+    for row, number in enumerate(frame.ids.tolist()):
+        if number in places:
+            xyz[row] = correction.xyz[places[number]]
+    return replace(frame, T_camera_tracker=T, xyz=xyz)

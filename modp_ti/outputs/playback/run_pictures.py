@@ -1,0 +1,128 @@
+"""The pictures of a finished run in the order of its frames: those that it kept, or read again from its source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.scene_file import load_scene
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources import FrameReader, Picture, Undistorter, open_source
+from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.trackers import open_tracker
+from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
+
+__all__ = ["kept_images", "pictures", "run_settings"]
+
+Preparing = Callable[[str, int, int], None]
+
+
+def kept_images(run: FinishedRun) -> Path | None:
+    """Return the folder of the undistorted images that the run kept (`export.images`), or None."""
+    folder = run.folder / "colmap" / "images"
+    return folder if folder.is_dir() else None
+
+
+def run_settings(run: FinishedRun) -> SceneConfig:
+    """Return the settings of the run. Raises InputError if they cannot be read."""
+    return load_scene(run.folder / "config.yaml")
+
+
+def pictures(run: FinishedRun, preparing: Preparing | None = None) -> Generator[Picture]:
+    """Yield the undistorted picture of every frame. Kept images have no vignette.
+
+    Args:
+        run: The finished run.
+        preparing: Called while a tracker prepares, where the images have to be read through it.
+
+    Raises:
+        InputError: If the images are gone, were live and not kept, or are others than those that were mapped.
+    """
+    folder = kept_images(run)
+    if folder is not None:
+        yield from (_kept(folder, name) for name in run.names)
+        return
+    config = run_settings(run)
+    if config.is_live or config.source.realtime:
+        raise InputError(
+            f"{run.folder}: its frames were live and cannot be read again; such a run needs `export.images: true`"
+        )
+    own = _Frames(run.names, run.cameras)
+    if config.onto is not None:  # the frames of an earlier run come first, in names that say so from the second on
+        first = open_run(config.onto)
+        if len(first) >= len(run) or first.cameras != run.cameras[: len(first)]:
+            raise InputError(f"{config.onto}: it is no longer the run that {run.folder} goes on with; map both again")
+        yield from pictures(first, preparing)
+        names = [name.partition("/")[2] for name in run.names[len(first) :]]
+        own = _Frames(names, run.cameras[len(first) :])
+    yield from _read_again(config, own, run.record.stored_camera, preparing)
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Names in the source, and cameras, of the frames of one recording."""
+
+    names: Sequence[str]
+    cameras: Sequence[PinholeCamera]
+
+
+def _kept(folder: Path, name: str) -> Picture:
+    file = folder / name
+    image = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB) if file.is_file() else None
+    if image is None:
+        raise InputError(f"{file}: the run's image is missing")
+    mask = folder.with_name("masks") / f"{name}.png"
+    valid = None
+    if mask.is_file():
+        stored = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
+        if stored is None or stored.shape != image.shape[:2]:
+            raise InputError(f"{mask}: not the mask of {name}")
+        valid = stored > 0
+    return Picture(np.divide(image, np.float32(255.0), dtype=np.float32), valid, None)
+
+
+def _read_again(
+    config: SceneConfig, frames: _Frames, stored: Intrinsics | None, preparing: Preparing | None
+) -> Generator[Picture]:
+    """Read the frames from the source: by the camera that the run recorded, or through the tracker if it has several.
+
+    The tracker brings the cameras of the frames; `klt` has to track again for that, but it has one camera.
+    """
+    scale = config.source.scale
+    undistorter = None if stored is None or scale == "auto" else stored.undistorter(scale)
+    if undistorter is not None and set(frames.cameras) == {undistorter.camera}:
+        yield from _through_source(config, frames.names, undistorter)
+        return
+    with closing(open_tracker(config.without_clock(), preparing)) as tracker:
+        count = 0
+        for frame, name, camera in zip(tracker, frames.names, frames.cameras, strict=False):
+            if (frame.name, frame.camera) != (name, camera):
+                raise _changed(config)
+            yield Picture(frame.image, frame.mask, frame.vignette)
+            count += 1
+    if count < len(frames.names):
+        raise _changed(config)
+
+
+def _through_source(config: SceneConfig, names: Sequence[str], undistorter: Undistorter) -> Generator[Picture]:
+    with closing(open_source(config.without_clock().source)) as images:
+        source = config.source
+        reader, there = FrameReader(images, source), set(images.selected(source.start, source.stop, source.step))
+        for name in names:
+            if name not in there or images.size(name) != (undistorter.raw.width, undistorter.raw.height):
+                raise _changed(config)
+            yield reader.read(name, undistorter)
+
+
+def _changed(config: SceneConfig) -> InputError:
+    return InputError(
+        f"{config.source.path}: the source no longer gives the frames that were mapped; run the scene again, with "
+        "`export.images: true` to keep them"
+    )

@@ -1,0 +1,146 @@
+"""A second visit to a painted room, by a tracker with a world of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import exp_se3, inverse_se3
+from fields.geometry.similarity import moved_points, moved_pose
+from modp_ti.engine.snapshots.file import FILE
+from modp_ti.outputs.formats.scores_csv import read_scores
+from modp_ti.outputs.formats.splats_ply import read_splats
+from modp_ti.outputs.playback.finished_run import open_run
+from tests.modp_ti.engine.snapshots.test_resume import position, stop_midway
+from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, write_run
+from tests.modp_ti.runs import run
+from tests.room import Room, RoomRecording, walk, write_colmap
+
+pytestmark = pytest.mark.slow
+
+# Similarity from the room to the world of the second tracker.
+S_TRACKER_ROOM = np.diag([0.37, 0.37, 0.37, 1.0]) @ exp_se3([0.4, -2.0, 1.0, 0.9, -1.7, 0.6])
+# Along the same path, and on to where the first visit has not been.
+FRAMES, STEP = 11, 0.17
+FIRST = 7
+# Mean distance of the second visit from the truth [m], in a map whose depths nothing has optimised.
+AWAY = 0.02
+SCENE = """
+source:  {path: images, holdout: 5, fps: 10}
+tracker: {kind: colmap, path: sparse/0}
+output:  out
+device:  cpu
+mapping: {optimise: {steps: 2, last_passes: 1}}
+refine:  {steps: 0}
+export:  {report: true}
+"""
+
+
+@pytest.fixture(scope="module")
+def first(made_once: Callable[[str, Callable[[Path], None]], Path], room: Room) -> Path:
+    """The output folder of a first visit, with its images."""
+
+    def fill(folder: Path) -> None:
+        poses = write_run(room, folder / "out")
+        (folder / "out" / "colmap" / "images").mkdir()
+        for number, T in enumerate(poses):
+            _, png = cv2.imencode(".png", room.image(CAMERA, T)[..., ::-1])
+            (folder / "out" / "colmap" / "images" / f"{number:04d}").write_bytes(png.tobytes())
+
+    return made_once("a first visit", fill) / "out"
+
+
+def second_scene(room: Room, folder: Path) -> Path:
+    """Write the recording of the second visit, tracked in another world, and return its scene file."""
+    recording = RoomRecording(room, CAMERA, walk(FRAMES, step=STEP), seed=1)
+    recording.write(folder)
+    poses = [moved_pose(S_TRACKER_ROOM, T) for T in recording.T_camera_world]
+    xyz, seen, pixels = recording.observations
+    names = [f"{number:04d}.png" for number in range(FRAMES)]
+    write_colmap(folder / "sparse" / "0", CAMERA, names, poses, moved_points(S_TRACKER_ROOM, xyz), seen, pixels)
+    scene = folder / "scene.yaml"
+    scene.write_text(SCENE)
+    return scene
+
+
+def content(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([inverse_se3(T)[:3, 3] for T in poses])
+
+
+def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, room: Room, tmp_path: Path) -> None:
+    before = content(first)
+    scene = second_scene(room, tmp_path)
+    result = run(scene, "--onto", str(first))
+    assert result.returncode == 0, result.stderr
+    assert content(first) == before, "the first visit is only read"
+
+    out = open_run(tmp_path / "out")
+    assert len(out) == FIRST + FRAMES
+    away = np.linalg.norm(centres(out.poses[FIRST:]) - centres(np.array(walk(FRAMES, step=STEP))), axis=1)
+    assert away.mean() < AWAY
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    onto = metrics["onto"]
+    assert onto["frames"] == FIRST and 3 <= onto["agreeing"] <= onto["located"]
+    assert onto["scale"] == pytest.approx(1 / 0.37, rel=0.02)
+    assert f"joined to {first}: {onto['agreeing']} of {onto['located']} located frames agree" in result.stderr
+
+    # Nothing of the two visits collides.
+    assert (np.diff(out.timestamps) > 0).all()
+    assert out.names == [f"{i:04d}" for i in range(FIRST)] + [f"visit2/{i:04d}.png" for i in range(FRAMES)]
+    scores = read_scores(tmp_path / "out" / "scores.csv")
+    assert [score.index for score in scores] == list(range(FIRST + FRAMES))
+    assert out.record.held_out == [FIRST, FIRST + 5, FIRST + 10]
+    assert set(range(FIRST)) < set(out.record.keyframes), "the first visit's keyframes, and new ones"
+
+    # The map goes on where the first visit ended, which it still shows.
+    assert len(out.gaussians["position"]) > len(read_splats(first / "splats.ply")["position"])
+    psnr = np.array([score.psnr for score in scores])
+    assert psnr[:FIRST].min() > 25 and psnr[FIRST:-3].min() > 25
+
+    # It can be visited again, and later commands find its images.
+    third = run(scene, "--onto", str(tmp_path / "out"), "--set", "output=third", "source.stop=6")
+    assert third.returncode == 0, third.stderr
+    again = open_run(tmp_path / "third")
+    assert again.names[: len(out)] == out.names and again.names[-1] == "visit3/0005.png"
+
+
+def test_a_second_visit_that_is_killed_goes_on_as_one_in_peace(first: Path, room: Room, tmp_path: Path) -> None:
+    """It locates the recording again, and comes to the same place."""
+    scene = second_scene(room, tmp_path)
+    options = ["--onto", str(first), "--set", "source.stop=6", "snapshot_every=2"]
+    assert run(scene, *options).returncode == 0
+    peace = (tmp_path / "out").rename(tmp_path / "peace")
+    out = tmp_path / "out"
+    stop_midway([str(scene), *options], out, lambda: position(out / FILE)[0] > FIRST, signal.SIGKILL)
+    result = subprocess.run([sys.executable, "-m", "modp_ti.run", "--resume", str(out)], check=False)
+    assert result.returncode == 0
+    for name in ("splats.ply", "trajectory.txt", "scores.csv"):
+        assert (out / name).read_bytes() == (peace / name).read_bytes(), name
+
+
+def test_a_recording_of_another_place_is_refused_in_one_line(first: Path, tmp_path: Path) -> None:
+    scene = second_scene(another_room(), tmp_path)
+    result = run(scene, "--onto", str(first), "--quiet")
+    assert result.returncode == 2
+    assert result.stderr.startswith("error: onto: 0 of ") and result.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_first_visit_is_not_written_to(first: Path, room: Room, tmp_path: Path) -> None:
+    result = run(second_scene(room, tmp_path), "--onto", str(first), "--quiet", "--set", f"output={first}")
+    assert result.returncode == 2 and "choose another output" in result.stderr

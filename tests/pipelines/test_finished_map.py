@@ -1,0 +1,107 @@
+"""A new map goes on with a finished one: it holds the same Gaussians and views, and grows only where nothing is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.geometry.se3 import exp_se3
+from fields.map.gaussians import NO_ANCHOR
+from fields.runtime.backend import initialise
+from pipelines.finished_map import placed_by
+from pipelines.online import OnlineMapper
+from tests.pipelines.test_online import SETTINGS
+from tests.pipelines.wall import frame
+
+pytestmark = pytest.mark.slow
+
+FRAMES = 5
+
+
+def fresh() -> OnlineMapper:
+    initialise("cpu")  # a process has room for one map
+    return OnlineMapper(SETTINGS, 64, 48, seed=1)
+
+
+@pytest.fixture(scope="module")
+def finished() -> dict:
+    """What a finished run of the wall keeps."""
+    mapper = fresh()
+    for i in range(FRAMES):
+        mapper.process(frame(i))
+    mapper.finish()
+    store = mapper.keyframes
+    return {
+        "gaussians": mapper.gaussians.to_numpy(),
+        "frames": [replace(frame(i), T_camera_world=store.corrected(i, T)) for i, T in mapper.trajectory.items()],
+        "keyframes": [view.index for view in store.selected],
+        "scene_depth": store.scene_depth,
+        "errors": store.errors(),
+        "psnr": mapper.optimiser.compare(store[0], store.scene_depth).psnr,
+    }
+
+
+def gone_on(finished: dict) -> OnlineMapper:
+    mapper = fresh()
+    mapper.go_on_with(finished["gaussians"], finished["frames"], finished["keyframes"], {}, finished["scene_depth"])
+    return mapper
+
+
+def test_the_map_is_the_finished_one(finished: dict) -> None:
+    mapper = gone_on(finished)
+    for name, array in mapper.gaussians.to_numpy().items():
+        np.testing.assert_array_equal(array, finished["gaussians"][name])
+    store = mapper.keyframes
+    assert [view.index for view in store.selected] == finished["keyframes"]
+    assert list(mapper.trajectory) == list(range(FRAMES)) and mapper.frame_count == FRAMES
+    assert store.scene_depth == pytest.approx(finished["scene_depth"], rel=1e-2)
+    assert mapper.optimiser.compare(store[0], store.scene_depth).psnr == pytest.approx(finished["psnr"], abs=0.1)
+    # The errors are those of the map, and not those of keyframes that nothing has optimised.
+    assert store.errors().max() < 2.0 * finished["errors"].max()
+
+
+def test_every_gaussian_has_the_first_keyframe_that_shows_it_as_anchor(finished: dict) -> None:
+    mapper = gone_on(finished)
+    anchors, store = mapper.gaussians.anchors(), mapper.keyframes
+    position = mapper.gaussians.to_numpy()["position"].astype(np.float64)
+    np.testing.assert_array_equal(anchors, placed_by(store, position, mapper.near))
+    assert (anchors != NO_ANCHOR).mean() > 0.95
+    assert [anchor.keyframe for anchor in mapper.densifier.anchors] == list(store)
+    for place in np.unique(anchors[anchors != NO_ANCHOR]):
+        for earlier in range(place):
+            view = store[earlier]
+            local = position[anchors == place] @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+            ahead = local[:, 2] > mapper.near
+            assert not view.camera.contains(view.camera.project(local[ahead])).any()
+
+
+def test_the_voxels_of_the_map_are_taken(finished: dict) -> None:
+    mapper = gone_on(finished)
+    assert mapper.densifier.voxels is not None
+    known = mapper.gaussians.anchors() != NO_ANCHOR
+    position = mapper.gaussians.to_numpy()["position"].astype(np.float64)[known]
+    spacing = min(anchor.spacing for anchor in mapper.densifier.anchors)
+    assert mapper.densifier.voxels.query(position, 2.0 * spacing).mean() > 0.95
+    before = len(mapper.gaussians)
+    mapper.densifier.add_tracked_points(mapper.keyframes[-1])
+    assert len(mapper.gaussians) - before < 0.2 * len(mapper.keyframes[-1].points)
+
+
+def test_a_correction_of_later_frames_leaves_the_finished_map_alone(finished: dict) -> None:
+    mapper = gone_on(finished)
+    for i in range(FRAMES, FRAMES + 3):
+        mapper.process(frame(i))
+    later = [view.index for view in mapper.keyframes if view.index >= FRAMES]
+    assert later, "a frame after the finished map is a keyframe"
+    poses = [view.T_camera_world.copy() for view in mapper.keyframes if view.index < FRAMES]
+    anchors = mapper.gaussians.anchors()
+    old = (anchors >= 0) & (anchors < len(poses))
+    before = mapper.gaussians.to_numpy()["position"][old]
+    away = np.stack([exp_se3([0.3, 0, 0, 0, 0.1, 0]) @ mapper.trajectory[i] for i in later])
+    mapper.corrector.correct(PoseCorrection(np.array(later), away, others_stay=True), SETTINGS.corrections)
+    np.testing.assert_array_equal(mapper.gaussians.to_numpy()["position"][old], before)
+    for view, T in zip(mapper.keyframes, poses, strict=False):
+        np.testing.assert_array_equal(view.T_camera_world, T)
