@@ -12,15 +12,30 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.files.errors import InputError
 from modp_ti.outputs.live_status import LiveStatus
 from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, in_seconds
 from pipelines.settings import RefineSettings
 
-__all__ = ["Conductor", "Event"]
+__all__ = ["Conductor", "Event", "of_one_size"]
 
 Event = TrackedFrame | PoseCorrection
+
+
+def of_one_size(events: Iterator[Event]) -> Iterator[Event]:
+    """Yield the frames and corrections. Raises InputError at the first frame whose image has another size."""
+    size = None
+    for event in events:
+        if isinstance(event, TrackedFrame):
+            this = f"{event.camera.width}x{event.camera.height}"
+            size = size or this
+            if this != size:
+                raise InputError(
+                    f"{event.name} is {this}, the first frame {size}: all images of a scene must have one size"
+                )
+        yield event
 
 
 class Conductor:

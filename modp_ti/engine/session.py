@@ -16,7 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import build_mapper, open_conductor, open_observer
-from modp_ti.engine.conductor import Conductor, Event
+from modp_ti.engine.conductor import Conductor, Event, of_one_size
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
@@ -94,9 +94,8 @@ class _Session:
         self.clock, self.record = RunClock(), RunRecord()
         self.line = ProgressLine(console)
         self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
-        self.observer = open_observer(
-            config.view, self._say, self.line.note, self.held
-        )  # opened first, as what follows may take minutes
+        # Opened first, as what follows may take minutes.
+        self.observer = open_observer(config.view, self._say, self.line.note, self.held)
         self.stop = Interruption(lambda: self.line.note("stopping after this step; Ctrl-C again stops at once"))
         try:
             self.backend = initialise(config.device, config.mapper_threads, config.seed)
@@ -202,20 +201,14 @@ class _Session:
             len(mapper.frames),
             lambda _: after.seconds(len(mapper.frames), self.tracker.frame_count),
         )
-        size = None
         self.record.begin()
         try:
-            for frame in self.conductor.events(arriving, mapper, self.stop, self.observer.on_further_step):
+            events = self.conductor.events(arriving, mapper, self.stop, self.observer.on_further_step)
+            for frame in of_one_size(events):
                 self.checkpointer.digest.add(frame)
                 if isinstance(frame, PoseCorrection):
                     self.conductor.correct(mapper, frame)
                     continue
-                this = f"{frame.camera.width}x{frame.camera.height}"
-                size = size or this
-                if this != size:
-                    raise InputError(
-                        f"{frame.name} is {this}, the first frame {size}: all images of a scene must have one size"
-                    )
                 self._add(frame)
                 self.checkpointer.after_frame()
             if offline:
