@@ -24,7 +24,7 @@ EXAMPLES = examples(
     "modp-ti run room.mp4 --fast   (or a folder of images; the map is in out/room)",
     "modp-ti run --stream 0 --view   (a camera; modp-ti cameras lists them)",
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
-    "modp-ti run second.yaml --onto OUT   (go on with a finished map; OUT stays as it is)",
+    "modp-ti run second.yaml --onto OUT   (go on with a finished map)",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
     "modp-ti run --replay OUT   (repeat a recorded realtime run)",

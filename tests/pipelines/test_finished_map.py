@@ -85,9 +85,15 @@ def test_the_voxels_of_the_map_are_taken(finished: dict) -> None:
     position = mapper.gaussians.to_numpy()["position"].astype(np.float64)[known]
     spacing = min(anchor.spacing for anchor in mapper.densifier.anchors)
     assert mapper.densifier.voxels.query(position, 2.0 * spacing).mean() > 0.95
-    before = len(mapper.gaussians)
-    mapper.densifier.add_tracked_points(mapper.keyframes[-1])
-    assert len(mapper.gaussians) - before < 0.2 * len(mapper.keyframes[-1].points)
+    # Half of a view's points stay out, where the optimiser has left a Gaussian. Without the marks, all come again.
+    grown = []
+    for _ in range(2):
+        before = len(mapper.gaussians)
+        mapper.densifier.add_tracked_points(mapper.keyframes[-1])
+        grown.append(len(mapper.gaussians) - before)
+        mapper.densifier.voxels.clear()
+        mapper.densifier.voxels.settle(mapper.densifier.voxels.coarsest, mapper.densifier.voxels.origin)
+    assert grown[0] < 0.7 * grown[1]
 
 
 def test_a_correction_of_later_frames_leaves_the_finished_map_alone(finished: dict) -> None:

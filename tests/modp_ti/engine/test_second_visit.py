@@ -34,13 +34,13 @@ S_TRACKER_ROOM = np.diag([0.37, 0.37, 0.37, 1.0]) @ exp_se3([0.4, -2.0, 1.0, 0.9
 FRAMES, STEP = 11, 0.17
 FIRST = 7
 # Mean distance of the second visit from the truth [m], in a map whose depths nothing has optimised.
-AWAY = 0.02
+AWAY = 0.03
 SCENE = """
 source:  {path: images, holdout: 5, fps: 10}
 tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
-mapping: {optimise: {steps: 2, last_passes: 1}}
+mapping: {sh_degree: 0, optimise: {steps: 2, last_passes: 1}}
 refine:  {steps: 0}
 export:  {report: true}
 """
@@ -113,16 +113,16 @@ def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, room: Ro
     assert psnr[:FIRST].min() > 25 and psnr[FIRST:-3].min() > 25
 
     # It can be visited again, and later commands find its images.
-    third = run(scene, "--onto", str(tmp_path / "out"), "--set", "output=third", "source.stop=6")
+    third = run(scene, "--onto", str(tmp_path / "out"), "--set", "output=third")
     assert third.returncode == 0, third.stderr
     again = open_run(tmp_path / "third")
-    assert again.names[: len(out)] == out.names and again.names[-1] == "visit3/0005.png"
+    assert again.names[: len(out)] == out.names and again.names[-1] == f"visit3/{FRAMES - 1:04d}.png"
 
 
 def test_a_second_visit_that_is_killed_goes_on_as_one_in_peace(first: Path, room: Room, tmp_path: Path) -> None:
     """It locates the recording again, and comes to the same place."""
     scene = second_scene(room, tmp_path)
-    options = ["--onto", str(first), "--set", "source.stop=6", "snapshot_every=2"]
+    options = ["--onto", str(first), "--set", "snapshot_every=2"]
     assert run(scene, *options).returncode == 0
     peace = (tmp_path / "out").rename(tmp_path / "peace")
     out = tmp_path / "out"
