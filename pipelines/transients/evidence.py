@@ -29,8 +29,8 @@ WINDOW = 0.01
 SAME_DEPTH = 0.08
 # Opacity from which a render has a depth.
 MIN_OPACITY = 0.7
-# Difference from which a view is wrong [1 = white], and as a factor on its median difference. Half of it is right.
-WRONG, FACTOR = 0.06, 4.0
+# Difference from which a view is wrong [1 = white], and as a factor on its median difference. RIGHT of it is right.
+WRONG, FACTOR, RIGHT = 0.1, 6.0, 0.3
 # Number of other views that must see a surface, and the share of them that must agree.
 MIN_LOOKS, MAJORITY = 3, 0.65
 
@@ -46,7 +46,7 @@ class CoarseView:
             where the image has no valid pixels.
         depth: Rendered depth (h, w); 0 where it is unknown [scene units].
         valid: Whether the image is valid (h, w).
-        wrong: Difference from which the view is wrong [1 = white]; half of it is right.
+        wrong: Difference from which the view is wrong [1 = white].
     """
 
     camera: PinholeCamera
@@ -139,7 +139,7 @@ def votes(xyz: NDArray[np.float64], views: Sequence[CoarseView]) -> Ballot:
         same = view.valid[row, column] & (np.abs(view.depth[row, column] - z) < SAME_DEPTH * z)
         seen, difference = seen[same], view.difference[row[same], column[same]]
         looks[seen] += 1
-        right[seen] += difference < 0.5 * view.wrong
+        right[seen] += difference < RIGHT * view.wrong
         wrong[seen] += difference >= view.wrong
     return Ballot(looks, right, wrong)
 
