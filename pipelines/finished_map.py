@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +15,29 @@ from pipelines.densify.densifier import Anchor
 from pipelines.online_map import OnlineMap
 from pipelines.render.cpu.photometric_model import IDENTITY
 
-__all__ = ["go_on_with", "placed_by"]
+__all__ = ["FinishedMap", "go_on_with", "placed_by"]
 
 
-def go_on_with(
-    mapper: OnlineMap,
-    gaussians: Mapping[str, NDArray],
-    frames: Iterable[TrackedFrame],
-    keyframes: Collection[int],
-    exposures: Mapping[int, NDArray[np.float64]],
-    scene_depth: float,
-) -> None:
+@dataclass(frozen=True)
+class FinishedMap:
+    """What a finished run keeps of its map.
+
+    Attributes:
+        gaussians: The Gaussians, as from `GaussianField.to_numpy`.
+        frames: All of its frames in order, with their refined poses. They are iterated over once.
+        keyframes: Indices of the keyframes.
+        exposures: Exposure (3, 4) by frame index, for the frames that have one.
+        scene_depth: Depth of keyframes without tracked points [scene units].
+    """
+
+    gaussians: Mapping[str, NDArray]
+    frames: Iterable[TrackedFrame]
+    keyframes: Collection[int]
+    exposures: Mapping[int, NDArray[np.float64]]
+    scene_depth: float
+
+
+def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
     """Put a finished map into a new online map, so that it can go on with more frames.
 
     The finished map keeps no optimiser state and no voxels. The moments of Adam start at zero. The voxels are marked
@@ -33,31 +46,27 @@ def go_on_with(
 
     Args:
         mapper: The new map, without frames.
-        gaussians: The finished map, as from `GaussianField.to_numpy`.
-        frames: All of its frames in order, with their refined poses.
-        keyframes: Indices of the keyframes.
-        exposures: Exposure (3, 4) by frame index, for the frames that have one.
-        scene_depth: Depth of keyframes without tracked points [scene units].
+        finished: The finished map.
 
     Raises:
         ValueError: If the Gaussians do not fit the settings, or none of the keyframes is among the frames.
     """
-    mapper.gaussians.load(dict(gaussians))
+    mapper.gaussians.load(dict(finished.gaussians))
     unexposed = np.array(IDENTITY) if mapper.settings.exposure.enabled is True else None
-    for frame in frames:
+    for frame in finished.frames:
         mapper.trajectory.add(frame)
         if frame.held_out:
             continue
         mapper.frame_count += 1
-        view = _view_of(mapper, frame, frame.index in keyframes)
+        view = _view_of(mapper, frame, frame.index in finished.keyframes)
         if view is not None:
-            view.exposure = exposures.get(frame.index, unexposed)
+            view.exposure = finished.exposures.get(frame.index, unexposed)
             if len(view.points) == 0:
-                view.median_depth = scene_depth
+                view.median_depth = finished.scene_depth
     if len(mapper.keyframes) == 0:
         raise ValueError("none of the map's keyframes is among its frames")
     mapper.keyframes.take_in_depths()
-    _restore_anchors(mapper, gaussians["position"].astype(np.float64))
+    _restore_anchors(mapper, finished.gaussians["position"].astype(np.float64))
     for view in mapper.keyframes:
         values = mapper.optimiser.compare(view, mapper.keyframes.scene_depth)
         if np.isfinite(values.l1):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframes import Keyframe
 from pipelines import finished_map, online_state
 from pipelines.corrections import CorrectionReport
+from pipelines.finished_map import FinishedMap
 from pipelines.online_map import OnlineMap
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, refine
@@ -222,16 +223,9 @@ class OnlineMapper(OnlineMap):
     ) -> None:
         refine(self, settings, progress, done, schedule)
 
-    def go_on_with(
-        self,
-        gaussians: Mapping[str, NDArray],
-        frames: Iterable[TrackedFrame],
-        keyframes: Collection[int],
-        exposures: Mapping[int, NDArray[np.float64]],
-        scene_depth: float,
-    ) -> None:
+    def go_on_with(self, finished: FinishedMap) -> None:
         """Put a finished map into this new one, see `pipelines.finished_map`."""
-        finished_map.go_on_with(self, gaussians, frames, keyframes, exposures, scene_depth)
+        finished_map.go_on_with(self, finished)
 
     def state(self) -> MapState:
         return online_state.state_of(self)

@@ -46,7 +46,7 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
         holds the masks of all keyframes, concatenated, and `transient_size` (N, 2) their sizes, 0 without a mask.
     """
     views = list(store)
-    arrays = {
+    arrays: dict[str, NDArray] = {
         name: np.array(
             [getattr(view, FIELDS.get(name, name)) for view in views], dtype=np.int64 if name in WHOLE else np.float64
         ).reshape(-1, *shape)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.formats.colmap_model import image_names
 from modp_ti.outputs.formats.map_folder import appearing, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
+from pipelines.finished_map import FinishedMap
 from pipelines.offline import OfflineMapper
 from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
@@ -188,29 +190,15 @@ class Mapper:
         self.pipeline.count_beside(frames.points.nbytes)
         self.finished = finished
 
-    def go_on_with(
-        self,
-        gaussians: Mapping[str, NDArray],
-        frames: Iterable[TrackedFrame],
-        keyframes: Collection[int],
-        exposures: Mapping[int, NDArray[np.float64]],
-        scene_depth: float,
-    ) -> None:
+    def go_on_with(self, finished: FinishedMap) -> None:
         """Go on with a finished map in this new mapper. More frames may follow.
-
-        Args:
-            gaussians: The finished map, as from `read_splats`.
-            frames: All of its frames in order, with their refined poses.
-            keyframes: Indices of its keyframes.
-            exposures: Exposure (3, 4) by frame index, for the frames that have one.
-            scene_depth: Depth of keyframes without tracked points [scene units].
 
         Raises:
             ValueError: If the map does not fit the settings of this mapper, or this mapper is for offline maps.
         """
         if not isinstance(self.pipeline, OnlineMapper):
             raise ValueError("an offline map cannot go on with a finished one")
-        self.pipeline.go_on_with(gaussians, self._noted(frames), keyframes, exposures, scene_depth)
+        self.pipeline.go_on_with(replace(finished, frames=self._noted(finished.frames)))
         self.finished = True
 
     def _noted(self, frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:

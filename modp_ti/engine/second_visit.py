@@ -30,6 +30,7 @@ from modp_ti.outputs.locating.world_alignment import (
 from modp_ti.outputs.playback.finished_frames import FinishedFrames
 from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.progress import ProgressLine
+from pipelines.finished_map import FinishedMap
 
 __all__ = ["SecondVisit"]
 
@@ -122,8 +123,11 @@ class SecondVisit:
                 yield frame
 
         record = self._run.record
+        finished = FinishedMap(
+            self._run.gaussians, frames(), set(record.keyframes), self._exposures, record.scene_depth
+        )
         try:
-            mapper.go_on_with(self._run.gaussians, frames(), set(record.keyframes), self._exposures, record.scene_depth)
+            mapper.go_on_with(finished)
         except ValueError as error:
             raise InputError(
                 f"{self._run.folder}: its map does not fit these settings ({error}); map both with the same ones"

@@ -36,7 +36,7 @@ def soft_mask(
     start = _most(certain)
     if before is not None:
         start |= before == 0
-    _, label = cv2.connectedComponents(agreed.astype(np.uint8), connectivity=8)
+    label = np.asarray(cv2.connectedComponents(agreed.astype(np.uint8), connectivity=8)[1], dtype=np.int64)
     area = np.bincount(label.ravel())
     started = np.bincount(label.ravel(), weights=start.ravel()) > 0
     chosen = started & (area >= MIN_SHARE * label.size)

@@ -11,7 +11,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import NO_ANCHOR
 from fields.runtime.backend import initialise
-from pipelines.finished_map import placed_by
+from pipelines.finished_map import FinishedMap, placed_by
 from pipelines.online import OnlineMapper
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
@@ -46,7 +46,8 @@ def finished() -> dict:
 
 def gone_on(finished: dict) -> OnlineMapper:
     mapper = fresh()
-    mapper.go_on_with(finished["gaussians"], finished["frames"], finished["keyframes"], {}, finished["scene_depth"])
+    kept = (finished[name] for name in ("gaussians", "frames", "keyframes"))
+    mapper.go_on_with(FinishedMap(*kept, {}, finished["scene_depth"]))
     return mapper
 
 

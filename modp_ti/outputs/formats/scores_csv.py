@@ -53,10 +53,10 @@ def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
         try:
             index, name, held_out, stage, psnr, ssim, *others = row
             held = {"0": False, "1": True}[held_out]
-            lpips, *detail = (float(value) if value else None for value in others)
+            lpips, detail = (float(value) if value else None for value in (*others, "")[:2])
             if len(row) != len(rows[0]):
                 raise ValueError
-            score = FrameScore(int(index), name, held, stage, float(psnr), float(ssim), lpips, *detail)
+            score = FrameScore(int(index), name, held, stage, float(psnr), float(ssim), lpips, detail)
         except (ValueError, KeyError):
             raise InputError(f"{file}:{number}: not a line of scores") from None
         scores.append(score)
