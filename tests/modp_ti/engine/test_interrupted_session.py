@@ -76,7 +76,7 @@ class Presser(Observer):
 def test_ctrl_c_after_the_recording_has_ended_saves_the_map_so_far(
     observer: Presser, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session._Session, "_open_observer", lambda _: observer)
+    monkeypatch.setattr(session, "open_observer", lambda *_: observer)
     with pytest.raises(KeyboardInterrupt) as stopped:
         session.run_scene(load_scene(scene))
     out = scene.parent / "out"
@@ -144,7 +144,7 @@ def test_the_finished_map_is_there_before_its_scores_and_stays_without_room_for_
     (out / "metrics.json").write_text("{}")
     (out / "renders").mkdir()
     watcher = Watcher(out)
-    monkeypatch.setattr(session._Session, "_open_observer", lambda _: watcher)
+    monkeypatch.setattr(session, "open_observer", lambda *_: watcher)
     monkeypatch.setattr(results, "write_scores", full)
     with pytest.raises(InputError) as error:
         session.run_scene(load_scene(scene, ["source.stop=12", "refine.seconds=null", "refine.steps=2"]))
