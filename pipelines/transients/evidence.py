@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
+from pipelines.render.renderer import RenderedView
 
 __all__ = ["Ballot", "CoarseView", "coarse_view", "moving", "votes"]
 
@@ -58,9 +59,7 @@ class CoarseView:
 
 
 def coarse_view(
-    render: NDArray[np.floating],
-    depth: NDArray[np.floating],
-    opacity: NDArray[np.floating],
+    render: RenderedView,
     rgba: NDArray[np.uint8],
     camera: PinholeCamera,
     T_camera_world: NDArray[np.float64],
@@ -68,9 +67,7 @@ def coarse_view(
     """Compare a render with its image.
 
     Args:
-        render: Rendered and developed colour (H, W, 3).
-        depth: Composited depth (H, W), not divided by opacity.
-        opacity: Opacity (H, W).
+        render: The render, with its colour developed.
         rgba: Image (H, W, 4) with its mask in the last channel.
         camera: Camera of the image.
         T_camera_world: Pose (4, 4).
@@ -78,18 +75,18 @@ def coarse_view(
     width = min(CELLS, camera.width)
     size = (width, max(round(camera.height * width / camera.width), 1))
     valid = rgba[..., 3] > 0
-    difference = np.clip(render, 0.0, 1.0).astype(np.float32) - rgba[..., :3] / np.float32(255.0)
+    difference = np.clip(render.colour, 0.0, 1.0).astype(np.float32) - rgba[..., :3] / np.float32(255.0)
     difference[~valid] = 0.0
     mean = cv2.GaussianBlur(difference, (0, 0), max(WINDOW * camera.width, 0.5))
     magnitude = np.asarray(cv2.resize(np.abs(mean).mean(axis=2), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    solid = np.where(opacity >= MIN_OPACITY, depth / np.maximum(opacity, 1e-6), 0.0).astype(np.float32)
+    depth = render.expected_depth(MIN_OPACITY).astype(np.float32)
     known = np.asarray(cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST), dtype=bool)
     usual = float(np.median(magnitude[known])) if known.any() else 0.0
     return CoarseView(
         camera=camera.resized(*size),
         T_camera_world=T_camera_world,
         difference=magnitude,
-        depth=np.asarray(cv2.resize(solid, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32),
+        depth=np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32),
         valid=known,
         wrong=max(WRONG, FACTOR * usual),
     )

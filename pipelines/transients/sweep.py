@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe, KeyframeStore
-from pipelines.render.renderer import Renderer
+from pipelines.render.renderer import RenderedView, Renderer
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 from pipelines.transients.masks import soft_mask
 
@@ -47,8 +48,8 @@ def compared(
     renderer.forward(image.camera, T_camera_world, near)
     renderer.develop(exposure, view.vignette)
     images = renderer.images
-    parts = images.colour_to_numpy(), images.depth_to_numpy(), images.opacity_to_numpy()
-    return coarse_view(*parts, image.rgba, image.camera, T_camera_world)
+    render = RenderedView(images.colour_to_numpy(), images.depth_to_numpy(), images.opacity_to_numpy())
+    return coarse_view(render, image.rgba, image.camera, T_camera_world)
 
 
 def neighbours(place: int, count: int) -> list[int]:
@@ -107,7 +108,11 @@ class TransientSweep:
 
     def _remove(self, views: Sequence[Keyframe], coarse: Sequence[CoarseView]) -> None:
         """Remove Gaussians that masks cover in some views, and that are wrong in most of the others that see them."""
-        masked = [_only(c, v.transient) for c, v in zip(coarse, views, strict=True) if v.transient is not None]
+        masked = [
+            replace(c, valid=c.valid & (view.transient == 0))
+            for c, view in zip(coarse, views, strict=True)
+            if view.transient is not None
+        ]
         if not masked:
             return
         position = self.gaussians.to_numpy()["position"].astype(np.float64)
@@ -120,18 +125,9 @@ class TransientSweep:
         self.gaussians.remove(keep)
 
 
-def _only(view: CoarseView, mask: NDArray[np.uint8] | None) -> CoarseView:
-    """The view with only its masked cells valid."""
-    return _with_valid(view, view.valid & (mask == 0))
-
-
 def without(view: CoarseView, mask: NDArray[np.uint8] | None) -> CoarseView:
     """Return the view without its masked cells, which do not vote."""
-    return view if mask is None else _with_valid(view, view.valid & (mask > 0))
-
-
-def _with_valid(view: CoarseView, valid: NDArray[np.bool_]) -> CoarseView:
-    return CoarseView(view.camera, view.T_camera_world, view.difference, view.depth, valid, view.wrong)
+    return view if mask is None else replace(view, valid=view.valid & (mask > 0))
 
 
 def place_of(views: Sequence[Keyframe], index: int) -> int:

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from pipelines.render.renderer import RenderedView
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 
 CAMERA = PinholeCamera(150.0, 150.0, 80.0, 60.0, 160, 120)
@@ -29,7 +30,7 @@ def view(x: float, render: NDArray[np.float64], image: NDArray[np.float64], vali
     T[0, 3] = -x
     rgba = np.dstack([np.rint(255 * image), np.full((120, 160), 255)]).astype(np.uint8)
     rgba[..., 3] *= np.broadcast_to(valid, (120, 160)).astype(np.uint8)
-    return coarse_view(render, np.full((120, 160), DEPTH), np.ones((120, 160)), rgba, CAMERA, T)
+    return coarse_view(RenderedView(render, np.full((120, 160), DEPTH), np.ones((120, 160))), rgba, CAMERA, T)
 
 
 def found(views: list[CoarseView], place: int, kept: bool) -> NDArray[np.bool_]:
