@@ -79,23 +79,26 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     """Start Taichi, compile the kernels of a run, and return the backend, the width and the height.
 
     Taichi finds a kernel in its cache only if the same fields were created before it, so everything is created in the
-    order of a run. Where `size` is None, the width and the height are those of the tracker's first frame.
+    order of a run. Where `size` is None, the width and the height are those that a realtime run expects, or those of the
+    tracker's first frame.
 
     Raises:
         InputError: If the device or the input cannot be used, or a live tracker is given without a size.
     """
     from fields.geometry.camera import PinholeCamera
     from fields.runtime.backend import initialise
-    from modp_ti.engine.build import build_mapper
+    from modp_ti.engine.build import EXPECTED, build_mapper
     from modp_ti.inputs.trackers import open_tracker
 
     try:
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
-    if size is None and config.tracker.is_live:
+    if size is None and config.is_realtime:
+        camera = EXPECTED
+    elif size is None and config.tracker.is_live:
         raise InputError("no frame is there before a tracker sends one: give the size, --size 640x480")
-    if size is None:
+    elif size is None:
         first = next(iter(open_tracker(config.without_clock())), None)
         if first is None:
             raise InputError("the tracker delivered no frame: nothing to compile for")

@@ -16,7 +16,11 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
 from pipelines.pace import CompletePace, Pace
 
-__all__ = ["build_mapper", "open_conductor", "open_observer"]
+__all__ = ["EXPECTED", "build_mapper", "open_conductor", "open_observer"]
+
+# The camera that the mapper of a realtime run is made for before the stream has opened. The images of most are smaller:
+# `source.scale: auto` makes none of them larger than 480 pixels.
+EXPECTED = PinholeCamera(640.0, 640.0, 320.0, 320.0, 640, 640)
 
 
 def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None = None) -> Mapper:

@@ -19,9 +19,24 @@ from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, in_seconds
 from pipelines.settings import RefineSettings
 
-__all__ = ["Conductor", "Event", "of_one_size"]
+__all__ = ["Conductor", "Event", "first_frame", "of_one_size"]
 
 Event = TrackedFrame | PoseCorrection
+
+
+def first_frame(arriving: FramesAhead[Event]) -> TrackedFrame:
+    """Wait for the first frame and return it; it stays the next one of `arriving`.
+
+    Raises:
+        InputError: If there is none, or a correction comes before it.
+    """
+    first = next(arriving, None)
+    if first is None:
+        raise InputError("the tracker delivered no frame: nothing to map")
+    if isinstance(first, PoseCorrection):
+        raise InputError("the tracker corrects poses before its first frame")
+    arriving.put_back(first)
+    return first
 
 
 def of_one_size(events: Iterator[Event]) -> Iterator[Event]:

@@ -88,7 +88,7 @@ class Mapper:
             ValueError: If the frame is out of order or larger than the mapper's images.
         """
         size, images = frame.camera, self.pipeline.renderer.images
-        if size.width > images.max_width or size.height > images.max_height:
+        if not self.takes(size.width, size.height):
             raise ValueError(
                 f"{frame.name} is {size.width}x{size.height}, the mapper was made for images up to "
                 f"{images.max_width}x{images.max_height}"
@@ -99,6 +99,11 @@ class Mapper:
         self._note(frame)
         self.finished = False
         return report
+
+    def takes(self, width: int, height: int) -> bool:
+        """Return whether images of this size [px] fit the mapper."""
+        images = self.pipeline.renderer.images
+        return width <= images.max_width and height <= images.max_height
 
     def optimise_further(self) -> bool:
         """Make one optimisation step on the whole map, for time in which no frame waits.

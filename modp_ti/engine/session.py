@@ -15,8 +15,8 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.build import build_mapper, open_conductor, open_observer
-from modp_ti.engine.conductor import Conductor, Event, of_one_size
+from modp_ti.engine.build import EXPECTED, build_mapper, open_conductor, open_observer
+from modp_ti.engine.conductor import Conductor, Event, first_frame, of_one_size
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
@@ -103,7 +103,8 @@ class _Session:
             raise InputError(str(error)) from None
         self.record.device = describe(self.backend)
         self.line.note(f"device: {self.record.device}")
-        # Set once the first frame has arrived.
+        self.compiling = 0.0  # [s]; 0 until the mapper is made
+        # Set while the stream is opened.
         self.tracker: Tracker
         self.visit: SecondVisit | None = None
         self.conductor: Conductor
@@ -130,32 +131,26 @@ class _Session:
             self.visit = SecondVisit(self.config, self.line)
         self.tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(self.tracker.close)
-        self.config = self.config.resolved(self.tracker.scale)
         if self.visit is not None:
             self.tracker = self.visit.join(self.tracker)
-        self.ahead = self.config.source.prefetch if self.tracker.reads_ahead else 0
-        if self.config.is_realtime:
-            self.ahead = max(self.ahead, 1)  # so that the mapper sees whether a frame waits
         self.conductor = open_conductor(self.config, self.tracker, self.held)
+        if self.config.is_realtime:  # the kernels are loaded while the tracker opens
+            self._make_mapper(EXPECTED)
+        self.config = self.config.resolved(self.tracker.scale)
+        # At least one frame in a realtime run, so that the mapper sees whether a frame waits.
+        self.ahead = max(self.config.source.prefetch if self.tracker.reads_ahead else 0, self.config.is_realtime)
         with FramesAhead(self.tracker.events(), self.ahead) as arriving:
             undistorter = self.tracker.undistorter if self.config.is_realtime else None
-            if undistorter is not None:  # the kernels are compiled while the first frames are tracked
+            if undistorter is not None:  # larger images than expected: while the first frames are tracked
                 self._make_mapper(undistorter.camera)
-            first = next(arriving, None)
-            if first is None:
-                raise InputError("the tracker delivered no frame: nothing to map")
-            if isinstance(first, PoseCorrection):
-                raise InputError("the tracker corrects poses before its first frame")
-            prepared = time.perf_counter() - tick
+            first = first_frame(arriving)
+            prepared = time.perf_counter() - tick - self.compiling
             side = min(first.camera.width, first.camera.height)
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes, *([self.visit.note] if self.visit is not None else []))
-            if undistorter is None:
-                self._make_mapper(first.camera)
-            seconds = self.mapper.pipeline.stopwatch.seconds
-            seconds["track"] = prepared - (0.0 if undistorter is None else seconds["compile"])
-            arriving.put_back(first)
+            self._make_mapper(first.camera)
+            self.mapper.pipeline.stopwatch.seconds["track"] = prepared
             self._open_keeper(resumed, arriving)
             self.observer.begin(self.mapper, self.tracker.frame_count)
             self.clock.begin_mapping()
@@ -170,12 +165,18 @@ class _Session:
         self._say(*(note for note in self.tracker.notes if note not in notes))
 
     def _make_mapper(self, camera: PinholeCamera) -> None:
-        """Make the mapper for images of this camera, and for those of an earlier map that the run goes on with."""
+        """Make the mapper for images of this camera, and for those of an earlier map, unless the present one does."""
         before = self.tracker.before
-        camera = camera.resized(max(camera.width, before.width), max(camera.height, before.height))
-        self.mapper = build_mapper(self.config, camera, self.conductor.pace)
+        width, height = max(camera.width, before.width), max(camera.height, before.height)
+        if self.compiling > 0.0:
+            if self.mapper.takes(width, height):
+                return
+            initialise(self.config.device, self.config.mapper_threads, self.config.seed)  # frees the smaller one
+        self.mapper = build_mapper(self.config, camera.resized(width, height), self.conductor.pace)
+        began = time.perf_counter()
         with self.line.working("compiling kernels (the first time on this machine takes longest)"):
             self.mapper.pipeline.compile()
+        self.compiling += time.perf_counter() - began
 
     def _open_keeper(self, resumed: Snapshot | None, arriving: FramesAhead[Event]) -> None:
         """Create the checkpointer. With `resumed`, restore the map and advance the stream to that position."""

@@ -235,9 +235,11 @@ class KltTracker(Tracker):
 
     def _sum_up(self, names: Sequence[str]) -> None:
         if self._odometry.tracking is None or self._trajectory is None:
+            images = self._reader.images
+            before = "" if images.ending is None else f" before the recording ended ({images.ending})"
             raise InputError(
-                f"{self._reader.images.path}: klt could place none of the {len(names)} images: they need texture, "
-                "and a camera that moves sideways and does not only turn"
+                f"{images.path}: klt could place none of the {len(names)} images{before}: they need texture, and a "
+                "camera that moves sideways and does not only turn"
             )
         if self._odometry.loops:
             self._notes.append(f"klt closed {self._odometry.loops} loops")

@@ -107,9 +107,13 @@ class LiveSource(ImageSource):
                 f"{counts.thinned} of {counts.arrived} frames of {self.path} came faster than they could be tracked "
                 "and were left out evenly"
             )
-        if self._end is not None:
-            notes.append(f"the recording ended: {self._end}")
+        if self.ending is not None:
+            notes.append(f"the recording ended: {self.ending}")
         return notes
+
+    @property
+    def ending(self) -> str | None:
+        return self._end
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
         """Return the names of delivered frames; see `ImageSource`. There are none before the first is delivered."""

@@ -65,6 +65,11 @@ class ImageSource(ABC):
         """One-line remarks for the user. A live source may add more by its end."""
         return self._notes
 
+    @property
+    def ending(self) -> str | None:
+        """Why the recording of a live source ended, None if it was asked to or has not."""
+        return None
+
     def add_note(self, note: str, first: bool = False) -> None:
         """Add a remark after the others, or before them if `first`."""
         self._notes.insert(0 if first else len(self._notes), note)

@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import threading
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -51,7 +52,8 @@ def main() -> None:
         job = connection.recv()
     except EOFError:
         return
-    _Child(connection, ring, CountsBoard(board), job).run()
+    with suppress(BrokenPipeError):  # the parent is gone
+        _Child(connection, ring, CountsBoard(board), job).run()
 
 
 class _Child:

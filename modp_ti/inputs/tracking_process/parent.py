@@ -53,12 +53,12 @@ class TrackingProcess(Tracker):
     stream, goes to the handler that was there before. If the process dies, the recording ends too, with a note. The
     process ends when this one does.
 
+    The process opens the tracker while this one goes on. `notes`, `scale`, `undistorter` and `events` wait until it has
+    done so, and raise InputError if it cannot.
+
     Args:
         config: The scene; the tracker is `klt`.
-        progress: Called while the tracker is opened.
-
-    Raises:
-        InputError: If the tracker cannot be opened.
+        progress: Called while the tracker is opened and this process waits for it.
     """
 
     def __init__(self, config: SceneConfig, progress: Progress | None = None) -> None:
@@ -80,36 +80,46 @@ class TrackingProcess(Tracker):
         theirs.close()
         os.close(board)
         self._interrupt = RecordingInterrupt(self._interrupted)
+        self._progress = progress
+        self._notes: list[str] = []
+        self._scale = 1.0
+        self._undistorter: Undistorter | None = None  # None until the process has opened the tracker
         try:
             self._connection.send(Job(config, None if self._kept is None else Path(self._kept.name)))
-            opened = self._wait_for_opening(progress)
+        except OSError:
+            pass  # the process is gone: the wait for its first message says so
         except BaseException:
             self.close()
             raise
-        self._notes = [*opened.notes, _shared_cores(config)]
-        self._scale = opened.scale
-        self._undistorter = opened.intrinsics.undistorter(opened.scale)
 
-    def _wait_for_opening(self, progress: Progress | None) -> Opened:
-        while True:
+    def _wait_until_open(self) -> None:
+        """Wait until the process has opened the source and the tracker."""
+        while self._undistorter is None:
             message = self._receive()
             if isinstance(message, Opened):
-                return message
-            if isinstance(message, Preparing) and progress is not None:
-                progress(message.what, message.done, message.total)
+                self._notes = [*message.notes, _shared_cores(self._config)]
+                self._scale = message.scale
+                self._undistorter = message.intrinsics.undistorter(message.scale)
+            if isinstance(message, Preparing) and self._progress is not None:
+                self._progress(message.what, message.done, message.total)
             if isinstance(message, Ended):
+                self.close()
                 raise message.error or InputError(f"the tracker could not be opened: {message.failure}")
 
     @property
     def notes(self) -> list[str]:
+        self._wait_until_open()
         return self._notes
 
     @property
     def scale(self) -> float:
+        self._wait_until_open()
         return self._scale
 
     @property
     def undistorter(self) -> Undistorter:
+        self._wait_until_open()
+        assert self._undistorter is not None
         return self._undistorter
 
     @property
@@ -131,6 +141,7 @@ class TrackingProcess(Tracker):
         Raises:
             InputError: If the tracker rejects its input, or the process ends before the first frame.
         """
+        self._wait_until_open()
         while not self._ended:
             message = self._receive()
             if isinstance(message, RingMade):
@@ -159,7 +170,7 @@ class TrackingProcess(Tracker):
         if self._again is None:
             self._again = FrameReader(self._images_again(), self._config.source)
         for record in self._log:
-            yield record.with_picture(self._again.read(record.name, self._undistorter))
+            yield record.with_picture(self._again.read(record.name, self.undistorter))
 
     def close(self) -> None:
         """End the recording and the process, and remove what was stored."""

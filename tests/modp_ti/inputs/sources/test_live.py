@@ -18,6 +18,7 @@ import pytest
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files import disk_room
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.klt import open_klt
 from modp_ti.inputs.sources import live, open_source
 from modp_ti.inputs.sources.live import LiveSource
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
@@ -289,6 +290,18 @@ def test_room_for_the_map_is_kept_on_the_disk(camera, opened, monkeypatch):
     assert list(arriving) == [] and list(source.names) == taken
     said = f"{source._store.folder.parent}: less than 1 GiB is free for the frames of the live source; "
     assert source.notes[-1].startswith(f"the recording ended: {said}")
+
+
+def test_a_tracker_without_a_map_says_that_the_disk_was_full(camera, opened, monkeypatch):
+    camera.send(*range(6))
+    source = opened()
+    tracker = open_klt(SourceSettings(stream=camera.url), images=source)
+    arriving = tracker.events()
+    monkeypatch.setattr("modp_ti.inputs.sources.frame_store.has_room", lambda *_: len(source.names) < 3)
+    with pytest.raises(
+        InputError, match=r"none of the 3 images before the recording ended \(.*less than 1 GiB is free"
+    ):
+        list(arriving)
 
 
 @pytest.mark.parametrize(

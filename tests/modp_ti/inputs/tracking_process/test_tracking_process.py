@@ -127,6 +127,7 @@ def test_a_process_that_is_killed_ends_the_recording_with_a_note(scene, started)
 
 def test_a_process_that_is_killed_before_its_first_frame_is_an_error(scene, started):
     tracker = started(scene(realtime=True, fps=0.01))  # the second image does not come
+    assert tracker.scale == 0.5  # it is open
     os.kill(tracker._process.pid, signal.SIGKILL)
     with pytest.raises(InputError, match=r"^the tracker process ended \(signal 9\) before it delivered a frame$"):
         list(tracker.events())
@@ -181,7 +182,7 @@ def test_a_full_disk_ends_the_recording_with_a_note(scene, started, monkeypatch)
 
 def test_input_errors_are_those_of_the_tracker(scene, started, tmp_path, folder):
     with pytest.raises(InputError, match="no such folder of images"):
-        started(scene(path=tmp_path / "nothing"))
+        list(started(scene(path=tmp_path / "nothing")).events())
     dark = tmp_path / "dark"
     dark.mkdir()
     for i in range(3):
