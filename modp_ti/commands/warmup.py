@@ -79,8 +79,8 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     """Start Taichi, compile the kernels of a run, and return the backend, the width and the height.
 
     Taichi finds a kernel in its cache only if the same fields were created before it, so everything is created in the
-    order of a run. Where `size` is None, the width and the height are those that a realtime run expects, or those of the
-    tracker's first frame.
+    order of a run. Where `size` is None, the width and the height are those that a realtime run expects, or else those
+    of the tracker's first frame.
 
     Raises:
         InputError: If the device or the input cannot be used, or a live tracker is given without a size.
