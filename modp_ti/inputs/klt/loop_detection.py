@@ -14,6 +14,9 @@ __all__ = ["YOUNGEST", "LoopDetection"]
 YOUNGEST = 15  # keyframes between the two ends of a loop, at least
 SHARED = 10  # landmarks: keyframes that share more are connected
 NOTABLE = 5.0  # px: with less drift, the search for landmarks finds those of the other end
+# Radians. Directions drift by a few degrees over a recording. Opposite sides of a building that look alike make turns
+# of 180 degrees, which the check of the adjusted map has missed.
+LARGEST_TURN = 0.8
 CANDIDATES = 2  # keyframes with which a keyframe is compared
 # Cosine of the image descriptors from which keyframes are compared. It is 0.1 to 0.8 for overlapping pictures of
 # redkitchen, and below 0.07 for others.
@@ -70,15 +73,23 @@ class LoopDetection:
             if likeness[at] < LEAST_LIKENESS:
                 break
             found = recognised(landmarks, old[at], landmarks, by, self._seed)
-            if found is None or _offset(found) * landmarks.lens.focal < NOTABLE:
+            if found is None:
+                continue
+            turn, shift = _offset(found)
+            if turn > LARGEST_TURN or (turn + shift) * landmarks.lens.focal < NOTABLE:
                 continue
             self._found.append((k, found))
             best = max(best, agreeing([each for _, each in self._found], found), key=len)
         return best
 
 
-def _offset(found: Recognition) -> float:
-    """Approximate motion of the picture, in focal lengths, from where the map has `by` to where it was recognised."""
+def _offset(found: Recognition) -> tuple[float, float]:
+    """How far the place where `by` was recognised is from where the map has it.
+
+    Returns:
+        The turn [radians], and the shift relative to the scene's depth. Their sum is about the motion of the picture,
+        in focal lengths.
+    """
     off = found.T_camera_world @ inverse_se3(found.by.T_camera_world)
     turn = float(np.arccos(np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-    return turn + float(np.linalg.norm(off[:3, 3])) / found.depth
+    return turn, float(np.linalg.norm(off[:3, 3])) / found.depth

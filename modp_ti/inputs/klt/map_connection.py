@@ -18,7 +18,7 @@ __all__ = ["connected"]
 ROUNDS = 2  # bundle adjustments, each without the outliers of the one before
 # The map contradicts a connection if the residuals of more of the connecting observations, or of the others, are those
 # of outliers after the adjustment.
-LARGEST_LOSS, LARGEST_DAMAGE = 0.5, 0.02
+LARGEST_LOSS, LARGEST_DAMAGE = 0.5, 0.04
 
 
 def connected(landmarks: LandmarkMap, found: Sequence[Recognition], apart: bool = False) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +16,7 @@ from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.loop_closing import LoopClosing
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.pose_graph import Link, closed_loop
-from modp_ti.inputs.klt.recognition import Recognition
+from modp_ti.inputs.klt.recognition import Recognition, recognised
 from modp_ti.inputs.klt.tracking import Tracking
 from modp_ti.outputs.evaluation import umeyama
 from tests.room import look_at
@@ -119,3 +120,19 @@ def test_a_loop_that_the_map_contradicts_is_not_closed(box_room, monkeypatch):
     assert found and (odometry.loops, odometry.undone) == (0, 1)
     for view, other in zip(views, again, strict=True):
         np.testing.assert_array_equal(view.T_camera_world, other.T_camera_world)
+
+
+@pytest.mark.slow
+def test_opposite_walls_that_look_alike_make_no_loop(box_room, monkeypatch):
+    across = {(axis, 1): box_room.textures[axis, 0][:, ::-1] for axis in (0, 1)}
+    room = replace(box_room, textures=box_room.textures | across)
+    recognitions = []
+
+    def noted(*arguments):
+        recognitions.append(recognised(*arguments))
+        return recognitions[-1]
+
+    monkeypatch.setattr("modp_ti.inputs.klt.loop_detection.recognised", noted)
+    odometry, _ = followed(room, round_walk(80, 0.7), None)
+    assert sum(found is not None for found in recognitions) >= 3
+    assert (odometry.loops, odometry.undone) == (0, 0)
