@@ -60,7 +60,7 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: b
 
     if scene is None:
         # A placeholder with default settings, of a tracker that needs no source; neither it nor the output is opened.
-        config = SceneConfig(tracker=SocketSettings(), output=Path())
+        config = SceneConfig(tracker=SocketSettings(), output=Path()).without_clock()
     else:
         config = load_scene(scene, overrides)
     from modp_ti.outputs.progress import ProgressLine
@@ -79,8 +79,8 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     """Start Taichi, compile the kernels of a run, and return the backend, the width and the height.
 
     Taichi finds a kernel in its cache only if the same fields were created before it, so everything is created in the
-    order of a run. Where `size` is None, the width and the height are those that a realtime run expects, or else those
-    of the tracker's first frame.
+    order of a run. A realtime run is made for the images that it expects, unless `size` is larger. Other runs, where
+    `size` is None, are made for those of the tracker's first frame.
 
     Raises:
         InputError: If the device or the input cannot be used, or a live tracker is given without a size.
@@ -94,7 +94,7 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
         backend = initialise(config.device, config.threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
-    if size is None and config.is_realtime:
+    if config.is_realtime and (size is None or max(size) <= EXPECTED.width):
         camera = EXPECTED
     elif size is None and config.tracker.is_live:
         raise InputError("no frame is there before a tracker sends one: give the size, --size 640x480")

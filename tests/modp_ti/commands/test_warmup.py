@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 
 from fields.runtime.engine import engine
 from modp_ti.commands import app as cli
+from modp_ti.engine import build
 from tests.patience import PATIENCE
 
 SCENE = """
@@ -41,6 +43,25 @@ def test_bad_input_gets_one_line_and_exit_code_two(arguments: list[str], complai
     assert result.stdout == ""
     assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
     assert complaint in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "size"),
+    [
+        (["live.yaml"], (640, 640)),
+        (["live.yaml", "--size", "320x240"], (640, 640)),
+        (["live.yaml", "--size", "960x540"], (960, 540)),
+        (["--size", "320x240"], (320, 240)),
+    ],
+)
+def test_a_realtime_run_is_compiled_for_the_images_that_it_expects(arguments, size, tmp_path, monkeypatch) -> None:
+    (tmp_path / "live.yaml").write_text("{tracker: {kind: socket}, output: out, device: cpu}")
+    monkeypatch.chdir(tmp_path)
+    cameras = []
+    monkeypatch.setattr(build, "build_mapper", lambda _, camera: cameras.append(camera) or MagicMock())
+    result = CliRunner().invoke(cli.app, ["warmup", *arguments])
+    assert result.exit_code == 0, result.stderr
+    assert [(camera.width, camera.height) for camera in cameras] == [size]
 
 
 @pytest.mark.slow
