@@ -182,7 +182,7 @@ def evaluate(
                 T, exposure = version.trajectory[frame.index], version.exposures[frame.index]
                 score, render = score_frame(pipeline, frame, T, name, lpips, exposure)
                 if name in still:
-                    score = replace(score, still=still[name].score(frame))
+                    score = replace(score, still=still[name].score(frame, render))
                 scores[name].append(score)
                 rendered(name, frame, render)
     return [score for of in scores.values() for score in of]

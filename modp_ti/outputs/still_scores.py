@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from pipelines.pipeline import Pipeline
-from pipelines.transients.evidence import CoarseView, moving
+from pipelines.render.renderer import RenderedView
+from pipelines.transients.evidence import CoarseView, coarse_view, moving
 from pipelines.transients.masks import soft_mask
 from pipelines.transients.sweep import compared, neighbours, place_of, without
 
@@ -65,19 +66,23 @@ class StillScorer:
             coarse = compared(pipeline.renderer, view, T, exposure, pipeline.near)
             self._coarse.append(without(coarse, view.transient))
 
-    def score(self, frame: TrackedFrame) -> StillScore:
-        """Score a frame. The renderer's images are overwritten."""
-        renderer = self._pipeline.renderer
-        T, exposure = self._version.trajectory[frame.index], self._version.exposures[frame.index]
-        coarse = compared(renderer, frame, T, exposure, self._pipeline.near)
+    def score(self, frame: TrackedFrame, colour: NDArray[np.float32]) -> StillScore:
+        """Score the frame that was rendered last.
+
+        Args:
+            frame: The frame. The renderer's images hold its render, with the colour developed and clipped.
+            colour: The colour (H, W, 3) of that render.
+        """
+        images = self._pipeline.renderer.images
+        render = RenderedView(colour, images.depth_to_numpy(), images.opacity_to_numpy())
+        coarse = coarse_view(render, frame.rgba, frame.camera, self._version.trajectory[frame.index])
         around = neighbours(place_of(self._views, frame.index), len(self._views))
         mask = soft_mask(*moving(coarse, [self._coarse[i] for i in around], kept=False))
         rgba = frame.rgba.copy()
         if mask is not None:
             size = (frame.camera.width, frame.camera.height)
             rgba[np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR)) < 255] = 0
-        renderer.images.clip_colour()
-        renderer.images.set_reference(rgba)
+        images.set_reference(rgba)
         values = self._pipeline.loss.forward()
         moving_share = 1.0 - (rgba[..., 3] > 0).sum() / max((frame.rgba[..., 3] > 0).sum(), 1)
         return StillScore(values.psnr, values.ssim, float(moving_share))

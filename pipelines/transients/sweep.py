@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe, KeyframeStore
 from pipelines.render.renderer import RenderedView, Renderer
@@ -30,21 +29,21 @@ ROUNDS = 2
 
 def compared(
     renderer: Renderer,
-    view: Keyframe | TrackedFrame,
+    view: Keyframe,
     T_camera_world: NDArray[np.float64],
     exposure: NDArray[np.float64] | None,
     near: float,
 ) -> CoarseView:
-    """Render a view and compare it with its image, without its mask of what moves.
+    """Render a keyframe and compare it with its image, without its mask of what moves.
 
     Args:
         renderer: Renderer of the map. Its images are overwritten.
-        view: A keyframe, at half its size if its pyramid has that, or a frame.
+        view: The keyframe, which is compared at half its size if its pyramid has that.
         T_camera_world: Pose (4, 4) to render from.
         exposure: Exposure (3, 4); None for the identity.
         near: Depth below which nothing is drawn [scene units].
     """
-    image = view.whole_image(1) if isinstance(view, Keyframe) else view.pyramid[0]
+    image = view.whole_image(1)
     renderer.forward(image.camera, T_camera_world, near)
     renderer.develop(exposure, view.vignette)
     images = renderer.images

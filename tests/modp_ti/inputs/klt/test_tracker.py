@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
@@ -80,6 +81,29 @@ def test_corrections_lead_from_the_delivered_poses_to_the_last_ones(delivered, b
     for frame in last:
         np.testing.assert_array_equal(frame.T_camera_world, poses[frame.index])
     assert absolute_trajectory_error([poses[i] for i in range(60)], box_walk.poses) < 0.01
+
+
+def test_images_that_exif_turns_are_tracked_like_upright_ones(box_room, box_walk, tmp_path):
+    exif, camera = Image.Exif(), box_room.camera
+    exif[0x0112] = 6  # stored on its side, shown after a turn clockwise
+    for name in ("stored", "upright"):
+        (tmp_path / name).mkdir()
+    for i, image in enumerate(box_walk.images[:30]):
+        file = tmp_path / "stored" / f"{i:04d}.jpg"
+        Image.fromarray(np.rot90(image)).save(file, exif=exif, quality=95)
+        stored = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        assert stored.shape == (320, 240, 3)
+        cv2.imwrite(str(tmp_path / "upright" / f"{i:04d}.png"), cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE))
+    intrinsics = IntrinsicsSettings(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+    stored, upright = (
+        list(open_klt(SourceSettings(path=tmp_path / name, intrinsics=intrinsics))) for name in ("stored", "upright")
+    )
+    assert len(stored) == len(upright) == 30
+    for a, b in zip(stored, upright, strict=True):
+        assert a.camera == b.camera == camera
+        np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(a.T_camera_world, b.T_camera_world)
+        np.testing.assert_array_equal(a.points.pixels, b.points.pixels)
 
 
 def test_iterating_alone_tracks_too_and_gives_the_same(delivered, box_room, box_walk, tmp_path):
