@@ -20,6 +20,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import engine
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine import session
+from modp_ti.engine.build import build_mapper
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import summary
@@ -294,3 +295,19 @@ def test_a_tracker_is_closed_and_heard_to_its_end_however_the_run_ends(scene, mo
     assert tracker.closed
     notes = [line for line in said.getvalue().splitlines() if line.startswith("note: said")]
     assert notes == ["note: said first", "note: said last"]
+
+
+@pytest.mark.parametrize(("expected", "made"), [(96, [96]), (16, [16, 80])])
+def test_a_realtime_run_makes_a_larger_mapper_only_for_images_larger_than_expected(scene, monkeypatch, expected, made):
+    sides = []
+
+    def noted(config, camera, pace):
+        sides.append(camera.width)
+        return build_mapper(config, camera, pace)
+
+    monkeypatch.setattr(session, "EXPECTED", PinholeCamera(1.0, 1.0, 8.0, 8.0, expected, expected))
+    monkeypatch.setattr(session, "build_mapper", noted)
+    output = session.run_scene(load_scene(scene, ["mapping.pace=realtime"]))
+    assert sides == made
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["frames"] == 9 and metrics["seconds"]["track"] >= 0
