@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.comparison import differing_keys, leaves
 from modp_ti.config.keys import as_yaml
 from modp_ti.config.old_settings import without_leftovers
 from modp_ti.config.scene_file import load_scene, scene_from_data
@@ -15,12 +15,23 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.engine.snapshots.snapshot import Snapshot, StreamDigest
+from modp_ti.engine.snapshots.store import fetch_snapshot
 from modp_ti.files.errors import InputError
 
-__all__ = ["load_resumed", "replay"]
+__all__ = ["continued", "load_resumed", "replay"]
 
 # Settings that may change on resuming: the map does not depend on them, but for the device, in the last digits.
-FREE = ("output", "device", "threads", "snapshot_every", "source.prefetch", "evaluation", "export", "view")
+FREE = (
+    "output",
+    "device",
+    "threads",
+    "snapshot_every",
+    "snapshot_store",
+    "source.prefetch",
+    "evaluation",
+    "export",
+    "view",
+)
 
 
 def load_resumed(
@@ -41,6 +52,9 @@ def load_resumed(
         InputError: If there is no usable snapshot, or a setting that the map depends on has changed.
     """
     file = output / FILE
+    config = None if scene is None else load_scene(scene, overrides, preset)
+    if config is not None and config.snapshot_store:
+        fetch_snapshot(config.snapshot_store, output)
     if not output.is_dir():
         raise InputError(f"{output}: no such folder (--resume); give the output folder of an interrupted run")
     if not file.is_file():
@@ -48,31 +62,28 @@ def load_resumed(
             raise InputError(f"{output}: this run is finished; there is nothing to resume")
         raise InputError(f"{file}: there is no snapshot; start the run from its scene, and set `snapshot_every`")
     snapshot = Snapshot.read(file)
-    if scene is None:
-        config = scene_from_data(snapshot.settings, str(file), overrides)
-    else:
-        config = load_scene(scene, overrides, preset)
-    config = config.model_copy(update={"output": output.resolve()})
-    before = _leaves(without_leftovers(snapshot.settings))
+    config = config or scene_from_data(snapshot.settings, str(file), overrides)
+    return continued(config.model_copy(update={"output": output.resolve()}), snapshot), snapshot
+
+
+def continued(config: SceneConfig, snapshot: Snapshot) -> SceneConfig:
+    """Return the settings with which a snapshot's run continues, given those of its scene.
+
+    Raises:
+        InputError: If a setting that the map depends on has changed.
+    """
+    settings = without_leftovers(snapshot.settings)
+    before = leaves(settings)
     scale = before.get("source.scale")
     if isinstance(scale, float):  # the run's number, which `auto` in the scene file became
         config = config.resolved(scale)
-    now = _leaves(config.model_dump(mode="json"))
-    for key in [*now, *(key for key in before if key not in now)]:
-        if before.get(key) != now.get(key) and not any(key == free or key.startswith(f"{free}.") for free in FREE):
-            raise InputError(
-                f"{file}: the snapshot was made with {key}: {as_yaml(before.get(key))}, not {as_yaml(now.get(key))}; "
-                "resume with the settings of the interrupted run"
-            )
-    return config, snapshot
-
-
-def _leaves(data: dict[str, Any], start: str = "") -> dict[str, Any]:
-    """Flatten nested settings to dotted keys."""
-    leaves: dict[str, Any] = {}
-    for key, value in data.items():
-        leaves |= _leaves(value, f"{start}{key}.") if isinstance(value, dict) else {f"{start}{key}": value}
-    return leaves
+    now = config.model_dump(mode="json")
+    for key in differing_keys(settings, now, FREE):
+        raise InputError(
+            f"{snapshot.path}: the snapshot was made with {key}: {as_yaml(before.get(key))}, not "
+            f"{as_yaml(leaves(now).get(key))}; resume with the settings of the interrupted run"
+        )
+    return config
 
 
 def replay(
