@@ -46,11 +46,10 @@ def map_scene(settings: dict[str, Any], report: Report) -> dict[str, Any]:
     with sole_use(config.output):
         metrics = finished_metrics(config)
         if metrics is None:
-            if config.snapshot_store:
-                try:
-                    fetch_snapshot(config.snapshot_store, config.output)
-                except StorageError as error:
-                    console.print(f"note: {error}", highlight=False, soft_wrap=True, markup=False)
+            try:
+                fetch_snapshot(config)
+            except StorageError as error:
+                console.print(f"note: {error}", highlight=False, soft_wrap=True, markup=False)
             run_scene(*_begun(config, console), watch=report)
             metrics = finished_metrics(config)
         if metrics is None:

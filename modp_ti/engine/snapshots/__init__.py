@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from modp_ti.engine.snapshots.checkpointer import Checkpointer
-from modp_ti.engine.snapshots.resume import continued, load_resumed, replay
+from modp_ti.engine.snapshots.resume import continued, fetch_snapshot, load_resumed, replay
 from modp_ti.engine.snapshots.snapshot import Snapshot
-from modp_ti.engine.snapshots.store import fetch_snapshot
 
 __all__ = ["Checkpointer", "Snapshot", "continued", "fetch_snapshot", "load_resumed", "replay"]

@@ -1,7 +1,9 @@
-"""Resuming a run: load the settings of its snapshot, and read again the frames that it was made from."""
+"""Resuming a run: find its snapshot and settings, and read again the frames that the snapshot was made from."""
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -15,10 +17,11 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.engine.snapshots.snapshot import Snapshot, StreamDigest
-from modp_ti.engine.snapshots.store import fetch_snapshot
+from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
+from modp_ti.files.storage import Storage
 
-__all__ = ["continued", "load_resumed", "replay"]
+__all__ = ["continued", "fetch_snapshot", "load_resumed", "replay"]
 
 # Settings that may change on resuming: the map does not depend on them, but for the device, in the last digits.
 FREE = (
@@ -53,8 +56,9 @@ def load_resumed(
     """
     file = output / FILE
     config = None if scene is None else load_scene(scene, overrides, preset)
-    if config is not None and config.snapshot_store:
-        fetch_snapshot(config.snapshot_store, output)
+    if config is not None:
+        config = config.model_copy(update={"output": output.resolve()})
+        fetch_snapshot(config)
     if not output.is_dir():
         raise InputError(f"{output}: no such folder (--resume); give the output folder of an interrupted run")
     if not file.is_file():
@@ -84,6 +88,40 @@ def continued(config: SceneConfig, snapshot: Snapshot) -> SceneConfig:
             f"{as_yaml(leaves(now).get(key))}; resume with the settings of the interrupted run"
         )
     return config
+
+
+def fetch_snapshot(config: SceneConfig) -> None:
+    """Put the snapshot of `snapshot_store` into the output folder, unless the one there is of use and as far.
+
+    Raises:
+        StorageError: If the storage cannot be read.
+        InputError: If the output folder cannot be written.
+    """
+    if not config.snapshot_store:
+        return
+    file = config.output / FILE
+    with tempfile.TemporaryDirectory(prefix="modp-ti-snapshot-") as folder:
+        fetched = Path(folder) / FILE
+        if not Storage(config.snapshot_store).get(FILE, fetched):
+            return
+        if file.is_file() and _progress(fetched, config) <= _progress(file, config):
+            return
+        try:
+            config.output.mkdir(parents=True, exist_ok=True)
+            with replacing(file) as target, fetched.open("rb") as source:
+                shutil.copyfileobj(source, target)
+        except OSError as error:
+            raise InputError(f"{config.output}: cannot be written: {error.strerror}") from None
+
+
+def _progress(file: Path, config: SceneConfig) -> tuple[int, bool, int]:
+    """Return how far a snapshot is in the run, in an order; before all others if it does not fit the settings."""
+    try:
+        snapshot = Snapshot.read(file)
+        continued(config, snapshot)
+    except InputError:
+        return -1, False, 0
+    return snapshot.position.events, snapshot.position.finished, snapshot.position.refined
 
 
 def replay(

@@ -1,18 +1,14 @@
-"""Copies of a run's snapshots in a storage that other machines reach."""
+"""`SnapshotStore`: copies of a run's snapshots in a storage that other machines reach."""
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from modp_ti.engine.snapshots.file import FILE, read_arrays
-from modp_ti.files.atomic import replacing
-from modp_ti.files.errors import InputError
+from modp_ti.engine.snapshots.file import FILE
 from modp_ti.files.storage import Storage, StorageError
 
-__all__ = ["SnapshotStore", "fetch_snapshot"]
+__all__ = ["SnapshotStore"]
 
 # Failures in a row after which nothing more is copied, since each may take minutes.
 TOO_MANY = 2
@@ -57,31 +53,3 @@ class SnapshotStore:
         if not self._said:
             self._said = True
             self._say(what)
-
-
-def fetch_snapshot(url: str, output: Path) -> None:
-    """Put the snapshot of a storage into an output folder, unless that has one that is at least as far.
-
-    Raises:
-        StorageError: If the storage cannot be read.
-        InputError: If the output folder cannot be written.
-    """
-    with tempfile.TemporaryDirectory(prefix="modp-ti-snapshot-") as folder:
-        fetched = Path(folder) / FILE
-        if not Storage(url).get(FILE, fetched) or _progress(fetched) <= _progress(output / FILE):
-            return
-        try:
-            output.mkdir(parents=True, exist_ok=True)
-            with replacing(output / FILE) as target, fetched.open("rb") as source:
-                shutil.copyfileobj(source, target)
-        except OSError as error:
-            raise InputError(f"{output}: cannot be written: {error.strerror}") from None
-
-
-def _progress(file: Path) -> tuple[int, bool, int]:
-    """Return how far a snapshot is in its run, in an order; before all others where it is missing or damaged."""
-    try:
-        position = read_arrays(file)[1]["position"]
-        return int(position["events"]), bool(position["finished"]), int(position["refined"])
-    except (InputError, KeyError, TypeError, ValueError):
-        return -1, False, 0
