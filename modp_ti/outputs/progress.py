@@ -44,6 +44,8 @@ class StageProgress:
     left: str = ""
 
     def __str__(self) -> str:
+        if self.total is None and not self.done:
+            return self.what
         total = "" if self.total is None else f"/{self.total}"
         return f"{self.what} {self.done}{total}  {self.state}{self.left}".rstrip()
 

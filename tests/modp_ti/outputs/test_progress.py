@@ -122,7 +122,7 @@ def test_who_watches_is_told_every_change_of_a_stage() -> None:
     line.frame(FrameReport(0, True, 1, 1200, 20.5))
     line.frame(None, 3)
     line.stop()
-    assert told[0] == StageProgress("compiling")
+    assert told[0] == StageProgress("compiling") and str(told[0]) == "compiling"
     assert [(one.what, one.done, one.total) for one in told[1:]] == [
         ("mapping", 0, 2),
         ("mapping", 1, 2),
