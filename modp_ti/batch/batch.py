@@ -140,6 +140,9 @@ class _Batch:
             self._change(event.name, attempts=event.attempt)
             self._table.retried(event.name, event.attempt, event.error)
         elif isinstance(event, Ended):
+            if event.answer.end is not End.interrupted:
+                known = self._results[event.name]
+                self._change(event.name, attempts=known.attempts or 1, machine=event.machine or known.machine)
             self._answered(event.name, event.answer)
         elif isinstance(event, Stopping):
             self._table.note("stopping when all scenes have saved what they have; Ctrl-C again stops at once")

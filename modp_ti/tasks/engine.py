@@ -36,10 +36,12 @@ class Ended:
     Attributes:
         name: Name of the call.
         answer: How it ended.
+        machine: Name of the machine that it ran on, "" if it did not begin or was lost.
     """
 
     name: str
     answer: Answer
+    machine: str = ""
 
 
 class Engine(AbstractContextManager["Engine"], Protocol):

@@ -158,7 +158,7 @@ class LocalEngine(Engine):
                 continue
             call.close()
             del self._running[name]
-            found.append(Ended(name, message))
+            found.append(Ended(name, message, self._machine))
         return found
 
 

@@ -36,8 +36,8 @@ class _Board:
         return latest
 
 
-def _perform(name: str, work: Work, board: Any) -> Answer:
-    """Make a call in a worker process of Ray."""
+def _perform(name: str, work: Work, board: Any) -> tuple[Answer, str]:
+    """Make a call in a worker process of Ray. Return its end and the name of the machine."""
     machine, told = platform.node(), 0.0
     board.put.remote(name, machine, None)
 
@@ -47,7 +47,7 @@ def _perform(name: str, work: Work, board: Any) -> Answer:
             told = time.monotonic()
             board.put.remote(name, machine, content)
 
-    return perform(work, report)
+    return perform(work, report), machine
 
 
 class RayEngine(Engine):
@@ -82,7 +82,8 @@ class RayEngine(Engine):
             self._held.close()
             reason, where = " ".join(str(error).split())[:200], address or "this machine"
             raise InputError(f"Ray at {where} cannot be used: {reason}; start it, or correct --address") from None
-        self._board: Any = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
+        board = ray.remote(_Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
+        self._board: Any = board.remote()
         # A worker runs one call and ends: a process has room for one map. `run_tasks` counts the attempts.
         self._remote: Any = ray.remote(max_calls=1, max_retries=0)(_perform)
         self._names: dict[Any, str] = {}  # of the calls that have not ended, by the reference to their answer
@@ -101,7 +102,7 @@ class RayEngine(Engine):
         names = list(self._names)
         ready = self._ray.wait(names, num_returns=len(names), timeout=wait)[0] if names else []
         found: list[Running | Ended] = list(self._reported())
-        return found + [Ended(self._names.pop(reference), self._answer(reference)) for reference in ready]
+        return found + [Ended(self._names.pop(reference), *self._answer(reference)) for reference in ready]
 
     def stop(self) -> None:
         for reference in self._names:
@@ -121,19 +122,20 @@ class RayEngine(Engine):
         running = set(self._names.values())
         return [Running(name, *told) for name, told in latest.items() if name in running]
 
-    def _answer(self, reference: Any) -> Answer:
+    def _answer(self, reference: Any) -> tuple[Answer, str]:
+        """Return the end of a call, and its machine where that is known."""
         exceptions = self._ray.exceptions
         try:
             return self._ray.get(reference)
         except exceptions.TaskCancelledError:
-            return Answer(End.interrupted, error="interrupted")
+            return Answer(End.interrupted, error="interrupted"), ""
         except exceptions.OutOfMemoryError:
-            return Answer(End.lost, error="its machine ran out of memory, and Ray ended its process (--memory)")
+            return Answer(End.lost, error="its machine ran out of memory, and Ray ended its process (--memory)"), ""
         except exceptions.WorkerCrashedError:
-            return Answer(End.lost, error="its process ended")
+            return Answer(End.lost, error="its process ended"), ""
         except (exceptions.NodeDiedError, exceptions.ObjectLostError):
-            return Answer(End.lost, error="its machine was lost")
+            return Answer(End.lost, error="its machine was lost"), ""
         except exceptions.RayTaskError as error:  # before the call began, such as another version of the program there
-            return Answer(End.fault, error=f"Ray could not begin it ({error.cause!r})", traceback=str(error))
+            return Answer(End.fault, error=f"Ray could not begin it ({error.cause!r})", traceback=str(error)), ""
         except exceptions.RayError as error:
-            return Answer(End.lost, error=f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
+            return Answer(End.lost, error=f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"), ""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,22 +13,18 @@ from modp_ti.batch.results import State
 from modp_ti.batch.scenes import read_scenes
 from modp_ti.tasks import Ended, Running
 from modp_ti.tasks.ray_engine import RayEngine
+from tests.modp_ti.tasks.machines import made_cluster, other_machine
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'modp-ti[cluster]'")
 pytestmark = pytest.mark.slow
 
 
 class LosingEngine(RayEngine):
-    """Kills a raylet when two calls run.
+    """Loses a machine of its cluster when two calls run."""
 
-    Args:
-        address: Address of the cluster.
-        raylet: Process of the raylet.
-    """
-
-    def __init__(self, address: str, raylet: int) -> None:
-        super().__init__(address)
-        self._raylet = raylet
+    def __init__(self, cluster: Any) -> None:
+        super().__init__(cluster.address)
+        self._cluster = cluster
         self._begun: set[str] = set()
 
     def events(self, wait: float) -> list[Running | Ended]:
@@ -36,15 +32,13 @@ class LosingEngine(RayEngine):
         before = len(self._begun)
         self._begun |= {event.name for event in found if isinstance(event, Running)}
         if before < 2 <= len(self._begun):
-            os.kill(self._raylet, signal.SIGKILL)
+            other_machine(self._cluster).lose()
         return found
 
 
 def test_scenes_of_a_lost_machine_are_mapped_on_another_to_the_same_bytes(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ray.cluster_utils import Cluster
-
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "no-torch"))
     monkeypatch.setenv("PYTHONPATH", os.getcwd())  # for the processes of the cluster
     text = (finished.parent / "scene.yaml").read_text().replace("path: ", f"path: {finished.parent}/")
@@ -53,10 +47,9 @@ def test_scenes_of_a_lost_machine_are_mapped_on_another_to_the_same_bytes(
         files.append(tmp_path / f"{name}.yaml")
         files[-1].write_text(text.replace("output:  out", f"output: maps/{name}"))
     files[2].write_text(files[2].read_text().replace("/images", "/no-images"))
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    cluster = made_cluster()
     try:
-        raylets = [cluster.add_node(num_cpus=1).all_processes["raylet"][0].process.pid for _ in range(2)]
-        with LosingEngine(cluster.address, raylets[1]) as engine:
+        with LosingEngine(cluster) as engine:
             results = run_batch(read_scenes(files), engine, tmp_path / "batch")
     finally:
         cluster.shutdown()

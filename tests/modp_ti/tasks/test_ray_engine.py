@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,6 +13,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.tasks import Retried, Running, Task, Watched, open_engine, run_tasks
 from modp_ti.tasks.task import End
 from tests.modp_ti.tasks import calls
+from tests.modp_ti.tasks.machines import made_cluster, other_machine
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'modp-ti[cluster]'")
 pytestmark = pytest.mark.slow
@@ -22,13 +21,9 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def cluster() -> Iterator[Any]:
-    """A cluster of a head, which runs no tasks, and two machines of one core."""
     import ray
-    from ray.cluster_utils import Cluster
 
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
-    for _ in range(2):
-        made.add_node(num_cpus=1)
+    made = made_cluster()
     yield made
     ray.shutdown()
     made.shutdown()
@@ -54,14 +49,15 @@ def test_tasks_end_as_on_this_machine(cluster: Any, tmp_path: Path) -> None:
     assert "in stumble" in answers["stumbles"].traceback
 
 
-def test_tasks_of_a_machine_that_is_lost_go_on_on_another(cluster: Any, tmp_path: Path) -> None:
-    raylet = list(cluster.worker_nodes)[-1].all_processes["raylet"][0].process
+def test_tasks_of_a_machine_that_is_lost_go_on_on_another(cluster: Any) -> None:
     seen: list[Watched | None] = []
+    lost: list[bool] = []
 
     def watch(event: Watched | None) -> None:
         seen.append(event)
-        if len({e.name for e in seen if isinstance(e, Running)}) == 2 and raylet.poll() is None:
-            os.kill(raylet.pid, signal.SIGKILL)
+        if len({e.name for e in seen if isinstance(e, Running)}) == 2 and not lost:
+            lost.append(True)
+            other_machine(cluster).lose()
 
     tasks = [Task(name, partial(calls.rest, 3.0)) for name in ("a", "b")]
     with open_engine("ray", cluster.address) as engine:
