@@ -15,7 +15,7 @@ from modp_ti.files.errors import InputError
 __all__ = ["EXAMPLES", "batch"]
 
 EXAMPLES = examples(
-    "modp-ti batch */scene.yaml   (again: goes on, and repeats nothing that is finished)",
+    "modp-ti batch */scene.yaml   (again: goes on with what is not finished)",
     "modp-ti batch videos/*.mp4 --fast --jobs 2   (to out/NAME, as modp-ti run)",
     "modp-ti batch */scene.yaml --set refine.steps=3000 -o out/careful",
     "modp-ti batch */scene.yaml --engine ray --cpus 4 --memory 4",
