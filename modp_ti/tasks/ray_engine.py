@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import platform
+import re
+import socket
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout, suppress
@@ -17,6 +19,8 @@ __all__ = ["RayEngine"]
 
 # Least time between two reports of a call, since each is a message to the driver's machine [s].
 REPORT_EVERY = 1.0
+# Longest wait for a cluster to answer [s].
+CONNECT_WAIT = 10.0
 # Longest wait for the board of reports, which are left out rather than waited for [s].
 BOARD_WAIT = 5.0
 
@@ -50,6 +54,18 @@ def _perform(name: str, work: Work, board: Any) -> tuple[Answer, str]:
     return perform(work, report), machine
 
 
+def _require_reachable(address: str) -> None:
+    """Raise InputError if nothing answers at `HOST:PORT`. Ray itself would try for minutes."""
+    found = re.fullmatch(r"(?:ray://)?\[?([^/\]]+)\]?:([0-9]{1,5})", address)
+    if found is None:
+        return
+    try:
+        socket.create_connection((found[1], int(found[2])), CONNECT_WAIT).close()
+    except (OSError, OverflowError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
+        raise InputError(f"Ray at {address} cannot be reached: {reason}; start it, or correct --address") from None
+
+
 class RayEngine(Engine):
     """Runs calls on a Ray cluster, on whose machines the same MODP-Ti must be installed.
 
@@ -70,6 +86,8 @@ class RayEngine(Engine):
             NodeAffinitySchedulingStrategy,
         )
 
+        if address is not None:
+            _require_reachable(address)
         self._ray = ray
         # Ray prints a paragraph for every lost worker. Standard output is for results, and the events tell it shortly.
         self._held = ExitStack()

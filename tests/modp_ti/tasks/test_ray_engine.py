@@ -67,5 +67,5 @@ def test_tasks_of_a_machine_that_is_lost_go_on_on_another(cluster: Any) -> None:
 
 
 def test_a_cluster_that_cannot_be_reached_is_said_in_one_line() -> None:
-    with pytest.raises(InputError, match=r"^Ray at 127\.0\.0\.1:1 cannot be used: .*; start it"):
+    with pytest.raises(InputError, match=r"^Ray at 127\.0\.0\.1:1 cannot be reached: Connection refused; start it"):
         open_engine("ray", "127.0.0.1:1")
