@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fields.runtime.engine import EngineError, engine
-from modp_ti.commands import cameras, check, export, locate, render, run, view, warmup
+from modp_ti.commands import batch, cameras, check, export, locate, render, run, view, warmup
 from modp_ti.commands.shared import examples
 from modp_ti.version import __version__
 
@@ -17,13 +17,14 @@ OVERVIEW = examples(
     "modp-ti check scene.yaml   (is the input as it should be?)",
     "modp-ti run scene.yaml   (the map, its poses, figures and report.html)",
     "modp-ti run room.mp4   (the same without a scene file)",
+    "modp-ti batch */scene.yaml   (many recordings)",
     "modp-ti render OUT --path orbit   (OUT: the output folder of a run)",
     "modp-ti export OUT --format mesh",
     "modp-ti locate OUT new.jpg",
 )
 ENDS = (
-    "Exit codes: 0 done; 1 (check) usable, with warnings; 1 (locate) a picture was not located; 2 wrong input or "
-    "options; 3 a fault of the program; 130 interrupted."
+    "Exit codes: 0 done; 1 (check) usable, with warnings; 1 (batch) a scene is not finished; 1 (locate) a picture was "
+    "not located; 2 wrong input or options; 3 a fault of the program; 130 interrupted."
 )
 
 app = typer.Typer(
@@ -55,6 +56,7 @@ def _options(
 
 
 app.command("run", epilog=run.EXAMPLES)(run.run)
+app.command("batch", epilog=batch.EXAMPLES)(batch.batch)
 app.command("cameras", epilog=cameras.EXAMPLES)(cameras.cameras)
 app.command("check", epilog=check.EXAMPLES)(check.check)
 app.command("render", epilog=render.EXAMPLES)(render.render)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -28,7 +28,9 @@ def is_recording(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES
 
 
-def recorded_scene(path: Path, overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
+def recorded_scene(
+    path: Path, overrides: Iterable[str] = (), preset: str | None = None, taken: Collection[Path] = ()
+) -> SceneConfig:
     """Return the settings for a video, a VRS recording or a folder that has no scene file.
 
     The output folder is `out/NAME`, where NAME is that of the file without its suffix or of the folder. If it holds
@@ -38,6 +40,7 @@ def recorded_scene(path: Path, overrides: Iterable[str] = (), preset: str | None
         path: The recording, as for `source.path`, relative to the working directory.
         overrides: As for `load_scene`.
         preset: As for `load_scene`.
+        taken: Output folders of other recordings, which are not used.
 
     Raises:
         InputError: As for `load_scene`; or if the folder has a scene file, which is probably meant.
@@ -47,7 +50,7 @@ def recorded_scene(path: Path, overrides: Iterable[str] = (), preset: str | None
         raise InputError(f"{path} has a {SCENE}: name that file, or the folder of the images")
     name = path.resolve().name if path.is_dir() else path.stem
     source = {"path": str(path)}
-    return scene_from_data(_scene(source, _free(name, path)), str(path), overrides, preset)
+    return scene_from_data(_scene(source, _free(name, path, taken)), str(path), overrides, preset)
 
 
 def streamed_scene(stream: str, overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
@@ -84,11 +87,13 @@ def _stream_name(stream: str) -> str:
     return "-".join(re.findall(r"\w[\w.]*", " ".join(parts))) or "stream"
 
 
-def _free(name: str, recording: Path | None = None) -> Path:
-    """The first of `out/NAME`, `out/NAME-2`, ... that holds no map, or the map of this recording."""
+def _free(name: str, recording: Path | None = None, taken: Collection[Path] = ()) -> Path:
+    """The first of `out/NAME`, `out/NAME-2`, ... not in `taken` that holds no map, or the map of this recording."""
     name = name[:MAX_NAME] or "recording"
     for number in itertools.count(1):
         folder = OUTPUTS / (name if number == 1 else f"{name}-{number}")
+        if folder.resolve() in taken:
+            continue
         written = folder / "config.yaml"
         if not written.exists() or (recording is not None and _recording_of(written) == recording.resolve()):
             return folder

@@ -260,6 +260,11 @@ class SceneConfig(StrictModel):
         description="number of frames between snapshots of the run in `snapshot.npz`, for `modp-ti run --resume` after "
         "a crash; empty or 0: none. Ctrl-C always writes a snapshot",
     )
+    snapshot_store: str | None = Field(
+        default=None,
+        description="URL of a folder for copies of the snapshots, such as `s3://bucket/room`, through fsspec: another "
+        "machine continues from there (`modp-ti run SCENE --resume OUT`, `modp-ti batch --store`). Empty: none",
+    )
     threads: int | None = Field(
         default=None,
         ge=1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -31,7 +32,7 @@ from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
-from modp_ti.outputs.progress import ProgressLine
+from modp_ti.outputs.progress import ProgressLine, StageProgress
 from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import mapped_psnr, retention
 from modp_ti.outputs.time_left import TimeAfterMapping
@@ -47,6 +48,7 @@ def run_scene(
     console: Console | None = None,
     resumed: Snapshot | None = None,
     replayed: RecordedSession | None = None,
+    watch: Callable[[StageProgress], None] | None = None,
 ) -> Path:
     """Map a scene and write its output folder.
 
@@ -58,6 +60,7 @@ def run_scene(
         console: Receives progress and notes, None for no output.
         resumed: Snapshot to continue from, None to start from the first frame.
         replayed: Recorded session to repeat instead of opening the tracker, None for none.
+        watch: Called with the progress of each stage whenever it changes, None for no calls.
 
     Returns:
         The output folder.
@@ -74,11 +77,11 @@ def run_scene(
             print((output / "metrics.json").read_text())
     """
     with ExitStack() as held:
-        session = _Session(config, console or Console(quiet=True), held, replayed)
+        session = _Session(config, ProgressLine(console or Console(quiet=True), watch), held, replayed)
         output, further = session.run(resumed), session.tracker.further_maps
     for place in range(2, 2 + further):
         session.line.note(f"map {place} of {1 + further}")
-        run_scene(config.of_map(place), console)
+        run_scene(config.of_map(place), console, watch=watch)
     return output
 
 
@@ -86,13 +89,10 @@ class _Session:
     """A run in progress, with the state that its stages share. `held` closes the run's resources when it ends."""
 
     def __init__(
-        self, config: SceneConfig, console: Console, held: ExitStack, replayed: RecordedSession | None
+        self, config: SceneConfig, line: ProgressLine, held: ExitStack, replayed: RecordedSession | None
     ) -> None:
-        self.config = config
-        self.replayed = replayed
-        self.held = held
+        self.config, self.line, self.held, self.replayed = config, line, held, replayed
         self.clock, self.record = RunClock(), RunRecord()
-        self.line = ProgressLine(console)
         self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
         # Opened first, as what follows may take minutes.
         self.observer = open_observer(config.view, self._say, self.line.note, self.held)
@@ -356,6 +356,7 @@ class _Session:
             "onto": None if self.visit is None else self.visit.metrics,
             "lpips_note": self.no_lpips,
             "breakdown_percent": self.breakdown,
+            "further_maps": self.tracker.further_maps,
             **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": self.clock.total}),
             "retention": retention(self.record.frames, scores),
             **self.conductor.metrics(),

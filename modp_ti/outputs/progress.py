@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from modp_ti.outputs.live_status import LiveStatus
     from pipelines.pipeline import FrameReport
 
-__all__ = ["ProgressLine"]
+__all__ = ["ProgressLine", "StageProgress"]
 
 T = TypeVar("T")
 
@@ -24,11 +25,42 @@ T = TypeVar("T")
 LOG_EVERY = 30.0
 
 
-class ProgressLine:
-    """Shows the progress of a run in one line of a terminal, or in a line every 30 seconds otherwise."""
+@dataclass(frozen=True)
+class StageProgress:
+    """How far a stage of a run is.
 
-    def __init__(self, console: Console) -> None:
+    Attributes:
+        what: Name of the stage.
+        done: Number of items that are done.
+        total: Number of its items, None if unknown.
+        state: Figures of the map and the speed as text, "" if there are none.
+        left: Time left as text, "" if it is not known.
+    """
+
+    what: str
+    done: int = 0
+    total: int | None = None
+    state: str = ""
+    left: str = ""
+
+    def __str__(self) -> str:
+        if self.total is None and not self.done:
+            return self.what
+        total = "" if self.total is None else f"/{self.total}"
+        return f"{self.what} {self.done}{total}  {self.state}{self.left}".rstrip()
+
+
+class ProgressLine:
+    """Shows the progress of a run in one line of a terminal, or in a line every 30 seconds otherwise.
+
+    Args:
+        console: Where it is shown.
+        watch: Called with the progress whenever it changes.
+    """
+
+    def __init__(self, console: Console, watch: Callable[[StageProgress], None] | None = None) -> None:
         self.console = console
+        self._watch = watch
         self._progress: Progress | None = None
         self._state = ""
         self._logged = 0.0
@@ -38,6 +70,8 @@ class ProgressLine:
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
         """Show a status message while work of unknown length is in progress."""
+        if self._watch is not None:
+            self._watch(StageProgress(what))
         with self.console.status(what):
             yield
 
@@ -96,6 +130,7 @@ class ProgressLine:
         )
         self._progress.add_task(what, total=total, completed=done, state="", left="")
         self._progress.start()
+        self._tell()
 
     def frame(self, report: FrameReport | None, total: int | None = None, live: LiveStatus | None = None) -> None:
         """Count a finished frame.
@@ -149,11 +184,23 @@ class ProgressLine:
         self._progress.update(task.id, **changes)
         text = "" if task.finished else self._time_left(int(task.completed), task.total)
         self._progress.update(task.id, left=text)
+        progress = self._tell()
         if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
             return
         self._logged = time.monotonic()
-        total = "" if task.total is None else f"/{task.total:.0f}"
-        self.note(f"{task.description} {task.completed:.0f}{total}  {task.fields['state']}{text}")
+        self.note(str(progress))
+
+    def _tell(self) -> StageProgress:
+        """Return the progress of the current stage, after passing it to `watch`."""
+        assert self._progress is not None, "callers have started it"
+        task = self._progress.tasks[0]
+        total = None if task.total is None else int(task.total)
+        progress = StageProgress(
+            task.description, int(task.completed), total, task.fields["state"], task.fields["left"]
+        )
+        if self._watch is not None:
+            self._watch(progress)
+        return progress
 
     def _time_left(self, done: int, total: float | None) -> str:
         """Return the words for the time left after `done` of `total` items, "" if it is not known."""

@@ -1,4 +1,4 @@
-"""`Checkpointer`: writes the snapshots of a run."""
+"""`Checkpointer`: writes the snapshots of a run, and copies them to `snapshot_store`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from modp_ti.engine.snapshots.snapshot import (
     record_state,
     version_state,
 )
+from modp_ti.engine.snapshots.store import SnapshotStore
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import RunRecord
 
@@ -48,6 +49,7 @@ class Checkpointer:
     ) -> None:
         self.config = config
         self.path: Path = config.output / FILE
+        self._store = SnapshotStore(config.snapshot_store, say) if config.snapshot_store else None
         self.possible = config.can_be_resumed
         self.digest = StreamDigest()
         self.online: MapVersion | None = None
@@ -96,6 +98,8 @@ class Checkpointer:
             return False
         self.written += 1
         self._last = position
+        if self._store is not None:
+            self._store.put(self.path)
         return True
 
     def way_on(self) -> str:
@@ -105,9 +109,11 @@ class Checkpointer:
         return f"; fix the cause, then continue from the snapshot with `modp-ti run --resume {self.path.parent}`"
 
     def remove(self) -> None:
-        """Delete the snapshot of a finished run, and the partial file that a killed process may have left."""
+        """Delete the snapshot of a finished run, its copy, and the partial file that a killed process may have left."""
         for name in (FILE, FILE + ".partial"):
             self.path.with_name(name).unlink(missing_ok=True)
+        if self._store is not None:
+            self._store.remove()
 
     def go_on_from(self, snapshot: Snapshot) -> None:
         """Restore what a snapshot holds besides the map. Raises InputError if the snapshot is incomplete."""

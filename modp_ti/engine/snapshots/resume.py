@@ -1,13 +1,15 @@
-"""Resuming a run: load the settings of its snapshot, and read again the frames that it was made from."""
+"""Resuming a run: find its snapshot and settings, and read again the frames that the snapshot was made from."""
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.comparison import differing_keys, leaves
 from modp_ti.config.keys import as_yaml
 from modp_ti.config.old_settings import without_leftovers
 from modp_ti.config.scene_file import load_scene, scene_from_data
@@ -15,12 +17,24 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.engine.snapshots.snapshot import Snapshot, StreamDigest
+from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
+from modp_ti.files.storage import Storage
 
-__all__ = ["load_resumed", "replay"]
+__all__ = ["continued", "fetch_snapshot", "load_resumed", "replay"]
 
 # Settings that may change on resuming: the map does not depend on them, but for the device, in the last digits.
-FREE = ("output", "device", "threads", "snapshot_every", "source.prefetch", "evaluation", "export", "view")
+FREE = (
+    "output",
+    "device",
+    "threads",
+    "snapshot_every",
+    "snapshot_store",
+    "source.prefetch",
+    "evaluation",
+    "export",
+    "view",
+)
 
 
 def load_resumed(
@@ -41,6 +55,10 @@ def load_resumed(
         InputError: If there is no usable snapshot, or a setting that the map depends on has changed.
     """
     file = output / FILE
+    config = None if scene is None else load_scene(scene, overrides, preset)
+    if config is not None:
+        config = config.model_copy(update={"output": output.resolve()})
+        fetch_snapshot(config)
     if not output.is_dir():
         raise InputError(f"{output}: no such folder (--resume); give the output folder of an interrupted run")
     if not file.is_file():
@@ -48,31 +66,62 @@ def load_resumed(
             raise InputError(f"{output}: this run is finished; there is nothing to resume")
         raise InputError(f"{file}: there is no snapshot; start the run from its scene, and set `snapshot_every`")
     snapshot = Snapshot.read(file)
-    if scene is None:
-        config = scene_from_data(snapshot.settings, str(file), overrides)
-    else:
-        config = load_scene(scene, overrides, preset)
-    config = config.model_copy(update={"output": output.resolve()})
-    before = _leaves(without_leftovers(snapshot.settings))
+    config = config or scene_from_data(snapshot.settings, str(file), overrides)
+    return continued(config.model_copy(update={"output": output.resolve()}), snapshot), snapshot
+
+
+def continued(config: SceneConfig, snapshot: Snapshot) -> SceneConfig:
+    """Return the settings with which a snapshot's run continues, given those of its scene.
+
+    Raises:
+        InputError: If a setting that the map depends on has changed.
+    """
+    settings = without_leftovers(snapshot.settings)
+    before = leaves(settings)
     scale = before.get("source.scale")
     if isinstance(scale, float):  # the run's number, which `auto` in the scene file became
         config = config.resolved(scale)
-    now = _leaves(config.model_dump(mode="json"))
-    for key in [*now, *(key for key in before if key not in now)]:
-        if before.get(key) != now.get(key) and not any(key == free or key.startswith(f"{free}.") for free in FREE):
-            raise InputError(
-                f"{file}: the snapshot was made with {key}: {as_yaml(before.get(key))}, not {as_yaml(now.get(key))}; "
-                "resume with the settings of the interrupted run"
-            )
-    return config, snapshot
+    now = config.model_dump(mode="json")
+    for key in differing_keys(settings, now, FREE):
+        raise InputError(
+            f"{snapshot.path}: the snapshot was made with {key}: {as_yaml(before.get(key))}, not "
+            f"{as_yaml(leaves(now).get(key))}; resume with the settings of the interrupted run"
+        )
+    return config
 
 
-def _leaves(data: dict[str, Any], start: str = "") -> dict[str, Any]:
-    """Flatten nested settings to dotted keys."""
-    leaves: dict[str, Any] = {}
-    for key, value in data.items():
-        leaves |= _leaves(value, f"{start}{key}.") if isinstance(value, dict) else {f"{start}{key}": value}
-    return leaves
+def fetch_snapshot(config: SceneConfig) -> None:
+    """Put the snapshot of `snapshot_store` into the output folder, unless the one there is of use and as far.
+
+    Raises:
+        StorageError: If the storage cannot be read.
+        InputError: If the output folder cannot be written.
+    """
+    if not config.snapshot_store:
+        return
+    file = config.output / FILE
+    with tempfile.TemporaryDirectory(prefix="modp-ti-snapshot-") as folder:
+        fetched = Path(folder) / FILE
+        if not Storage(config.snapshot_store).get(FILE, fetched):
+            return
+        if file.is_file() and _progress(fetched, config) <= _progress(file, config):
+            return
+        try:
+            config.output.mkdir(parents=True, exist_ok=True)
+            with replacing(file) as target, fetched.open("rb") as source:
+                shutil.copyfileobj(source, target)
+        except OSError as error:
+            raise InputError(f"{config.output}: cannot be written: {error.strerror}") from None
+
+
+def _progress(file: Path, config: SceneConfig) -> tuple[int, bool, int]:
+    """Return how far a snapshot is in the run, in an order; before all others if it does not fit the settings."""
+    try:
+        snapshot = Snapshot.read(file)
+        continued(config, snapshot)
+    except InputError:
+        return -1, False, 0
+    return snapshot.position.events, snapshot.position.finished, snapshot.position.refined
 
 
 def replay(

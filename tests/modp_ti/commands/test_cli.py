@@ -290,7 +290,7 @@ def test_wrong_options_end_with_two(arguments):
     assert "Usage:" in result.stderr
 
 
-COMMANDS = ["run", "cameras", "check", "render", "export", "locate", "view", "warmup"]
+COMMANDS = ["run", "batch", "cameras", "check", "render", "export", "locate", "view", "warmup"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from modp_ti.batch.finished import finished_metrics
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine.session import run_scene
 from modp_ti.outputs.formats.trajectory import read_trajectory
@@ -48,5 +49,6 @@ def test_the_largest_map_is_the_runs_and_the_other_has_a_folder_in_it(scene: Pat
     assert not (output / "map-3").exists() and not (output / "map-2" / "map-2").exists()
     for folder, count in frames.items():
         assert (folder / "splats.ply").is_file() and len(read_trajectory(folder / "trajectory.txt")[0]) == count
+    assert finished_metrics(load_scene(scene)) is not None, "a batch does not repeat it"
     again = load_scene(output / "map-2" / "config.yaml")  # which maps this map alone
     assert getattr(again.tracker, "maps") == 2 and again.output == output / "map-2"  # noqa: B009

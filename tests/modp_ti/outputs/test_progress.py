@@ -7,7 +7,7 @@ from rich.console import Console
 
 from modp_ti.outputs import progress
 from modp_ti.outputs.live_status import LiveStatus
-from modp_ti.outputs.progress import ProgressLine
+from modp_ti.outputs.progress import ProgressLine, StageProgress
 from pipelines.pipeline import FrameReport
 
 
@@ -111,3 +111,21 @@ def test_a_realtime_run_shows_how_it_keeps_pace(monkeypatch: pytest.MonkeyPatch)
     line.frame(FrameReport(0, True, 1, 1200, 20.5, 4), None, LiveStatus(10.0, 9.5, 0.42, 3, 4.25))
     line.stop()
     assert "lag 0.4 s, 3 waiting, camera 10.0/s, tracked 9.5/s, 4.2 steps a keyframe" in console.file.getvalue()
+
+
+def test_who_watches_is_told_every_change_of_a_stage() -> None:
+    told: list[StageProgress] = []
+    line = ProgressLine(Console(quiet=True), told.append)
+    with line.working("compiling"):
+        pass
+    line.start("mapping", 2)
+    line.frame(FrameReport(0, True, 1, 1200, 20.5))
+    line.frame(None, 3)
+    line.stop()
+    assert told[0] == StageProgress("compiling") and str(told[0]) == "compiling"
+    assert [(one.what, one.done, one.total) for one in told[1:]] == [
+        ("mapping", 0, 2),
+        ("mapping", 1, 2),
+        ("mapping", 2, 3),
+    ]
+    assert "1,200 Gaussians  20.50 dB" in told[2].state and str(told[1]) == "mapping 0/2"

@@ -1,0 +1,1 @@
+"""A batch: many recordings, each mapped by a task of its own."""

@@ -1,0 +1,101 @@
+"""`modp-ti batch SCENES...`: maps many recordings, on this machine or on a Ray cluster."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from modp_ti.commands.shared import AsJson, Overrides, Quiet, examples, outcome, progress_console
+from modp_ti.config.presets import PRESETS
+from modp_ti.files.errors import InputError
+
+__all__ = ["EXAMPLES", "batch"]
+
+EXAMPLES = examples(
+    "modp-ti batch */scene.yaml   (again: goes on with what is not finished)",
+    "modp-ti batch videos/*.mp4 --fast --jobs 2   (to out/NAME, as modp-ti run)",
+    "modp-ti batch */scene.yaml --set refine.steps=3000 -o out/careful",
+    "modp-ti batch */scene.yaml --engine ray --cpus 4 --memory 4",
+    "modp-ti batch */scene.yaml --engine ray --gpus 1 --store s3://bucket/maps",
+    "modp-ti batch */scene.yaml --quiet --json > result.json",
+)
+UNFINISHED = 1
+GIGABYTE = 1 << 30
+
+
+class Where(str, Enum):
+    """The engines."""
+
+    local = "local"
+    ray = "ray"
+
+
+def batch(
+    scenes: Annotated[
+        list[Path], typer.Argument(metavar="SCENES...", help="scene files (YAML), videos and folders of images")
+    ],
+    engine: Annotated[
+        Where, typer.Option(help="`local`: processes on this machine; `ray`: a Ray cluster (extra `cluster`)")
+    ] = Where.local,
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="`ray`: address of the cluster; empty: RAY_ADDRESS, or this machine"),
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, help="`local`: scenes at a time; empty: as many as the cores allow")
+    ] = None,
+    cpus: Annotated[
+        float | None, typer.Option(min=0.1, help="cores of each scene; empty: an equal share, at least one")
+    ] = None,
+    gpus: Annotated[
+        float | None,
+        typer.Option(min=0, help="GPUs of each scene, 0.5 lets two share one; empty: 1 with `device: cuda`, else 0"),
+    ] = None,
+    memory: Annotated[
+        float | None,
+        typer.Option(min=0.1, metavar="GB", help="memory of each scene: no machine gets more of them than fit"),
+    ] = None,
+    attempts: Annotated[
+        int, typer.Option(min=1, help="how often a scene is begun if its process or its machine is lost")
+    ] = 3,
+    store: Annotated[
+        str | None,
+        typer.Option(
+            "--store", metavar="URL", help="folder for snapshots and results, where machines share no file system"
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FOLDER", help="folder of the tables and the summary page")
+    ] = Path("out/batch"),
+    set_: Overrides = None,
+    fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
+    best: Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Map many recordings, each in a process of its own. Exit code: 0 all are finished, 1 some are not."""
+    with outcome(as_json) as result:
+        # Imported here, so that `--help` does not wait for the readers to load.
+        from modp_ti.batch.batch import LOGS, PAGE, Shares, run_batch
+        from modp_ti.batch.results import State, as_row
+        from modp_ti.batch.scenes import read_scenes, with_store
+        from modp_ti.files.storage import Storage
+        from modp_ti.tasks import open_engine
+
+        if fast and best:
+            raise InputError("--fast and --best are two presets: give one of them")
+        if store is not None:
+            Storage(store).probe()
+        named = read_scenes(scenes, set_ or [], "fast" if fast else "best" if best else None)
+        if store is not None:
+            named = with_store(named, store)
+        shares = Shares(cpus, gpus, None if memory is None else int(memory * GIGABYTE), attempts)
+        with open_engine(engine.value, address, jobs, output / LOGS) as opened:
+            results = run_batch(named, opened, output, shares, progress_console(quiet))
+        done = sum(row.state in (State.finished, State.before) for row in results)
+        result.code = 0 if done == len(results) else UNFINISHED
+        result.text = f"{done} of {len(results)} scenes are finished; the summary is {output / PAGE}"
+        result.data = {"output": str(output.absolute()), "scenes": [as_row(row) for row in results]}

@@ -1,0 +1,199 @@
+"""A batch of real runs: what is finished stays, what is lost goes on, and what fails takes nothing with it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from modp_ti.batch.batch import Shares, run_batch
+from modp_ti.batch.results import State
+from modp_ti.batch.scenes import read_scenes, with_store
+from modp_ti.commands.app import app
+from modp_ti.files.errors import InputError
+from modp_ti.tasks import Resources
+from modp_ti.tasks.local import LocalEngine
+from modp_ti.tasks.task import Work
+from tests.modp_ti.batch.dying import lose_machine_once
+
+SAME = ("splats.ply", "trajectory.txt", "frames.json", "scores.csv")
+
+
+class LosingEngine(LocalEngine):
+    """Loses the machine of one scene after its third snapshot.
+
+    Args:
+        scene: Name of the scene.
+        output: Its output folder.
+        died: A file that says that this has happened.
+    """
+
+    def __init__(self, scene: str, output: Path, died: Path) -> None:
+        super().__init__(jobs=1)
+        self._lost = scene, output, died
+
+    def submit(self, name: str, work: Work, resources: Resources) -> None:
+        scene, output, died = self._lost
+        if name == scene:
+            work = partial(lose_machine_once, work, 3, died, output)
+        super().submit(name, work, resources)
+
+
+@pytest.fixture
+def recordings(finished: Path, tmp_path: Path) -> Path:
+    """A folder with the scenes `done`, whose output folder is finished, `new` and `empty`, which has no images."""
+    text = (finished.parent / "scene.yaml").read_text()
+    for name in ("done", "new", "empty"):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "scene.yaml").write_text(text.replace("output:  out", f"output:  ../maps/{name}"))
+        if name != "empty":
+            (folder / "images").symlink_to(finished.parent / "images")
+        (folder / "sparse").symlink_to(finished.parent / "sparse")
+    shutil.copytree(finished, tmp_path / "maps" / "done")
+    written = tmp_path / "maps" / "done" / "config.yaml"
+    written.write_text(written.read_text().replace(str(finished.parent), str(tmp_path / "done")))
+    return tmp_path
+
+
+def scene_files(recordings: Path) -> list[Path]:
+    return [recordings / name / "scene.yaml" for name in ("done", "new", "empty", "gone")]
+
+
+def times(folder: Path) -> Mapping[Path, int]:
+    return {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_batch_finishes_what_it_can_and_repeats_nothing(
+    recordings: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(recordings / "no-torch"))
+    maps, folder, store = recordings / "maps", recordings / "batch", recordings / "store"
+    kept = times(maps / "done")
+    scenes = with_store(read_scenes(scene_files(recordings), ["snapshot_every=2"]), f"file://{store}")
+    with LosingEngine("new", maps / "new", recordings / "died") as engine:
+        results = run_batch(scenes, engine, folder)
+
+    states = {result.name: result.state for result in results}
+    assert states == {"done": State.before, "new": State.finished, "empty": State.failed, "scene.yaml": State.failed}
+    assert times(maps / "done") == kept
+    new = results[1]
+    assert (new.attempts, new.resumed, new.frames) == (2, 1, 9) and (recordings / "died").exists()
+    for name in SAME:
+        assert (maps / "new" / name).read_bytes() == (finished / name).read_bytes(), name
+    assert "no such folder of images" in results[2].error
+    assert results[3].error == f"{recordings / 'gone' / 'scene.yaml'}: no such scene file"
+    (stored,) = store.glob("new-*")
+    assert (stored / "output" / "splats.ply").read_bytes() == (finished / "splats.ply").read_bytes()
+    assert not (stored / "snapshot.npz").exists()
+
+    rows = list(csv.DictReader((folder / "batch.csv").open()))
+    assert [row["state"] for row in rows] == ["finished before", "finished", "failed", "failed"]
+    assert float(rows[1]["psnr"]) == json.loads((finished / "metrics.json").read_text())["refined"]["held_out"]["psnr"]
+    page = (folder / "index.html").read_text()
+    for name in ("done", "new"):
+        assert f'<a href="../maps/{name}/report.html">{name}</a>' in page
+    assert "no such scene file" in page
+
+    # The same command again, and once more where nothing is left but the storage.
+    kept = times(maps)
+    again = scene_files(recordings)[:2]
+    with LocalEngine() as engine:
+        results = run_batch(with_store(read_scenes(again, ["snapshot_every=2"]), f"file://{store}"), engine, folder)
+    assert [(result.state, result.attempts) for result in results] == [(State.before, 0)] * 2
+    assert times(maps) == kept
+    shutil.rmtree(maps / "new")
+    with LocalEngine() as engine:
+        results = run_batch(with_store(read_scenes(again[1:]), f"file://{store}"), engine, folder)
+    assert [(result.state, result.attempts) for result in results] == [(State.before, 0)]
+    assert (maps / "new" / "splats.ply").read_bytes() == (finished / "splats.ply").read_bytes()
+
+
+def test_the_command_says_which_scenes_are_finished_by_its_exit_code(recordings: Path) -> None:
+    done, gone = recordings / "done" / "scene.yaml", recordings / "gone.yaml"
+    folder = recordings / "batch"
+    result = CliRunner().invoke(app, ["batch", str(done), str(done), "-o", str(folder)])
+    assert (result.exit_code, result.stdout) == (
+        0,
+        f"1 of 1 scenes are finished; the summary is {folder / 'index.html'}\n",
+    )
+    assert "done: finished before, 9 frames" in result.stderr
+    result = CliRunner().invoke(app, ["batch", str(done), str(gone), "-o", str(folder), "--json", "--quiet"])
+    data = json.loads(result.stdout)
+    assert (result.exit_code, data["exit_code"], result.stderr) == (1, 1, "")
+    assert [(row["name"], row["state"]) for row in data["scenes"]] == [
+        ("done", "finished before"),
+        ("gone.yaml", "failed"),
+    ]
+
+
+def test_scenes_with_other_settings_are_not_taken_for_finished(recordings: Path) -> None:
+    done = recordings / "done" / "scene.yaml"
+    for override, state in (
+        ("threads=1", State.before),
+        ("source.prefetch=0", State.before),
+        ("seed=4", State.failed),
+        ("export.images=true", State.failed),
+    ):
+        with LocalEngine() as engine:  # a task that is begun fails, as the images are gone
+            shutil.rmtree(recordings / "done" / "images", ignore_errors=True)
+            (recordings / "done" / "images").unlink(missing_ok=True)
+            (result,) = run_batch(read_scenes([done], [override]), engine, recordings / "batch")
+        assert result.state is state, override
+
+
+def test_a_folder_that_cannot_be_written_is_said_before_anything_begins(recordings: Path) -> None:
+    (recordings / "file").touch()
+    with LocalEngine() as engine, pytest.raises(InputError, match="file/batch: cannot be written: Not a directory"):
+        run_batch(read_scenes(scene_files(recordings)), engine, recordings / "file" / "batch")
+
+
+def test_a_store_that_cannot_be_reached_is_said_in_one_line(recordings: Path) -> None:
+    (recordings / "file").touch()
+    before = times(recordings)
+    arguments = ["batch", str(recordings / "done" / "scene.yaml"), "-o", str(recordings / "batch"), "--store"]
+    for url, said in (
+        (f"file://{recordings}/file/store", "cannot be written: Not a directory"),
+        ("nonsense://bucket", "cannot be opened: Protocol not known: nonsense"),
+    ):
+        result = CliRunner().invoke(app, [*arguments, url])
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert result.stderr.startswith(f"error: {url}: {said}") and result.stderr.count("\n") == 1
+    assert times(recordings) == before
+
+
+@pytest.mark.parametrize(
+    ("shares", "device", "machines", "scenes", "expected"),
+    [
+        (Shares(), "cpu", [8.0], 3, Resources(2.0)),
+        (Shares(), "cpu", [8.0], 20, Resources(1.0)),
+        (Shares(), "auto", [8.0, 4.0], 2, Resources(4.0)),
+        (Shares(), "cpu", [], 2, Resources(1.0)),
+        (Shares(cpus=3.0, memory=5), "cpu", [2.0], 2, Resources(3.0, 0.0, 5)),
+        (Shares(), "cuda", [8.0], 8, Resources(1.0, 1.0)),
+        (Shares(gpus=0.5), "auto", [8.0], 8, Resources(1.0, 0.5)),
+    ],
+)
+def test_scenes_share_the_cores_unless_told_otherwise(
+    recordings: Path, shares: Shares, device: str, machines: list[float], scenes: int, expected: Resources
+) -> None:
+    (scene,) = read_scenes([recordings / "done" / "scene.yaml"], [f"device={device}"])
+    assert scene.config is not None
+    assert shares.of(scene.config, machines, scenes) == expected
+
+
+def test_the_table_is_plain_lines_where_there_is_no_terminal(recordings: Path) -> None:
+    with (recordings / "said").open("w") as said, LocalEngine() as engine:
+        console = Console(file=said, width=500)
+        run_batch(read_scenes(scene_files(recordings)[2:]), engine, recordings / "batch", console=console)
+    lines = (recordings / "said").read_text().splitlines()
+    assert lines[0] == f"scene.yaml: failed: {recordings / 'gone' / 'scene.yaml'}: no such scene file"
+    assert lines[1].startswith("empty: begun on ")
+    assert lines[-1].startswith("empty: failed: ") and "no such folder of images" in lines[-1]
