@@ -145,8 +145,8 @@ class _Session:
                 self._make_mapper(undistorter.camera)
             first = first_frame(arriving)
             prepared = time.perf_counter() - tick - self.compiling
-            side = min(first.camera.width, first.camera.height)
-            self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
+            size, weights = (first.camera.width, first.camera.height), self.config.evaluation.lpips_weights
+            self.lpips, self.no_lpips = open_lpips(weights, min(size))
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes, *([self.visit.note] if self.visit is not None else []))
             self._make_mapper(first.camera)
@@ -161,8 +161,7 @@ class _Session:
                 raise self._stopped() from None
             scoring = self.mapper.pipeline.stopwatch.seconds.get("evaluate", 0.0)
             self.clock.end_mapping(self.observer.waited + scoring)
-        # A live tracker adds notes at its end.
-        self._say(*(note for note in self.tracker.notes if note not in notes))
+        self._say(*(note for note in self.tracker.notes if note not in notes))  # a live tracker adds some at its end
 
     def _make_mapper(self, camera: PinholeCamera) -> None:
         """Make the mapper for images of this camera, and for those of an earlier map, unless the present one does."""
