@@ -145,8 +145,8 @@ class _Session:
                 self._make_mapper(undistorter.camera)
             first = first_frame(arriving)
             prepared = time.perf_counter() - tick - self.compiling
-            size, weights = (first.camera.width, first.camera.height), self.config.evaluation.lpips_weights
-            self.lpips, self.no_lpips = open_lpips(weights, min(size))
+            side = min(first.camera.width, first.camera.height)
+            self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
             self._say(*notes, *([self.visit.note] if self.visit is not None else []))
             self._make_mapper(first.camera)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +18,8 @@ __all__ = ["sole_use"]
 def sole_use(folder: Path, patience: float = 20.0) -> Iterator[None]:
     """Lock a folder, which is created if it does not exist, for this process. The lock ends with the process.
 
-    File systems that have no locks for folders, such as some network file systems, lock nothing.
+    File systems that have no locks for folders, such as some network file systems, lock nothing, and neither does
+    Windows.
 
     Args:
         folder: The folder.
@@ -28,9 +30,12 @@ def sole_use(folder: Path, patience: float = 20.0) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
+        handle = None if sys.platform == "win32" else os.open(folder, os.O_RDONLY)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    if handle is None:
+        yield
+        return
     try:
         until = time.monotonic() + patience
         while not _locked(handle):
