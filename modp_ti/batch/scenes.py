@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from modp_ti.commands.bare_recording import is_recording, recorded_scene
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.bare_recording import is_recording, recorded_scene
 from modp_ti.tasks import Resources
 
 __all__ = ["SNAPSHOT_EVERY", "Scene", "read_scenes", "with_resources", "with_store"]

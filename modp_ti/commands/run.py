@@ -117,8 +117,8 @@ def _run(
     snapshot = None
     if resume is not None:
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
-        from modp_ti.commands.bare_recording import is_recording
         from modp_ti.engine.snapshots import load_resumed
+        from modp_ti.inputs.bare_recording import is_recording
 
         if scene is not None and is_recording(scene):
             raise InputError(f"{scene}: --resume has the recording already; leave it out")
@@ -135,8 +135,8 @@ def _run(
 
 def _new_scene(scene: Path | None, stream: str | None, overrides: list[str], preset: str | None) -> SceneConfig:
     """Return the settings of a scene file, of a recording, or of a stream."""
-    from modp_ti.commands.bare_recording import is_recording, recorded_scene, streamed_scene
     from modp_ti.config.scene_file import load_scene
+    from modp_ti.inputs.bare_recording import is_recording, recorded_scene, streamed_scene
 
     if stream is not None:
         return streamed_scene(stream, overrides, preset)

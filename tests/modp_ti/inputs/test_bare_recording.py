@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from modp_ti.commands import app as cli
-from modp_ti.commands.bare_recording import recorded_scene, streamed_scene
 from modp_ti.config.presets import PRESETS
 from modp_ti.config.scene_file import dump_scene, load_scene
+from modp_ti.inputs.bare_recording import recorded_scene, streamed_scene
 
 
 @pytest.fixture(autouse=True)
