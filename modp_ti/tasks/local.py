@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from platform import node
 from typing import Any, cast
 
 from fields.runtime.parallel import available_cores
+from modp_ti.files.child_environment import child_environment
 from modp_ti.files.reading import available_memory
 from modp_ti.tasks.engine import Ended, Engine, Running
 from modp_ti.tasks.task import Answer, End, Resources, Work
@@ -164,12 +164,10 @@ class LocalEngine(Engine):
 
 def _started(descriptor: int, threads: int, output: Any) -> subprocess.Popen[bytes]:
     """Start the process of a call. A session of its own keeps Ctrl-C away: the engine decides what it means."""
-    places = [place or os.getcwd() for place in sys.path]
-    libraries = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
     return subprocess.Popen(
         [sys.executable, "-c", "from modp_ti.tasks.child import main; main()", str(descriptor)],
         pass_fds=[descriptor],
-        env={**os.environ, **libraries, "PYTHONPATH": os.pathsep.join(places), "PYTHONSAFEPATH": "1"},
+        env=child_environment(threads),
         stdin=subprocess.DEVNULL,
         stdout=output,
         stderr=output,

@@ -5,11 +5,11 @@ pycolmap keeps Python's interpreter to itself while it solves, for seconds if th
 
 from __future__ import annotations
 
-import os
 import pickle
 import subprocess
 import sys
 
+from modp_ti.files.child_environment import child_environment
 from modp_ti.inputs.multiview.bundle_adjustment import Bundle, adjusted_bundle
 
 __all__ = ["adjusted_apart", "main"]
@@ -23,12 +23,11 @@ def adjusted_apart(*arguments: object, **keywords: object) -> Bundle | None:
     Returns:
         The same result; None also if the process fails, for example because memory is short.
     """
-    places = [place or os.getcwd() for place in sys.path]
     done = subprocess.run(
         [sys.executable, "-c", CODE],
         input=pickle.dumps((arguments, keywords)),
         stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(places), "PYTHONSAFEPATH": "1"},
+        env=child_environment(),
         start_new_session=True,  # Ctrl-C is for this process
         check=False,
     )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
+from modp_ti.files.child_environment import child_environment
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
@@ -247,10 +248,6 @@ class TrackingProcess(Tracker):
 
 def _started(descriptors: list[int]) -> subprocess.Popen[bytes]:
     """Start the child with these descriptors. It ignores Ctrl-C from its beginning, where possible."""
-    places = [place or os.getcwd() for place in sys.path]
-    # One thread for each library: the other cores are the mapper's.
-    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(places), "PYTHONSAFEPATH": "1"}
     code = "from modp_ti.inputs.tracking_process.child import main; main()"
     in_main = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main else None
@@ -258,7 +255,7 @@ def _started(descriptors: list[int]) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             [sys.executable, "-c", code, *map(str, descriptors)],
             pass_fds=descriptors,
-            env=environment,
+            env=child_environment(threads=1),  # the other cores are the mapper's
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
         )
