@@ -8,9 +8,17 @@ from typing import Annotated
 
 import typer
 
-from modp_ti.commands.shared import AsJson, Overrides, Quiet, examples, outcome, progress_console
-from modp_ti.config.presets import PRESETS
-from modp_ti.files.errors import InputError
+from modp_ti.commands.shared import (
+    AsJson,
+    Best,
+    Fast,
+    Overrides,
+    Quiet,
+    chosen_preset,
+    examples,
+    outcome,
+    progress_console,
+)
 
 __all__ = ["EXAMPLES", "batch"]
 
@@ -71,8 +79,8 @@ def batch(
         Path, typer.Option("--output", "-o", metavar="FOLDER", help="folder of the tables and the summary page")
     ] = Path("out/batch"),
     set_: Overrides = None,
-    fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
-    best: Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")] = False,
+    fast: Fast = False,
+    best: Best = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -85,11 +93,10 @@ def batch(
         from modp_ti.files.storage import Storage
         from modp_ti.tasks import open_engine
 
-        if fast and best:
-            raise InputError("--fast and --best are two presets: give one of them")
+        preset = chosen_preset(fast, best)
         if store is not None:
             Storage(store).probe()
-        named = read_scenes(scenes, set_ or [], "fast" if fast else "best" if best else None)
+        named = read_scenes(scenes, set_ or [], preset)
         if store is not None:
             named = with_store(named, store)
         shares = Shares(cpus, gpus, None if memory is None else int(memory * GIGABYTE), attempts)

@@ -8,8 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modp_ti.commands.shared import AsJson, Overrides, Quiet, examples, outcome, progress_console
-from modp_ti.config.presets import PRESETS
+from modp_ti.commands.shared import (
+    AsJson,
+    Best,
+    Fast,
+    Overrides,
+    Quiet,
+    chosen_preset,
+    examples,
+    outcome,
+    progress_console,
+)
 from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,8 +75,8 @@ def run(
             "--onto", metavar="OUT", help="go on with the finished map of this output folder (docs/second_visit.md)"
         ),
     ] = None,
-    fast: Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")] = False,
-    best: Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")] = False,
+    fast: Fast = False,
+    best: Best = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -103,9 +112,7 @@ def run(
 
 def _preset(resume: Path | None, scene: Path | None, fast: bool, best: bool) -> str | None:
     """Return the name of the preset that was asked for. Raises InputError if it is not clear or has no effect."""
-    if fast and best:
-        raise InputError("--fast and --best are two presets: give one of them")
-    preset = "fast" if fast else "best" if best else None
+    preset = chosen_preset(fast, best)
     if preset is not None and scene is None and resume is not None:
         raise InputError(f"--{preset} is for a scene file: a run that goes on has its settings already")
     return preset

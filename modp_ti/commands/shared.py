@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fields.runtime.engine import EngineError
+from modp_ti.config.presets import PRESETS
 from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,10 +24,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AsJson",
+    "Best",
     "Device",
+    "Fast",
     "Outcome",
     "Overrides",
     "Quiet",
+    "chosen_preset",
     "examples",
     "matching_settings",
     "one_line",
@@ -74,6 +78,8 @@ def matching_settings(incomplete: str) -> list[tuple[str, str]]:
 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress and no notes; errors are said all the same")]
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JSON object, and nothing else")]
+Fast = Annotated[bool, typer.Option("--fast", help=f"{PRESETS['fast'].purpose} (docs/configuration.md)")]
+Best = Annotated[bool, typer.Option("--best", help=f"{PRESETS['best'].purpose} (docs/configuration.md)")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -83,6 +89,13 @@ Overrides = Annotated[
         autocompletion=matching_settings,
     ),
 ]
+
+
+def chosen_preset(fast: bool, best: bool) -> str | None:
+    """Return the name of the preset that `--fast` or `--best` asks for. Raises InputError if both do."""
+    if fast and best:
+        raise InputError("--fast and --best are two presets: give one of them")
+    return "fast" if fast else "best" if best else None
 
 
 @dataclass
