@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,3 +139,11 @@ def finished(made_once: Callable[[str, Callable[[Path], None]], Path], room_reco
         finished_run(folder, SHORT_RUN, "device: CPU")
 
     return made_once(SHORT_RUN, fill) / "out"
+
+
+@pytest.fixture
+def interruptible():
+    """Ctrl-C as in a shell's foreground: a process that was started in the background may ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,11 +86,3 @@ def recording(plane_scene) -> Recording:
     rng = np.random.default_rng(5)
     xyz = np.c_[rng.uniform(-1.6, 1.6, (60, 2)), np.zeros(60)]
     return Recording(plane_scene.folder.parent, plane_scene.names, plane_scene.K, plane_scene.T_camera_world, xyz)
-
-
-@pytest.fixture
-def interruptible():
-    """Ctrl-C as in a shell's foreground: a process that was started in the background may ignore it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)

@@ -101,6 +101,7 @@ def test_stopped_tasks_save_what_they_have_and_those_that_wait_do_not_begin(tmp_
     assert saved.read_text() == "saved" and not (tmp_path / "never.begun").exists()
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_waits_until_the_tasks_have_saved_what_they_have(tmp_path: Path) -> None:
     seen: list[Watched | None] = []
     pressed: list[bool] = []
