@@ -26,10 +26,17 @@ class ImageLevel:
     Attributes:
         rgba: Image (H, W, 4) uint8; the last channel is 255 at valid pixels.
         camera: Camera of the level.
+        on_disk: Whether the image lies in a memory-mapped file, and takes no memory unless it is read.
     """
 
     rgba: NDArray[np.uint8]
     camera: PinholeCamera
+    on_disk: bool = False
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the image takes in memory."""
+        return 0 if self.on_disk else self.rgba.nbytes
 
 
 def build_pyramid(rgba: NDArray[np.uint8], camera: PinholeCamera, levels: int = MAX_LEVELS) -> tuple[ImageLevel, ...]:

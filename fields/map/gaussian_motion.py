@@ -27,8 +27,8 @@ class GaussianMotion:
     def __init__(self, gaussians: GaussianField) -> None:
         self.gaussians = gaussians
 
-    def move(self, S: NDArray[np.float64], sh_rotation: NDArray[np.float64]) -> None:
-        """Move every Gaussian by the similarity of its anchor.
+    def move(self, S: NDArray[np.float64], sh_rotation: NDArray[np.float64], first: int = 0) -> None:
+        """Move every Gaussian from `first` on by the similarity of its anchor.
 
         Gaussians without an anchor, and those of an anchor whose similarity is the identity, stay bit-identical. The
         gradients of Gaussians that move are set to zero, so call this between steps.
@@ -36,15 +36,16 @@ class GaussianMotion:
         Args:
             S: Similarities S_after_before (A, 4, 4), one per anchor.
             sh_rotation: Matrices (A, K, K) that rotate the K harmonic coefficients.
+            first: The first Gaussian.
 
         Raises:
             ValueError: If the anchor of a Gaussian is not a row of `S`.
         """
         g = self.gaussians
-        if g.count == 0:
+        if g.count == first:
             return
-        if int(g.anchors().max()) >= len(S):
-            raise ValueError(f"anchor {int(g.anchors().max())} has none of the {len(S)} motions")
+        if (largest := int(g.anchors(first).max())) >= len(S):
+            raise ValueError(f"anchor {largest} has none of the {len(S)} motions")
         scale = scale_of(S)
         rotation = S[:, :3, :3] / scale[:, None, None]
         moves = (S != np.eye(4)).any(axis=(1, 2))
@@ -58,29 +59,33 @@ class GaussianMotion:
             np.stack([np.log(scale), 1.0 / scale], axis=1),
             sh_rotation,
         )
-        self._move(g.count, moves.astype(np.int32), *(np.ascontiguousarray(table, dtype=g.dtype) for table in tables))
+        self._move(
+            first, g.count, moves.astype(np.int32), *(np.ascontiguousarray(table, dtype=g.dtype) for table in tables)
+        )
 
-    def place(self, position: NDArray[np.float64], growth: float) -> None:
+    def place(self, position: NDArray[np.float64], growth: float, first: int = 0) -> None:
         """Give the Gaussians new positions, and scale them. Moments stay, and gradients are set to zero.
 
         Args:
-            position: New means (N, 3) of all Gaussians in the world frame.
+            position: New means (N, 3) of the Gaussians from `first` on, in the world frame.
             growth: Factor on their sizes.
+            first: The first Gaussian.
         """
-        self._place(np.ascontiguousarray(position, dtype=self.gaussians.dtype), float(np.log(growth)))
+        self._place(first, np.ascontiguousarray(position, dtype=self.gaussians.dtype), float(np.log(growth)))
         self.gaussians.clear_gradients()
 
     @ti.kernel
-    def _place(self, position: TABLE, growth: ti.f32):
+    def _place(self, first: ti.i32, position: TABLE, growth: ti.f32):
         for i in range(position.shape[0]):
             for c in ti.static(range(3)):
-                self.gaussians.position[i][c] = position[i, c]
-                self.gaussians.log_scale[i][c] += growth
+                self.gaussians.position[first + i][c] = position[i, c]
+                self.gaussians.log_scale[first + i][c] += growth
 
     @ti.kernel
     def _move(
         self,
-        count: ti.i32,
+        first: ti.i32,
+        end: ti.i32,
         moves: ti.types.ndarray(dtype=ti.i32, ndim=1),
         linear: TABLE,  # (A, 12): the upper three rows of S
         rotations: TABLE,  # (A, 9)
@@ -88,7 +93,7 @@ class GaussianMotion:
         scales: TABLE,  # (A, 2): log s and 1 / s
         sh_rotation: BLOCKS,  # (A, K, K)
     ):
-        for i in range(count):
+        for i in range(first, end):
             a = self.gaussians.anchor[i]
             if a >= 0 and moves[ti.max(a, 0)] != 0:
                 self._move_geometry(i, a, linear, rotations, quaternions, scales)

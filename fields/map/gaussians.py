@@ -1,5 +1,5 @@
 """`GaussianField`: the Gaussians of a map, in a pool that grows without recompiling kernels."""
-# pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
+# pyright: reportCallIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fields.map.gaussian_arrays import read_numbers, read_values, write_integers, write_values
+from fields.map.gaussian_arrays import read_numbers, read_values, write_integers, write_reals, write_values
 from fields.runtime.backend import growing, refuse_too_many_fields
 from fields.runtime.engine import ti
 
@@ -42,14 +42,12 @@ class GaussianField:
         sh: Coefficients (K, 3) of the harmonics, K = (sh_degree + 1)^2, in the layout of 3DGS files.
         steps: Number of Adam updates of each Gaussian.
         anchor: Number of the view that placed each Gaussian; NO_ANCHOR if it is not known.
-        coverage: Largest coverage of each Gaussian in the views measured so far [px], see `Contribution`. It is not
-            saved.
+        coverage: Largest coverage of each Gaussian in the views measured so far [px], see `Contribution`.
         count: Number of Gaussians.
         capacity: Size of the pool.
 
     Example:
-        gaussians = modp_ti.GaussianField(sh_degree=1)
-        gaussians.load(modp_ti.read_splats("out/room/splats.ply"))
+        modp_ti.GaussianField(sh_degree=1).load(modp_ti.read_splats("out/room/splats.ply"))
     """
 
     def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:
@@ -172,38 +170,37 @@ class GaussianField:
 
     # ---- saving and loading ----------------------------------------------------------------------------------
 
-    def to_numpy(self) -> dict[str, NDArray]:
-        """Return the values of all Gaussians by name.
+    def to_numpy(self, first: int = 0) -> dict[str, NDArray]:
+        """Return the values of all Gaussians from `first` on, by name.
 
         Returns:
             position (N, 3), log_scale (N, 3), quaternion (N, 4), opacity_logit (N,) and sh (N, K, 3).
         """
-        return self._to_numpy([getattr(self, name) for name in _NAMES])
+        return self._to_numpy([getattr(self, name) for name in _NAMES], first)
 
-    def anchors(self) -> NDArray[np.int32]:
-        """Return the anchor (N,) of every Gaussian."""
-        out = np.zeros(self.count, dtype=np.int32)
-        if self.count:
-            read_numbers(self.anchor, out)
-        return out
+    def anchors(self, first: int = 0) -> NDArray[np.int32]:
+        """Return the anchor (N,) of every Gaussian from `first` on."""
+        return self._numbers(self.anchor, first, np.int32)
 
-    def coverages(self) -> NDArray[np.float32]:
-        """Return the coverage (N,) of every Gaussian [px]."""
-        out = np.zeros(self.count, dtype=np.float32)
-        if self.count:
-            read_numbers(self.coverage, out)
-        return out
+    def coverages(self, first: int = 0) -> NDArray[np.float32]:
+        """Return the coverage (N,) of every Gaussian from `first` on [px]."""
+        return self._numbers(self.coverage, first, np.float32)
 
     def gradients_to_numpy(self) -> dict[str, NDArray]:
         """Return the gradients of all Gaussians, with the names and shapes of `to_numpy`."""
-        return self._to_numpy([getattr(self, name).grad for name in _NAMES])
+        return self._to_numpy([getattr(self, name).grad for name in _NAMES], 0)
 
-    def _to_numpy(self, fields: list) -> dict[str, NDArray]:
-        n, k = self.count, self.sh_count
+    def _to_numpy(self, fields: list, first: int) -> dict[str, NDArray]:
+        n, k = self.count - first, self.sh_count
         arrays = [np.zeros(s, dtype=self.dtype) for s in ((n, 3), (n, 3), (n, 4), (n,), (n, k, 3))]
-        if n:
-            read_values(*fields, *arrays)
+        read_values(*fields, first, *arrays)
         return dict(zip(_NAMES, arrays, strict=True))
+
+    def _numbers(self, field: ti.Field, first: int, dtype: type) -> NDArray:
+        out = np.zeros(self.count - first, dtype=dtype)
+        if len(out):
+            read_numbers(field, first, out)
+        return out
 
     def load(self, state: dict[str, NDArray]) -> None:
         """Replace all Gaussians by those of `state`.
@@ -224,28 +221,34 @@ class GaussianField:
             self.count = before
             raise
         if anchor is not None and self.count:
-            write_integers(self.anchor, np.ascontiguousarray(anchor, dtype=np.int32))
+            write_integers(self.anchor, 0, np.ascontiguousarray(anchor, dtype=np.int32))
 
-    def history(self) -> dict[str, NDArray]:
-        """Return the optimiser state: moments `NAME_m` and `NAME_v` of each value, `steps` and `anchor`.
+    def history(self, first: int = 0) -> dict[str, NDArray]:
+        """Return the optimiser state from `first` on: moments `NAME_m`, `NAME_v` of each value, `steps` and `anchor`.
 
-        Together with `to_numpy`, this is the complete state of the Gaussians between two steps.
+        With `to_numpy`, this is the complete state of the Gaussians between two steps.
         """
         moments = {
             name + end: array
             for end in MOMENTS
-            for name, array in self._to_numpy([getattr(self, name + end) for name in _NAMES]).items()
+            for name, array in self._to_numpy([getattr(self, name + end) for name in _NAMES], first).items()
         }
-        steps = np.zeros(self.count, dtype=np.int32)
-        if self.count:
-            read_numbers(self.steps, steps)
-        return moments | {"steps": steps, "anchor": self.anchors()}
+        return moments | {"steps": self._numbers(self.steps, first, np.int32), "anchor": self.anchors(first)}
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Replace all Gaussians by saved values and optimiser state.
+        """Replace all Gaussians by saved values and optimiser state. Arguments and errors are those of `extend`."""
+        before, self.count = self.count, 0
+        try:
+            self.extend(state)
+        except (KeyError, ValueError):
+            self.count = before
+            raise
+
+    def extend(self, state: dict[str, NDArray]) -> None:
+        """Add saved Gaussians with their optimiser state.
 
         Args:
-            state: The entries of `to_numpy` and `history`.
+            state: The entries of `to_numpy` and `history`, and optionally the coverages (N,) as `coverage`.
 
         Raises:
             KeyError: If an entry is missing.
@@ -257,13 +260,17 @@ class GaussianField:
         for name in ("steps", "anchor"):
             if state[name].shape != state["opacity_logit"].shape:
                 raise ValueError(f"{name} has shape {state[name].shape}, expected {state['opacity_logit'].shape}")
-        self.load(state)
-        if self.count == 0:
+        first = self.count
+        self.append(*(state[name] for name in _NAMES))
+        if self.count == first:
             return
         for end in MOMENTS:
             arrays = [np.ascontiguousarray(state[name + end], dtype=self.dtype) for name in _NAMES]
-            write_values(*(getattr(self, name + end) for name in _NAMES), *arrays)
-        write_integers(self.steps, np.ascontiguousarray(state["steps"], dtype=np.int32))
+            write_values(*(getattr(self, name + end) for name in _NAMES), first, *arrays)
+        for name in ("steps", "anchor"):
+            write_integers(getattr(self, name), first, np.ascontiguousarray(state[name], dtype=np.int32))
+        if "coverage" in state:
+            write_reals(self.coverage, first, np.ascontiguousarray(state["coverage"], dtype=np.float32))
 
     def take(self, tensors: Sequence[torch.Tensor]) -> None:
         """Replace all Gaussians by tensors, without a copy through the host.
@@ -271,8 +278,7 @@ class GaussianField:
         The values are not checked; they must satisfy the conditions of `append`.
 
         Args:
-            tensors: Values in the order and shapes of `append`, contiguous, of the field's type, and on the device that
-                kernels run on.
+            tensors: Values in the order and shapes of `append`, contiguous, of the field's type, on the kernels' device.
 
         Raises:
             ValueError: If the pool is too small.
@@ -287,7 +293,7 @@ class GaussianField:
     def gradients_into(self, tensors: Sequence[torch.Tensor]) -> None:
         """Write the gradients of all Gaussians into tensors of the form that `take` expects."""
         if self.count:
-            read_values(*(getattr(self, name).grad for name in _NAMES), *tensors)
+            read_values(*(getattr(self, name).grad for name in _NAMES), 0, *tensors)
 
     def clear_gradients(self) -> None:
         """Set the gradients accumulated since the last Adam step to zero."""
@@ -298,8 +304,7 @@ class GaussianField:
         """Return and reset the numbers of skipped steps and of exploded Gaussians, see `Adam`."""
         skipped, exploded = self._caught[0], self._caught[1]
         self._caught.fill(0)
-        # Taichi annotates every element of a field as a vector or matrix.
-        return skipped, exploded  # pyright: ignore[reportReturnType]
+        return skipped, exploded  # pyright: ignore[reportReturnType]  # Taichi annotates elements as vectors
 
     def opacities(self) -> NDArray:
         """Return the opacity (N,) in (0, 1) of all Gaussians."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -66,6 +66,7 @@ class Keyframe:
         transient: Weights (h, w) uint8 of the parts of the image that move, on a coarse grid: 0 where the image shows
             something that moves, 255 elsewhere. None if nothing moves. `rgba` and `pyramid` contain them.
         unmasked: The pyramid without these weights; empty if nothing moves.
+        missing: Number of Gaussians in blocks on disk that it sees, see `pipelines.blocks`.
     """
 
     index: int
@@ -89,6 +90,17 @@ class Keyframe:
     is_between: bool = False
     transient: NDArray[np.uint8] | None = None
     unmasked: tuple[ImageLevel, ...] = ()
+    missing: int = 0
+
+    @property
+    def image_bytes(self) -> int:
+        """Bytes of the images in memory."""
+        return sum(image.nbytes for image in (*self.pyramid, *self.unmasked))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the images and tracked points in memory."""
+        return _nbytes((*self.pyramid, *self.unmasked), self.points)
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -196,8 +208,8 @@ def _weighted(image: ImageLevel, weights: NDArray[np.uint8]) -> ImageLevel:
     return ImageLevel(rgba, image.camera)
 
 
-def _nbytes(pyramid: tuple[ImageLevel, ...], points: SparsePoints) -> int:
-    return sum(image.rgba.nbytes for image in pyramid) + sum(a.nbytes for a in (points.xyz, points.pixels, points.ids))
+def _nbytes(pyramid: Iterable[ImageLevel], points: SparsePoints) -> int:
+    return sum(image.nbytes for image in pyramid) + sum(a.nbytes for a in (points.xyz, points.pixels, points.ids))
 
 
 class KeyframeStore:
@@ -211,6 +223,7 @@ class KeyframeStore:
         selected: The keyframes without the frames between them.
         latest: Place of the last of these in the store; -1 without keyframes.
         nbytes: Bytes of the keyframes' images and points.
+        most_missing: Number of Gaussians on disk that a keyframe may see and still be drawn as a view.
     """
 
     def __init__(self, levels: int = 1, min_side: int = 1, trajectory: Trajectory | None = None) -> None:
@@ -229,6 +242,7 @@ class KeyframeStore:
         self.latest = -1
         self._depths = RunningMedian()
         self.nbytes = 0
+        self.most_missing = 0
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -271,7 +285,7 @@ class KeyframeStore:
         if not is_between:
             self.selected.append(keyframe)
             self.latest = len(self._keyframes) - 1
-        self.nbytes += _nbytes(keyframe.pyramid, keyframe.points)
+        self.nbytes += keyframe.nbytes
         self._depths.add(keyframe.median_depth)
         return keyframe
 
@@ -283,13 +297,32 @@ class KeyframeStore:
             if vignette is not None and id(vignette) not in revised:
                 revised[id(vignette)] = revision.vignette(vignette)
             keyframe.revise_camera(revision, None if vignette is None else revised[id(vignette)])
-        self.nbytes = sum(_nbytes(keyframe.pyramid, keyframe.points) for keyframe in self._keyframes)
+        self.nbytes = sum(keyframe.nbytes for keyframe in self._keyframes)
 
     def mask(self, keyframe: Keyframe, transient: NDArray[np.uint8] | None) -> None:
         """Replace the mask of what moves in a keyframe of the store, see `Keyframe.mask`."""
-        self.nbytes -= _nbytes(keyframe.unmasked, keyframe.points)
+        self.nbytes -= keyframe.nbytes
         keyframe.mask(transient)
-        self.nbytes += _nbytes(keyframe.unmasked, keyframe.points)
+        self.nbytes += keyframe.nbytes
+
+    def move_images(self, keyframe: Keyframe, stored: Callable[[Sequence[ImageLevel]], list[ImageLevel]]) -> None:
+        """Replace the images of a keyframe of the store by equal ones.
+
+        Args:
+            keyframe: The keyframe.
+            stored: Returns such images for images, in order.
+        """
+        self.nbytes -= keyframe.nbytes
+        count = len(keyframe.pyramid)
+        moved = stored([*keyframe.pyramid, *keyframe.unmasked])
+        keyframe.pyramid, keyframe.unmasked = tuple(moved[:count]), tuple(moved[count:])
+        keyframe.rgba = keyframe.pyramid[0].rgba
+        self.nbytes += keyframe.nbytes
+
+    def near(self) -> NDArray[np.int64]:
+        """Return the places (M,) of the keyframes that miss at most `most_missing` Gaussians."""
+        missing = np.fromiter((k.missing for k in self._keyframes), np.int64, len(self._keyframes))
+        return np.flatnonzero(missing <= self.most_missing)
 
     def take_in_depths(self) -> None:
         """Recompute `scene_depth` after median depths have changed."""
