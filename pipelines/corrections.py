@@ -16,6 +16,7 @@ from fields.geometry.similarity import motion_around, moved_points, moved_pose, 
 from fields.map.gaussian_motion import GaussianMotion
 from fields.map.gaussians import NO_ANCHOR
 from fields.map.keyframes import NO_MOTION, Keyframe, KeyframeStore
+from pipelines.blocks.paging import Paging
 from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation
 from pipelines.settings import CorrectionSettings
@@ -92,14 +93,16 @@ class MapCorrector:
     Args:
         keyframes: The keyframes of the map.
         densifier: Owner of the map's anchors and voxels.
+        paging: Keeps the part of the map that is on disk, which moves as well.
 
     Attributes:
         motion: Moves the Gaussians.
     """
 
-    def __init__(self, keyframes: KeyframeStore, densifier: Densifier) -> None:
+    def __init__(self, keyframes: KeyframeStore, densifier: Densifier, paging: Paging) -> None:
         self.keyframes = keyframes
         self.densifier = densifier
+        self.paging = paging
         self.motion = GaussianMotion(densifier.gaussians)
 
     def correct(
@@ -144,22 +147,29 @@ class MapCorrector:
         }
         if anchors:
             S = np.stack([anchor.keyframe.pending_motion for anchor in anchors])
-            self.motion.move(S, np.stack([turns.get(anchor.keyframe.index, no_turn) for anchor in anchors]))
-            if camera is not None:
-                self.motion.place(self._on_new_rays(*camera), growth)
+            turn = np.stack([turns.get(anchor.keyframe.index, no_turn) for anchor in anchors])
+
+            def move(first: int) -> None:
+                self.motion.move(S, turn, first)
+                if camera is not None:
+                    self.motion.place(self._on_new_rays(*camera, first), growth, first)
+
+            move(0)
+            self.paging.rewrite(move)
             for anchor, scale in zip(anchors, scale_of(S).tolist(), strict=True):
                 anchor.spacing *= scale * growth
         if voxels is not None:
             first = self.keyframes[0].pending_motion
             origin = moved_points(first, voxels.origin[None])[0]
-            self.densifier.restart_voxels(voxels.coarsest * float(scale_of(first)) * growth, origin)
+            coarsest = voxels.coarsest * float(scale_of(first)) * growth
+            self.densifier.restart_voxels(coarsest, origin, *self.paging.placed())
         for view in self.keyframes:
             view.pending_motion = NO_MOTION
 
-    def _on_new_rays(self, revision: CameraRevision, former: PinholeCamera) -> NDArray[np.float64]:
-        """Positions (N, 3) of all Gaussians at their depths on the new rays of their pixels in the anchors' views."""
-        position = self.densifier.gaussians.to_numpy()["position"].astype(np.float64)
-        of = self.densifier.gaussians.anchors()
+    def _on_new_rays(self, revision: CameraRevision, former: PinholeCamera, first: int) -> NDArray[np.float64]:
+        """Positions (N, 3) of Gaussians from `first` on, at their depths on the new rays of their anchors' pixels."""
+        position = self.densifier.gaussians.to_numpy(first)["position"].astype(np.float64)
+        of = self.densifier.gaussians.anchors(first)
         placed = of != NO_ANCHOR
         T = np.stack([anchor.keyframe.T_camera_world for anchor in self.densifier.anchors])[of[placed]]
         here = np.einsum("nij,nj->ni", T[:, :3, :3], position[placed]) + T[:, :3, 3]

@@ -68,6 +68,7 @@ def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
     mapper.keyframes.take_in_depths()
     _restore_anchors(mapper, finished.gaussians["position"].astype(np.float64))
     for view in mapper.keyframes:
+        mapper.paging.gather([view])
         values = mapper.optimiser.compare(view, mapper.keyframes.scene_depth)
         if np.isfinite(values.l1):
             view.error = values.l1
@@ -87,7 +88,7 @@ def _restore_anchors(mapper: OnlineMap, position: NDArray[np.float64]) -> None:
     settings, first = mapper.settings.voxels, mapper.keyframes[0]
     mapper.densifier.anchors = [Anchor(view, settings.target * view.view_scale) for view in mapper.keyframes]
     mapper.gaussians.load(mapper.gaussians.to_numpy() | {"anchor": placed_by(mapper.keyframes, position, mapper.near)})
-    mapper.densifier.restart_voxels(settings.coarsest * first.view_scale, first.centre)
+    mapper.densifier.restart_voxels(settings.coarsest * first.view_scale, first.centre, *mapper.paging.placed())
 
 
 def placed_by(store: KeyframeStore, position: NDArray[np.float64], near: float) -> NDArray[np.int32]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,23 @@ LAST_RATE = 0.2
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
+@dataclass(frozen=True)
+class LastPart:
+    """A part of the passes of `OnlineMapper.finish`.
+
+    Attributes:
+        places: Places of its keyframes in the store.
+        first: Number of views before it.
+        end: Number of views after it.
+        before: Number of views in the passes before its own.
+    """
+
+    places: NDArray[np.int64]
+    first: int
+    end: int
+    before: int
+
+
 class OnlineMapper(OnlineMap):
     """Builds a Gaussian map from a stream of `TrackedFrame`s.
 
@@ -40,6 +58,7 @@ class OnlineMapper(OnlineMap):
         depth: Depth estimator; None builds the one that `settings.depth` names.
         views: View selection; None for `LocalGlobalViews`.
         pace: How much work a frame gets; None for all of the settings.
+        folder: Folder for the parts of the map that go to disk; None for a temporary one.
 
     Example:
         mapper = modp_ti.OnlineMapper(modp_ti.MappingSettings(), max_width=640, max_height=480, seed=0)
@@ -66,8 +85,12 @@ class OnlineMapper(OnlineMap):
         with self.stopwatch.measure("select"):
             last = self.keyframes.selected[-1] if len(self.keyframes) else None
             if self.gate.refuses(frame, last, self.renderer, self.near):
-                return FrameReport(frame.index, False, len(self.keyframes.selected), len(self.gaussians), None)
+                return FrameReport(frame.index, False, len(self.keyframes.selected), self.gaussian_count, None)
             is_wanted = self.selector.is_keyframe(frame, last) and self.pace.takes_keyframe()
+            if is_wanted:
+                self.paging.before_keyframe(frame)
+            elif len(self.keyframes):
+                self.paging.before_points(frame)
             is_keyframe = is_wanted and self.budget.takes_keyframe(frame)
         psnr, steps = None, 0
         if is_keyframe:
@@ -76,7 +99,7 @@ class OnlineMapper(OnlineMap):
             # Other frames only add their tracked points, at a pose corrected by the neighbouring keyframes. Some
             # become views: the more directions the map is optimised from, the better it looks from new ones.
             if self.selector.is_between(frame, self.keyframes) and self.budget.takes_between(frame):
-                view = self.keyframes.append(frame, is_between=True)
+                view = self._append(frame, is_between=True)
             else:
                 view = self.keyframes.view(frame)
             self.densifier.add_tracked_points(view)
@@ -84,12 +107,18 @@ class OnlineMapper(OnlineMap):
                 # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them,
                 # every frame is selected as a keyframe; each therefore gets only 1 / max_gap of the steps.
                 steps = -(-self.pace.plan(0, *self.counts).steps // self.settings.keyframes.max_gap)
-                psnr = self._optimise_evenly(np.arange(len(self.keyframes)), steps, self.settings.views.per_step)
-        return FrameReport(frame.index, is_keyframe, len(self.keyframes.selected), len(self.gaussians), psnr, steps)
+                psnr = self._optimise_evenly(self.keyframes.near(), steps, self.settings.views.per_step)
+        return FrameReport(frame.index, is_keyframe, len(self.keyframes.selected), self.gaussian_count, psnr, steps)
+
+    def _append(self, frame: TrackedFrame, is_between: bool = False) -> Keyframe:
+        """Add a frame to the views of the map."""
+        view = self.keyframes.append(frame, is_between)
+        self.paging.away.look(len(self.keyframes) - 1)
+        return view
 
     def _add_keyframe(self, frame: TrackedFrame) -> tuple[float | None, int]:
         """Add a keyframe, add Gaussians from it, and optimise. Returns the last step's mean PSNR, and the steps."""
-        view = self.keyframes.append(frame)
+        view = self._append(frame)
         if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
             self.optimiser.poses.align(view)
         with self.stopwatch.measure("optimise"):
@@ -147,11 +176,11 @@ class OnlineMapper(OnlineMap):
 
         Returns the mean PSNR of the last step.
         """
-        if len(self.gaussians) == 0:
+        if len(self.gaussians) == 0 or len(among) == 0:
             return None
         with self.stopwatch.measure("optimise"):
             for _ in range(steps):
-                p = global_probabilities(self.keyframes, self.settings.views.error_weight, 0.0)[among]
+                p = global_probabilities(self.keyframes, self.settings.views.error_weight, 0.0, among)
                 batch = [int(j) for j in self.rng.choice(among, views, p=p / p.sum())]
                 rates = self.optimiser.rates(self.keyframes.scene_depth)
                 self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
@@ -165,7 +194,7 @@ class OnlineMapper(OnlineMap):
         """
         if len(self.keyframes) == 0:
             return None
-        return self._optimise_evenly(np.arange(len(self.keyframes)), 1, self.settings.views.global_views)
+        return self._optimise_evenly(self.keyframes.near(), 1, self.settings.views.global_views)
 
     def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
         """Apply poses and points that the tracker has revised, see `MapCorrector`.
@@ -177,7 +206,8 @@ class OnlineMapper(OnlineMap):
             self.optimiser.settle()
             around, moved = self.corrector.correct(correction, settings, more)
         if len(moved):
-            self._optimise_evenly(moved, self.pace.steps_after_correction(*self.counts), settings.views)
+            seen = np.intersect1d(moved, self.keyframes.near())
+            self._optimise_evenly(seen, self.pace.steps_after_correction(*self.counts), settings.views)
         return CorrectionReport(around, moved=len(moved) > 0)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
@@ -194,21 +224,46 @@ class OnlineMapper(OnlineMap):
             Mean PSNR of the last step; None if nothing was optimised.
         """
         if self.settled == 0:
-            self.mask_transients()
-        order = np.argsort(np.arange(len(self.keyframes)) * GOLDEN_RATIO % 1.0)
-        total = self.pace.last_views(len(order)) if len(self.gaussians) else 0
-        views = np.resize(order, total)
-        count = self.settings.views.per_step
+            self.paging.plan()
+        total = self.pace.last_views(len(self.keyframes)) if self.gaussian_count else 0
         psnr = None
-        while self.settled < len(views):
-            slower = LAST_RATE ** (self.settled / len(views))
+        for part in self._last_parts(total):
+            if self.settled < part.end or total == 0:
+                psnr = self._settle(part, total, progress)
+        return psnr
+
+    def _last_parts(self, total: int) -> list[LastPart]:
+        """Divide the views of `finish` into parts. Each pass visits the groups of keyframes in turn."""
+        groups, count = self.paging.groups(), len(self.keyframes)
+        if len(groups) == 1:
+            return [LastPart(groups[0], 0, total, 0)]
+        parts, first = [], 0
+        for before in range(0, total, max(count, 1)):
+            seen = 0
+            for places in groups:
+                seen += len(places)
+                end = before + min(count, total - before) * seen // count
+                parts.append(LastPart(places, first, end, before))
+                first = end
+        return parts
+
+    def _settle(self, part: LastPart, total: int, progress: Callable[[int, int, float], None] | None) -> float | None:
+        """Make a part of the passes of `finish`."""
+        places = part.places
+        if self.settled == part.first:
+            self.mask_transients(places)
+        views = np.resize(places[np.argsort(places * GOLDEN_RATIO % 1.0)], part.end - part.first)
+        count, psnr = self.settings.views.per_step, None
+        while self.settled < part.end:
+            done = self.settled - part.first
+            slower = LAST_RATE ** ((part.before + done * len(self.keyframes) / len(places)) / total)
             rates = self.optimiser.rates(self.keyframes.scene_depth, slower, slower, slower)
-            batch = views[self.settled : self.settled + count].tolist()
+            batch = views[done : done + count].tolist()
             with self.stopwatch.measure("optimise"):
                 psnr = self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
             self.settled += len(batch)
             if progress is not None:
-                progress(self.settled, len(self.gaussians), psnr)
+                progress(self.settled, self.gaussian_count, psnr)
         with self.stopwatch.measure("optimise"):
             psnr = self.optimiser.settle() if psnr is not None else None
         self.prune()

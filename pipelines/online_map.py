@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
+from pipelines.blocks.paging import Paging
 from pipelines.corrections import MapCorrector
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
@@ -41,6 +44,7 @@ class OnlineMap(Pipeline):
         depth: Depth estimator; None builds the one that `settings.depth` names.
         views: View selection; None for `LocalGlobalViews`.
         pace: How much work a frame gets; None for all of the settings.
+        folder: Folder for the parts of the map that go to disk; None for a temporary one.
 
     Attributes:
         frame_count: Number of frames processed so far.
@@ -59,6 +63,7 @@ class OnlineMap(Pipeline):
         depth: DepthEstimator | None = None,
         views: ViewSelection | None = None,
         pace: Pace | None = None,
+        folder: Path | None = None,
     ) -> None:
         self.settings = settings
         self.rng = np.random.default_rng(seed)
@@ -74,12 +79,16 @@ class OnlineMap(Pipeline):
         depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
         self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
         self.budget = self.densifier.budget
+        self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
+        self.optimiser.before_views = self.paging.gather
         contribution = Contribution(self.gaussians, self.renderer)
-        self.hidden = HiddenGaussians(contribution, self.densifier, settings.densify.min_contribution)
-        self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer) if settings.transients else None
+        self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
+        self.transients = None
+        if settings.transients:
+            self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
         self.pace = pace or CompletePace(settings)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
-        self.corrector = MapCorrector(self.keyframes, self.densifier)
+        self.corrector = MapCorrector(self.keyframes, self.densifier, self.paging)
         self.frame_count = self.settled = 0
 
     @property
@@ -92,6 +101,13 @@ class OnlineMap(Pipeline):
         """Number of keyframes and of frames so far, as `Pace.plan` takes them."""
         return len(self.keyframes.selected), self.frame_count
 
+    @property
+    def gaussian_count(self) -> int:
+        return self.paging.count
+
+    def all_gaussians(self) -> dict[str, NDArray]:
+        return self.paging.to_numpy()
+
     def prune(self) -> int:
         """Remove Gaussians whose opacity is below `densify.prune_opacity`.
 
@@ -100,11 +116,15 @@ class OnlineMap(Pipeline):
         """
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
 
-    def mask_transients(self) -> None:
-        """Mask what moves in all keyframes, and remove its Gaussians. Does nothing if the settings disable it."""
+    def mask_transients(self, places: NDArray[np.int64]) -> None:
+        """Mask what moves in keyframes, and remove its Gaussians. Does nothing if the settings disable it.
+
+        Args:
+            places: Places of the keyframes in the store.
+        """
         if self.transients is not None:
             with self.stopwatch.measure("remove"):
-                self.transients.sweep(list(self.keyframes), self.near)
+                self.transients.sweep([self.keyframes[place] for place in places.tolist()], self.near)
 
     def caught(self) -> Safeguards:
         """Return the safeguards' counts so far. Waits for the device."""

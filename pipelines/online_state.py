@@ -45,6 +45,10 @@ def state_of(mapper: OnlineMap) -> MapState:
         places, words = voxels.marks()
         groups["voxels"] = {"places": places, "words": words}
         numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
+    if len(mapper.paging.away):
+        groups["blocks"] = mapper.paging.away.state()
+    if mapper.settled:
+        groups["settling"] = {"group": mapper.paging.group}
     if mapper.selector.previous is not None:
         groups["previous"] = {"index": np.array(mapper.selector.previous)}
     return MapState.of(groups, numbers)
@@ -64,13 +68,21 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     """
     mapper.trajectory.restore(state.group("tracked"))
     rows = KeyframeRows(state.group("keyframes"))
+    blocks = state.group("blocks")
+    on_disk = set(blocks["images"].tolist()) if blocks else ()
     for frame in frames:
         if frame.index in rows.rows:
             rows.put(frame, mapper.keyframes)
+            if frame.index in on_disk:
+                mapper.paging.away.store_images(mapper.keyframes[-1])
     if len(mapper.keyframes) != len(rows.rows):
         raise ValueError(f"{len(mapper.keyframes)} of the {len(rows.rows)} keyframes are among the frames")
     mapper.keyframes.take_in_depths()
     mapper.gaussians.restore(state.group("gaussians"))
+    if blocks:
+        mapper.paging.away.restore(blocks)
+    if settling := state.group("settling"):
+        mapper.paging.group = settling["group"]
     anchors = state.group("anchors")
     pairs = zip(anchors["keyframe"].tolist(), anchors["spacing"].tolist(), strict=True)
     mapper.densifier.anchors = [Anchor(mapper.keyframes[row], spacing) for row, spacing in pairs]

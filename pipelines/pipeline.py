@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from numpy.typing import NDArray
+
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import GaussianField
@@ -72,6 +74,15 @@ class Pipeline(ABC):
     @abstractmethod
     def near(self) -> float:
         """Depth [scene units] below which nothing is drawn."""
+
+    @property
+    def gaussian_count(self) -> int:
+        """Number of Gaussians of the whole map."""
+        return len(self.gaussians)
+
+    def all_gaussians(self) -> dict[str, NDArray]:
+        """Return the values of the whole map, with the names and shapes of `GaussianField.to_numpy`."""
+        return self.gaussians.to_numpy()
 
     @abstractmethod
     def compile(self) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from pipelines.online_map import OnlineMap
 from pipelines.select.views import global_probabilities
 from pipelines.settings import RefineSettings
@@ -58,7 +60,8 @@ def refine(
     """Optimise a finished map on error-weighted draws from all keyframes.
 
     All rates decay. Before the first step, Gaussians that cover fewer than `settings.min_contribution` pixels in every
-    keyframe are removed, but not from a map of many keyframes in a refinement by the clock.
+    keyframe are removed, but not from a map of many keyframes in a refinement by the clock. A map that is partly on
+    disk is refined group after group of keyframes, each for its share of the steps.
 
     Args:
         mapper: Mapper after `finish`.
@@ -74,7 +77,7 @@ def refine(
     """
     store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
     pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0
-    if len(store) == 0 or len(mapper.gaussians) == 0:
+    if len(store) == 0 or mapper.gaussian_count == 0:
         return
     by_the_clock = schedule is not None or settings.seconds is not None
     if schedule is None:
@@ -82,20 +85,24 @@ def refine(
     step, share = done, schedule(done)
     removes = settings.min_contribution > 0 and not (by_the_clock and len(store) > MOST_SWEPT)
     if not done and share is not None:
-        mapper.mask_transients()
+        mapper.mask_transients(np.arange(len(store)))
     if removes and not done and share is not None:
         with mapper.stopwatch.measure("refine"):
             mapper.hidden.remove(settings.min_contribution, mapper.near)
+    groups = mapper.paging.groups()
+    ends = np.cumsum([0] + [len(places) for places in groups]) / len(store)  # of the groups' shares
     while share is not None:
+        group = min(int(np.searchsorted(ends, share, side="right")) - 1, len(groups) - 1)
+        passed = (share - ends[group]) / (ends[group + 1] - ends[group])
         with mapper.stopwatch.measure("refine"):
-            p = global_probabilities(store, views.error_weight, 0.0)
-            batch = [int(j) for j in mapper.rng.choice(len(store), settings.views, p=p)]
-            slower = settings.position_decay**share
+            p = global_probabilities(store, views.error_weight, 0.0, groups[group])
+            batch = [int(j) for j in mapper.rng.choice(groups[group], settings.views, p=p)]
+            slower = settings.position_decay**passed
             rates = mapper.optimiser.rates(
                 store.scene_depth,
                 position_factor=slower,
-                scale_factor=settings.scale_decay**share,
-                other_factor=settings.rate_decay**share,
+                scale_factor=settings.scale_decay**passed,
+                other_factor=settings.rate_decay**passed,
             )
             psnr = mapper.optimiser.step(store, batch, rates, pose_rate * slower)
         step += 1

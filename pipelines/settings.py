@@ -320,14 +320,14 @@ class MappingSettings(StrictModel):
     max_gaussians: int = Field(
         default=1_500_000,
         ge=1024,
-        description="size of the pool; further Gaussians are not added. At most 1,500,000 with Taichi, "
-        "33,554,432 with Quadrants",
+        description="size of the pool; blocks of the map beyond it lie on disk (docs/scale.md). At most 1,500,000 with "
+        "Taichi, 33,554,432 with Quadrants",
     )
     memory: float | None = Field(
         default=None,
         gt=0,
         description="memory that Gaussians, keyframes, voxels and what frames saw of tracked points may take [GB]; "
-        "what has no room is left out and counted. Empty for no limit but max_gaussians",
+        "blocks of the map and images go to disk, and what still has no room is left out and counted",
     )
     near: float = Field(default=0.01, gt=0, description="nearest depth that is drawn [scene depths]")
     image_cache: float = Field(

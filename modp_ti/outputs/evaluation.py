@@ -15,6 +15,7 @@ from fields.map.keyframes import Keyframe
 from modp_ti.outputs.detail import explained_detail
 from modp_ti.outputs.lpips import Lpips
 from modp_ti.outputs.still_scores import StillScore, StillScorer
+from pipelines.blocks.shown_map import ShownMap
 from pipelines.optimise.losses import LossValues
 from pipelines.pipeline import Pipeline
 
@@ -171,15 +172,17 @@ def evaluate(
         The scores, ordered by version.
     """
     scores: dict[str, list[FrameScore]] = {name: [] for name in versions}
+    shown = {name: ShownMap(pipeline.gaussians, of.gaussians) for name, of in versions.items()}
     still: dict[str, StillScorer] = {}
     frames = iter(frames)
     while batch := list(islice(frames, EVALUATED_TOGETHER)):
         for name, version in versions.items():
-            pipeline.gaussians.load(version.gaussians)
-            if pipeline.transients is not None and name not in still:
-                still[name] = StillScorer(pipeline, version)
-            for frame in batch:
+            for place, frame in enumerate(batch):
                 T, exposure = version.trajectory[frame.index], version.exposures[frame.index]
+                if pipeline.transients is not None and name not in still:
+                    still[name] = StillScorer(pipeline, version, shown[name])
+                if place == 0 or not shown[name].fits:
+                    shown[name].show(frame.camera, T)
                 score, render = score_frame(pipeline, frame, T, name, lpips, exposure)
                 if name in still:
                     score = replace(score, still=still[name].score(frame, render))

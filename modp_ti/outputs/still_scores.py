@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
+from pipelines.blocks.shown_map import ShownMap
 from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import RenderedView
 from pipelines.transients.evidence import CoarseView, coarse_view, moving
@@ -52,17 +53,20 @@ class StillScorer:
     around it. The map need not have been optimised on the frame.
 
     Args:
-        pipeline: Holds the version of the map, now and whenever `score` is called.
+        pipeline: Holds the version of the map whenever `score` is called.
         version: Its poses and exposures.
+        shown: Loads it.
     """
 
-    def __init__(self, pipeline: Pipeline, version: Poses) -> None:
+    def __init__(self, pipeline: Pipeline, version: Poses, shown: ShownMap) -> None:
         self._pipeline = pipeline
         self._version = version
         self._views = list(pipeline.keyframes)
         self._coarse: list[CoarseView] = []
-        for view in self._views:
+        for place, view in enumerate(self._views):
             T, exposure = version.trajectory[view.index], version.exposures[view.index]
+            if place == 0 or not shown.fits:
+                shown.show(view.camera, T)
             coarse = compared(pipeline.renderer, view, T, exposure, pipeline.near)
             self._coarse.append(without(coarse, view.transient))
 

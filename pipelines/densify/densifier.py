@@ -112,24 +112,29 @@ class Densifier:
             spacing, anchor = self.anchors[-1].spacing, len(self.anchors) - 1
             grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, anchor)
 
-    def placed_since(self, keyframe: Keyframe) -> NDArray[np.bool_]:
-        """Return whether each Gaussian (N,) was placed in this keyframe or in a frame after it."""
-        first = bisect_left(self.anchors, keyframe.index, key=lambda anchor: anchor.keyframe.index)
-        return self.gaussians.anchors() >= first
+    def first_anchor_since(self, keyframe: Keyframe) -> int:
+        """Return the place of the first anchor of this keyframe or of a frame after it."""
+        return bisect_left(self.anchors, keyframe.index, key=lambda anchor: anchor.keyframe.index)
 
-    def restart_voxels(self, coarsest: float, origin: NDArray[np.float64]) -> None:
+    def restart_voxels(
+        self,
+        coarsest: float,
+        origin: NDArray[np.float64],
+        position: NDArray[np.floating],
+        anchor: NDArray[np.int32],
+    ) -> None:
         """Clear the voxels and mark those of all Gaussians, each down to the level of its anchor's spacing.
 
         Args:
             coarsest: New size of the coarsest voxels [scene units].
             origin: New origin (3,) of the voxels in the world frame.
+            position: Means (N, 3) of the Gaussians in the world frame.
+            anchor: Their anchors (N,).
         """
         if self.voxels is None:
             return
         self.voxels.clear()
         self.voxels.settle(coarsest, origin)
-        anchor = self.gaussians.anchors()
         spacing = np.array([a.spacing for a in self.anchors] + [self.voxels.coarsest])[anchor]  # -1: the coarsest
-        position = self.gaussians.to_numpy()["position"]
         order = np.argsort(spacing, kind="stable")  # on a GPU, `update` runs once per run of equal levels
         self.voxels.update(position[order], spacing[order])

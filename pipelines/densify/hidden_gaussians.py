@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 from fields.map.keyframes import Keyframe
+from pipelines.blocks.paging import Paging
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
 
@@ -17,19 +20,25 @@ COARSE = 1
 class HiddenGaussians:
     """Sweeps over the keyframes, a few at a time or all at once, and then removes what hardly showed in any of them.
 
-    A sweep spares the Gaussians that were placed in the `YOUNG` keyframes before it or while it went on.
+    A sweep spares the Gaussians that were placed in the `YOUNG` keyframes before it or while it went on. A sweep in
+    parts leaves out keyframes that see much of what lies on disk, and spares what they see.
 
     Args:
         contribution: Measures how much of each Gaussian shows.
         densifier: Owner of the map's Gaussians and keyframes.
+        paging: Keeps the part of the map that is on disk.
         min_contribution: Coverage in the keyframe that shows most of a Gaussian, below which it is removed [px].
     """
 
-    def __init__(self, contribution: Contribution, densifier: Densifier, min_contribution: float) -> None:
+    def __init__(
+        self, contribution: Contribution, densifier: Densifier, paging: Paging, min_contribution: float
+    ) -> None:
         self.contribution = contribution
         self._densifier = densifier
+        self._paging = paging
         self._min_contribution = min_contribution
         self._swept = 0
+        self._left_out: list[Keyframe] = []
         self._young: Keyframe
 
     def sweep(self, count: int, near: float) -> None:
@@ -39,20 +48,21 @@ class HiddenGaussians:
             count: Number of keyframes.
             near: Depth below which nothing is drawn [scene units].
         """
-        keyframes = self._densifier.keyframes.selected
-        if count == 0 or not keyframes or self._min_contribution == 0.0:
+        store = self._densifier.keyframes
+        if count == 0 or not store.selected or self._min_contribution == 0.0:
             return
+        whole = count >= len(store.selected)
         if self._swept == 0:
-            self.contribution.begin()
-            self._young = keyframes[-min(YOUNG, len(keyframes))]
-        level = 0 if count >= len(keyframes) else COARSE
-        self.contribution.measure(keyframes[self._swept : self._swept + count], near, level)
+            self._begin()
+            self._young = store.selected[-min(YOUNG, len(store.selected))]
+        views = store.selected[self._swept : self._swept + count]
+        far = [] if whole else [view for view in views if view.missing > store.most_missing]
+        self._left_out += far
+        self._measure([view for view in views if view not in far] if far else views, near, 0 if whole else COARSE)
         self._swept += count
-        if self._swept >= len(keyframes):
+        if self._swept >= len(store.selected):
             self._swept = 0
-            gaussians = self._densifier.gaussians
-            shows = gaussians.coverages() >= self._min_contribution
-            gaussians.remove(shows | self._densifier.placed_since(self._young))
+            self._remove(self._min_contribution, self._densifier.first_anchor_since(self._young))
 
     def remove(self, min_contribution: float, near: float) -> None:
         """Remove all Gaussians of a finished map that hardly show in any view. A sweep that goes on is given up.
@@ -62,6 +72,28 @@ class HiddenGaussians:
             near: Depth below which nothing is drawn [scene units].
         """
         self._swept = 0
+        self._begin()
+        self._measure(self._densifier.keyframes, near, 0)
+        self._remove(min_contribution, len(self._densifier.anchors))
+
+    def _begin(self) -> None:
         self.contribution.begin()
-        self.contribution.measure(self._densifier.keyframes, near)
-        self._densifier.gaussians.remove(self._densifier.gaussians.coverages() >= min_contribution)
+        self._paging.away.sweep += 1
+        self._left_out = []
+
+    def _measure(self, views: Iterable[Keyframe], near: float, level: int) -> None:
+        """Measure views, each with all that it sees."""
+
+        def complete() -> Iterator[Keyframe]:
+            for view in views:
+                self._paging.gather([view])
+                yield view
+
+        self.contribution.measure(complete(), near, level)
+
+    def _remove(self, min_contribution: float, young: int) -> None:
+        """Remove what hardly showed, unless it was placed by the anchor `young` or later, or may show elsewhere."""
+        gaussians = self._densifier.gaussians
+        spared = (gaussians.anchors() >= young) | self._paging.seen_by(self._left_out)
+        gaussians.remove((gaussians.coverages() >= min_contribution) | spared)
+        self._paging.away.remove_hidden(min_contribution, young, self._left_out)

@@ -25,7 +25,16 @@ __all__ = ["MapOptimiser"]
 
 
 class MapOptimiser:
-    """Optimises Gaussians, and the poses and exposures of keyframes, on the images of keyframes."""
+    """Optimises Gaussians, and the poses and exposures of keyframes, on the images of keyframes.
+
+    Args:
+        gaussians: The Gaussians of the map.
+        renderer: Renderer of the map.
+        settings: Settings of the mapping.
+
+    Attributes:
+        before_views: Called with the views of each Adam step before they are rendered.
+    """
 
     def __init__(self, gaussians: GaussianField, renderer: Renderer, settings: MappingSettings) -> None:
         self.gaussians = gaussians
@@ -42,6 +51,7 @@ class MapOptimiser:
         self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
         self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
+        self.before_views: Callable[[list[Keyframe]], None] = lambda views: None
 
     def rates(
         self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0, other_factor: float = 1.0
@@ -104,6 +114,7 @@ class MapOptimiser:
         size = self.settings.optimise.batch
         seen: list[tuple[Keyframe, LossValues]] = []
         for first in range(0, len(views), size):
+            self.before_views([store[j] for j in views[first : first + size]])
             seen += self._step(store, views[first : first + size], rates, pose_rate, level)
         self.loss.send()
         self._unread.append(seen)

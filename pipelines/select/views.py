@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fields.map.covisibility import SeenPoints, covisibility
 from fields.map.keyframes import KeyframeStore
@@ -25,18 +26,28 @@ class ViewSelection(Protocol):
         ...
 
 
-def global_probabilities(store: KeyframeStore, error_weight: float, recency_weight: float) -> np.ndarray:
-    """Probabilities (N,) of all keyframes in the draw of global views (Eq. 2).
+def global_probabilities(
+    store: KeyframeStore, error_weight: float, recency_weight: float, among: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Probabilities (N,) of keyframes in the draw of global views (Eq. 2).
 
     p(j) is proportional to exp(error_weight err(j)) exp(recency_weight (j - last)).
+
+    Args:
+        store: The keyframes.
+        error_weight: Weight of the errors.
+        recency_weight: Weight of the places.
+        among: Places (N,) of the keyframes that may be drawn.
     """
-    exponent = error_weight * store.errors() + recency_weight * (np.arange(len(store)) - (len(store) - 1))
+    exponent = error_weight * store.errors()[among] + recency_weight * (among - (len(store) - 1))
     p = np.exp(exponent - exponent.max())
     return p / p.sum()
 
 
 class LocalGlobalViews:
     """Selects the latest keyframe, up to `local_views` recent ones and `global_views` from all keyframes.
+
+    Keyframes that see too much of what lies on disk are left out (`KeyframeStore.near`).
 
     Local views come from a bank of the latest keyframes before the current one. They are drawn without replacement,
     in proportion to their covisibility with the current view. Global views are drawn by Eq. 2. Both draws are repeated
@@ -48,10 +59,14 @@ class LocalGlobalViews:
         self._rng = rng
         self._bank: list[int] = []
         self._overlap = np.zeros(0)
+        self._near = np.zeros(0, dtype=np.int64)
 
     def begin(self, store: KeyframeStore) -> None:
         last = store.latest
-        self._bank = list(range(max(0, last - self.settings.bank), last))
+        self._bank = [
+            j for j in range(max(0, last - self.settings.bank), last) if store[j].missing <= store.most_missing
+        ]
+        self._near = store.near()
         current = SeenPoints.of(store[last])
         self._overlap = np.array([covisibility(current, SeenPoints.of(store[j])) for j in self._bank])
 
@@ -62,7 +77,7 @@ class LocalGlobalViews:
             n = min(self.settings.local_views, len(self._bank))
             p = self._overlap + 1e-6
             views += list(self._rng.choice(self._bank, n, replace=False, p=p / p.sum()))
-        if len(store) > 1 and self.settings.global_views:
-            p = global_probabilities(store, self.settings.error_weight, self.settings.recency_weight)
-            views += list(self._rng.choice(len(store), self.settings.global_views, p=p))
+        if len(store) > 1 and len(self._near) and self.settings.global_views:
+            p = global_probabilities(store, self.settings.error_weight, self.settings.recency_weight, self._near)
+            views += list(self._rng.choice(self._near, self.settings.global_views, p=p))
         return [int(v) for v in views]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import Keyframe, KeyframeStore
+from pipelines.blocks.paging import Paging
 from pipelines.render.renderer import RenderedView, Renderer
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 from pipelines.transients.masks import soft_mask
@@ -65,12 +66,14 @@ class TransientSweep:
         gaussians: The Gaussians of the map.
         keyframes: The keyframes of the map.
         renderer: Renderer of the map.
+        paging: Keeps the part of the map that is on disk.
     """
 
-    def __init__(self, gaussians: GaussianField, keyframes: KeyframeStore, renderer: Renderer) -> None:
+    def __init__(self, gaussians: GaussianField, keyframes: KeyframeStore, renderer: Renderer, paging: Paging) -> None:
         self.gaussians = gaussians
         self.keyframes = keyframes
         self.renderer = renderer
+        self.paging = paging
 
     def after_keyframe(self, near: float) -> None:
         """Sweep over the latest keyframes, if enough have come since the last time.
@@ -91,7 +94,10 @@ class TransientSweep:
         """
         if len(self.gaussians) == 0:
             return
-        coarse = [compared(self.renderer, view, view.T_camera_world, view.exposure, near) for view in views]
+        coarse = []
+        for view in views:
+            self.paging.gather([view])
+            coarse.append(compared(self.renderer, view, view.T_camera_world, view.exposure, near))
         masks = [view.transient for view in views]
         for _ in range(ROUNDS):
             voters = [without(c, mask) for c, mask in zip(coarse, masks, strict=True)]

@@ -28,11 +28,14 @@ def store(errors: list[float], far: tuple[int, ...] = ()) -> KeyframeStore:
 def test_global_probabilities_are_equation_2() -> None:
     errors = [0.01, 0.05, 0.02]
     weights = [np.exp(50 * e) * np.exp(0.3 * (j - 2)) for j, e in enumerate(errors)]
-    np.testing.assert_allclose(global_probabilities(store(errors), 50.0, 0.3), np.array(weights) / sum(weights))
+    p = global_probabilities(store(errors), 50.0, 0.3, np.arange(3))
+    np.testing.assert_allclose(p, np.array(weights) / sum(weights))
+    p = global_probabilities(store(errors), 50.0, 0.3, np.array([0, 2]))
+    np.testing.assert_allclose(p, np.array(weights)[[0, 2]] / (weights[0] + weights[2]))
 
 
 def test_global_probabilities_stand_errors_of_any_size() -> None:
-    p = global_probabilities(store([0.0, 100.0]), 50.0, 0.001)
+    p = global_probabilities(store([0.0, 100.0]), 50.0, 0.001, np.arange(2))
     assert p[1] == pytest.approx(1.0)
 
 
@@ -53,7 +56,8 @@ def test_global_views_follow_their_probabilities() -> None:
     keyframes = store([0.00, 0.02, 0.04])
     views.begin(keyframes)
     drawn = np.bincount([views.select(keyframes)[1] for _ in range(4000)], minlength=3) / 4000
-    np.testing.assert_allclose(drawn, global_probabilities(keyframes, settings.error_weight, 0.001), atol=0.03)
+    expected = global_probabilities(keyframes, settings.error_weight, 0.001, np.arange(3))
+    np.testing.assert_allclose(drawn, expected, atol=0.03)
 
 
 def test_local_views_are_drawn_by_covisibility() -> None:
@@ -61,6 +65,18 @@ def test_local_views_are_drawn_by_covisibility() -> None:
     keyframes = store([0.1] * 4, far=(0, 1))
     views.begin(keyframes)
     assert {views.select(keyframes)[1] for _ in range(100)} == {2}
+
+
+def test_keyframes_that_see_much_of_what_lies_on_disk_are_not_drawn() -> None:
+    views = LocalGlobalViews(ViewSettings(local_views=2, global_views=3), np.random.default_rng(4))
+    keyframes = store([0.1] * 6)
+    keyframes.most_missing = 1
+    for place, missing in enumerate([2, 0, 1, 2, 0, 3]):
+        keyframes[place].missing = missing
+    views.begin(keyframes)
+    draws = np.array([views.select(keyframes) for _ in range(100)])
+    assert (draws[:, 0] == 5).all()
+    assert set(draws[:, 1:].ravel()) == {1, 2, 4}
 
 
 def test_the_first_keyframe_is_alone() -> None:

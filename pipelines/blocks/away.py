@@ -1,0 +1,292 @@
+"""`BlocksOnDisk`: the blocks of a map that lie on disk, and the keyframes that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.blocks import Boxes, box_of, extent_of, planes_of, seen
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import Keyframe, KeyframeStore
+from pipelines.blocks.block_files import BlockError, BlockFiles, StoredBlock, records_of, state_of
+
+__all__ = ["BlockOnDisk", "BlocksOnDisk", "planes_of_views"]
+
+# Depth up to which a view counts as seeing a block [median depths of its points]. Farther things are hidden, as a rule.
+REACH = 8.0
+
+
+# Number of blocks whose viewers are determined together, which bounds the memory that this takes.
+CHUNK = 256
+
+
+@dataclass(slots=True)
+class BlockOnDisk:
+    """A block on disk.
+
+    Attributes:
+        number: Unique number.
+        stored: Where it is.
+        box: A box around it.
+        viewers: Places (V,) of the keyframes that see it.
+        sweep: Number of the sweep in which its coverages were measured.
+    """
+
+    number: int
+    stored: StoredBlock
+    box: Boxes
+    viewers: NDArray[np.int64]
+    sweep: int
+
+
+class BlocksOnDisk:
+    """The blocks of a map that lie on disk, in the order in which they went there.
+
+    A keyframe that sees a block on disk misses its Gaussians (`Keyframe.missing`), and its images lie on disk as well.
+
+    Args:
+        gaussians: The resident Gaussians.
+        keyframes: The keyframes of the map.
+        folder: Folder for the files; None for a temporary one.
+
+    Attributes:
+        sweep: Number of the sweep in which coverages are measured, see `HiddenGaussians`.
+    """
+
+    def __init__(self, gaussians: GaussianField, keyframes: KeyframeStore, folder: Path | None) -> None:
+        self.gaussians = gaussians
+        self.keyframes = keyframes
+        self._files = BlockFiles(folder)
+        self._blocks: dict[int, BlockOnDisk] = {}
+        self._added = 0
+        self._planes: list[tuple[NDArray[np.float64], float, NDArray[np.float64]]] = []  # pose, far and planes
+        self.sweep = 0
+        self._boxes: Boxes | None = None  # of the blocks, once they are asked for
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def __iter__(self) -> Iterator[BlockOnDisk]:
+        return iter(list(self._blocks.values()))
+
+    @property
+    def boxes(self) -> Boxes:
+        """The boxes (B,) around the blocks."""
+        if self._boxes is None:
+            self._boxes = Boxes.joined([block.box for block in self._blocks.values()])
+        return self._boxes
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Number (B,) of Gaussians of each block."""
+        return np.array([block.stored.count for block in self._blocks.values()], dtype=np.int64)
+
+    def read(self, block: BlockOnDisk) -> NDArray[np.void]:
+        """Return the records of a block, memory-mapped.
+
+        Raises:
+            BlockError: If its file is missing or damaged. The map is then without it.
+        """
+        try:
+            return self._files.read(block.stored)
+        except BlockError:
+            self.forget(block)
+            raise
+
+    def add(self, blocks: Sequence[tuple[NDArray[np.void], Boxes, NDArray[np.int64]]]) -> None:
+        """Write blocks. Raises OSError if there is no room; none of them is then here.
+
+        Args:
+            blocks: The records, the box and the places of the viewers of each block.
+        """
+        if not blocks:
+            return
+        stored = self._files.write([records for records, _, _ in blocks])
+        for place, (_, box, viewers) in zip(stored, blocks, strict=True):
+            self._put(place, box, viewers, self.sweep)
+
+    def _put(self, stored: StoredBlock, box: Boxes, viewers: NDArray[np.int64], sweep: int) -> BlockOnDisk:
+        block = BlockOnDisk(self._added, stored, box, viewers, sweep)
+        self._blocks[self._added] = block
+        self._added += 1
+        self._boxes = None
+        for place in viewers.tolist():
+            self.keyframes[place].missing += stored.count
+        return block
+
+    def store_images(self, keyframe: Keyframe) -> None:
+        """Move the images of a keyframe to disk. Raises OSError if there is no room."""
+        self.keyframes.move_images(keyframe, self._files.store_images)
+
+    def forget_pages(self) -> None:
+        """Give back the memory of images on disk that have been read."""
+        self._files.forget_pages()
+
+    def forget(self, block: BlockOnDisk) -> None:
+        """Remove a block and its file."""
+        del self._blocks[block.number]
+        self._boxes = None
+        self._files.forget(block.stored)
+        for place in block.viewers.tolist():
+            self.keyframes[place].missing -= block.stored.count
+
+    def fetch(self, blocks: Sequence[BlockOnDisk]) -> None:
+        """Append the Gaussians of blocks to the resident ones, in order, and remove the blocks from here.
+
+        Raises:
+            BlockError: As in `read`.
+            ValueError: If the pool is too small.
+        """
+        if blocks:
+            records = np.concatenate([self.read(block) for block in blocks])
+            measured = np.repeat([block.sweep == self.sweep for block in blocks], [b.stored.count for b in blocks])
+            records["coverage"][~measured] = 0.0
+            self.gaussians.extend(state_of(records))
+            for block in blocks:
+                self.forget(block)
+
+    def change(self, block: BlockOnDisk, change: Callable[[int], None]) -> None:
+        """Change the Gaussians of a block.
+
+        Args:
+            block: The block.
+            change: Changes the resident Gaussians from a place on, which are then those of the block.
+
+        Raises:
+            BlockError: As in `read`.
+            ValueError: If the pool is too small.
+            OSError: If the changed block cannot be written. Its Gaussians are then resident.
+        """
+        first = len(self.gaussians)
+        self.fetch([block])
+        change(first)
+        records = self.resident_records(first)
+        box = _box(records)
+        self.add([(records, box, self.viewers(box)[0])])
+        self.gaussians.remove(np.arange(len(self.gaussians)) < first)
+
+    def resident_records(self, first: int = 0) -> NDArray[np.void]:
+        """Return the complete state of the resident Gaussians from `first` on as records."""
+        state = self.gaussians.to_numpy(first) | self.gaussians.history(first)
+        return records_of(state | {"coverage": self.gaussians.coverages(first)})
+
+    def remove_hidden(self, min_coverage: float, young: int, left_out: Iterable[Keyframe]) -> None:
+        """Remove Gaussians whose coverage was too small in the present sweep.
+
+        Args:
+            min_coverage: Smallest coverage of what stays [px].
+            young: Gaussians of this anchor and later ones stay.
+            left_out: Keyframes that the sweep has left out. What they see stays.
+        """
+        spared = {view.index for view in left_out}
+        for block in self:
+            if block.sweep != self.sweep or spared & {self.keyframes[place].index for place in block.viewers.tolist()}:
+                continue
+            records = self.read(block)
+            keep = (records["coverage"] >= min_coverage) | (records["anchor"] >= young)
+            if not keep.all():
+                kept = records[keep]
+                if len(kept):
+                    self.add([(kept, _box(kept), block.viewers)])
+                self.forget(block)
+
+    def viewers(self, boxes: Boxes) -> list[NDArray[np.int64]]:
+        """Return the places of the keyframes that see each of B boxes."""
+        planes, found = self._all_planes(), []
+        for first in range(0, len(boxes), CHUNK):
+            some = boxes[first : first + CHUNK]
+            around = Boxes(some.low.min(axis=0)[None], some.high.max(axis=0)[None])
+            places = np.flatnonzero(seen(planes, around))
+            found += [places[sees] for sees in seen(planes[places], some).T]
+        return found
+
+    def close(self) -> None:
+        """Remove all files. The map is not usable any more."""
+        self._files.close()
+
+    def look(self, place: int) -> None:
+        """Determine which blocks a new keyframe sees.
+
+        Args:
+            place: Its place in the store.
+        """
+        keyframe = self.keyframes[place]
+        if self._blocks:
+            blocks = list(self)
+            for number in np.flatnonzero(seen(planes_of_views([keyframe]), self.boxes)[0]).tolist():
+                blocks[number].viewers = np.append(blocks[number].viewers, place)
+                keyframe.missing += blocks[number].stored.count
+
+    def look_again(self) -> None:
+        """Determine again which keyframes see which blocks, after their poses have changed."""
+        for view in self.keyframes:
+            view.missing = 0
+        for block, viewers in zip(self, self.viewers(self.boxes), strict=True):
+            block.viewers = viewers
+            for place in viewers.tolist():
+                self.keyframes[place].missing += block.stored.count
+
+    def _all_planes(self) -> NDArray[np.float64]:
+        """Planes (K, 6, 4) of all keyframes. Those of keyframes that have not moved are taken from the last call."""
+        for place, view in enumerate(self.keyframes):
+            far = REACH * view.median_depth
+            if place == len(self._planes):
+                self._planes.append((view.T_camera_world, far, planes_of(view.camera, view.T_camera_world, far)))
+            elif self._planes[place][0] is not view.T_camera_world or self._planes[place][1] != far:
+                self._planes[place] = (view.T_camera_world, far, planes_of(view.camera, view.T_camera_world, far))
+        return np.array([planes for _, _, planes in self._planes]).reshape(-1, 6, 4)
+
+    # ---- snapshots -------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, NDArray]:
+        """Return the blocks as arrays, for `restore`. The records are memory-mapped. Raises BlockError as `read`."""
+        stored = [block.stored for block in self]
+        files = list(dict.fromkeys(place.path for place in stored))
+        arrays = {
+            "file": np.array([files.index(place.path) for place in stored], dtype=np.int64),
+            "first": np.array([place.first for place in stored], dtype=np.int64),
+            "count": self.counts,
+            "checksum": np.array([place.checksum for place in stored], dtype=np.int64),
+            "low": self.boxes.low,
+            "high": self.boxes.high,
+            "viewers": np.concatenate([np.zeros(0, dtype=np.int64), *(block.viewers for block in self)]),
+            "viewer_counts": np.array([len(block.viewers) for block in self], dtype=np.int64),
+            "images": np.array([view.index for view in self.keyframes if view.pyramid[0].on_disk], dtype=np.int64),
+        }
+        return arrays | {f"bytes{number}": self._files.contents(path) for number, path in enumerate(files)}
+
+    def restore(self, arrays: dict[str, NDArray]) -> None:
+        """Restore the blocks of `state`. Keyframes, with their images on disk, have been restored before.
+
+        Raises:
+            KeyError, ValueError: If the arrays do not fit the map, or blocks are damaged.
+            OSError: If the blocks cannot be written.
+        """
+        kind = self.resident_records(len(self.gaussians)).dtype
+        viewers = np.split(arrays["viewers"], np.cumsum(arrays["viewer_counts"])[:-1])
+        if len(arrays["viewers"]) and not 0 <= arrays["viewers"].min() <= arrays["viewers"].max() < len(self.keyframes):
+            raise ValueError("a block on disk is seen by a keyframe that the state does not contain")
+        files = np.unique(arrays["file"]).tolist()
+        paths = {
+            file: self._files.take(arrays[f"bytes{file}"], kind, int((arrays["file"] == file).sum())) for file in files
+        }
+        for block, (file, first, count, checksum) in enumerate(
+            zip(*(arrays[name].tolist() for name in ("file", "first", "count", "checksum")), strict=True)
+        ):
+            stored = StoredBlock(paths[file], first, count, checksum)
+            box = Boxes(arrays["low"][block : block + 1], arrays["high"][block : block + 1])
+            self.read(self._put(stored, box, viewers[block], self.sweep - 1))
+
+
+def _box(records: NDArray[np.void]) -> Boxes:
+    return box_of(records["position"], extent_of(records["log_scale"]))
+
+
+def planes_of_views(keyframes: Iterable[Keyframe]) -> NDArray[np.float64]:
+    """Return the planes (V, 6, 4) that bound what keyframes see."""
+    planes = [planes_of(view.camera, view.T_camera_world, REACH * view.median_depth) for view in keyframes]
+    return np.array(planes).reshape(-1, 6, 4)

@@ -1,0 +1,205 @@
+"""`BlockFiles`: Gaussians and images of keyframes in memory-mapped files."""
+
+from __future__ import annotations
+
+import mmap
+import shutil
+import tempfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.pyramid import ImageLevel
+
+__all__ = ["BlockError", "BlockFiles", "StoredBlock", "records_of", "state_of"]
+
+# Disk space that stays free for the finished map [bytes].
+KEPT_FREE = 1 << 30
+
+
+class BlockError(ValueError):
+    """Raised if a file of a block is missing or damaged. The message has one line."""
+
+
+@dataclass(frozen=True)
+class StoredBlock:
+    """Where a block is stored.
+
+    Attributes:
+        path: The file, an array of records in NumPy's .npy format (see `records_of`). Blocks that go to disk together
+            share one.
+        first: Place of the block's first record in it [bytes].
+        count: Number of Gaussians.
+        checksum: CRC-32 of the records.
+    """
+
+    path: Path
+    first: int
+    count: int
+    checksum: int
+
+
+def records_of(state: dict[str, NDArray]) -> NDArray[np.void]:
+    """Return Gaussians as an array (N,) of records, with a field for each entry of their state, in order.
+
+    Args:
+        state: The entries of `GaussianField.to_numpy` and `history`.
+    """
+    fields = [(name, array.dtype, array.shape[1:]) for name, array in state.items()]
+    records = np.zeros(len(state["opacity_logit"]), dtype=fields)
+    for name, array in state.items():
+        records[name] = array
+    return records
+
+
+def state_of(records: NDArray[np.void]) -> dict[str, NDArray]:
+    """Return the state of records, for `GaussianField.extend`."""
+    return {name: records[name] for name in records.dtype.names or ()}
+
+
+class BlockFiles:
+    """The files of blocks and of keyframes' images, in a folder of their own that is removed with this object.
+
+    Args:
+        folder: The folder, which appears with the first file. One that is left there from a process that was killed is
+            replaced. None for a temporary folder.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self._wanted = folder
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._written = 0
+        self._images: list[mmap.mmap] = []
+        self._kind = np.dtype(np.void)  # of the records
+        self._used: dict[Path, int] = {}  # number of blocks that each file still holds
+
+    @property
+    def path(self) -> Path:
+        """The folder, which is created at the first call. Raises OSError if it cannot be."""
+        if self._folder is None:
+            parent, prefix = None, "modp-ti-blocks-"
+            if self._wanted is not None:
+                parent, prefix = self._wanted.parent, f"{self._wanted.name}-"
+                parent.mkdir(parents=True, exist_ok=True)
+                for left in parent.glob(f"{prefix}*"):
+                    shutil.rmtree(left, ignore_errors=True)
+            self._folder = tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True)
+        return Path(self._folder.name)
+
+    def write(self, blocks: Sequence[NDArray[np.void]]) -> list[StoredBlock]:
+        """Write the records of blocks to one file. Raises OSError if there is no room, or too little would be left."""
+        together = np.concatenate(blocks)
+        path = self._next("blocks", ".npy", together.nbytes)
+        try:
+            np.save(path, together, allow_pickle=False)
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
+        self._used[path] = len(blocks)
+        self._kind, first = together.dtype, path.stat().st_size - together.nbytes
+        stored = []
+        for records in blocks:
+            stored.append(StoredBlock(path, first, len(records), _checksum(records)))
+            first += records.nbytes
+        return stored
+
+    def contents(self, path: Path) -> NDArray[np.uint8]:
+        """Return the bytes of a file, memory-mapped. Raises BlockError if it is missing."""
+        try:
+            return np.memmap(path, dtype=np.uint8, mode="r")
+        except (OSError, ValueError) as error:
+            raise BlockError(f"{path}: blocks of the map are gone ({error})") from None
+
+    def take(self, contents: NDArray[np.uint8], kind: np.dtype, blocks: int) -> Path:
+        """Write a file of such contents, and return its path. Raises OSError as `write`.
+
+        Args:
+            contents: Result of `contents`.
+            kind: Type of the records.
+            blocks: Number of blocks in it that are in use.
+        """
+        path = self._next("blocks", ".npy", contents.nbytes)
+        contents.tofile(path)
+        self._kind, self._used[path] = kind, blocks
+        return path
+
+    def read(self, block: StoredBlock) -> NDArray[np.void]:
+        """Return a copy of the records (N,) of a block.
+
+        Raises:
+            BlockError: If the file is missing, or the records differ from those that were written.
+        """
+        try:
+            # Not memory-mapped: of every file that a map touches, the system maps much more than the block.
+            records = np.fromfile(block.path, self._kind, block.count, offset=block.first)
+        except OSError as error:
+            raise BlockError(f"{block.path}: blocks of the map are gone ({error.strerror})") from None
+        if len(records) != block.count or _checksum(records) != block.checksum:
+            raise BlockError(f"{block.path}: a block of the map is damaged ({block.count:,} Gaussians)")
+        return records
+
+    def forget(self, block: StoredBlock) -> None:
+        """Remove a block, and its file with the last block in it."""
+        self._used[block.path] -= 1
+        if self._used[block.path] == 0:
+            del self._used[block.path]
+            block.path.unlink(missing_ok=True)
+
+    def store_images(self, images: Sequence[ImageLevel]) -> list[ImageLevel]:
+        """Write images to one file, and return them memory-mapped. Those that are already on disk stay as they are.
+
+        Raises OSError as `write` does.
+        """
+        here = [image.rgba for image in images if not image.on_disk]
+        if not here:
+            return list(images)
+        size = sum(rgba.nbytes for rgba in here)
+        path = self._next("images", ".raw", size)
+        try:
+            with path.open("wb") as file:
+                for rgba in here:
+                    file.write(np.ascontiguousarray(rgba).data)
+            with path.open("rb") as file:
+                # Copy-on-write, because kernels take no read-only arrays.
+                mapped = mmap.mmap(file.fileno(), size, access=mmap.ACCESS_COPY)
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
+        self._images.append(mapped)
+        stored, start = [], 0
+        for image in images:
+            if image.on_disk:
+                stored.append(image)
+                continue
+            end = start + image.rgba.nbytes
+            rgba = np.frombuffer(mapped, dtype=np.uint8, count=end - start, offset=start).reshape(image.rgba.shape)
+            stored.append(ImageLevel(rgba, image.camera, on_disk=True))
+            start = end
+        return stored
+
+    def forget_pages(self) -> None:
+        """Give back the memory of images that have been read. It is taken again when they are read again."""
+        if hasattr(mmap, "MADV_DONTNEED"):
+            for images in self._images:
+                images.madvise(mmap.MADV_DONTNEED)
+
+    def close(self) -> None:
+        """Remove the folder."""
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def _next(self, kind: str, suffix: str, size: int) -> Path:
+        """Return the path of a new file of so many bytes."""
+        folder = self.path
+        if shutil.disk_usage(folder).free < KEPT_FREE + size:
+            raise OSError(28, "No space left on device")
+        self._written += 1
+        return folder / f"{kind}-{self._written:06d}{suffix}"
+
+
+def _checksum(records: NDArray[np.void]) -> int:
+    return zlib.crc32(np.ascontiguousarray(records).view(np.uint8).data)

@@ -1,0 +1,252 @@
+"""`Paging`: moves blocks of the map to disk when there is no room for more, and back when a view sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.tracked_frame import TrackedFrame
+from fields.map.blocks import Blocks, Boxes, divide, extent_of, seen
+from fields.map.gaussians import GaussianField
+from fields.map.keyframes import Keyframe, KeyframeStore
+from pipelines.blocks.away import BlocksOnDisk, planes_of_views
+from pipelines.blocks.groups import grouped
+from pipelines.memory_budget import OBSERVATION, MemoryBudget
+from pipelines.settings import MappingSettings
+
+__all__ = ["Paging"]
+
+# Side of a block [scene depths]. An image is about one scene depth wide where most of it lies.
+SIDE = 0.125
+# Share of a limit that is used after blocks have gone to disk, so that they go rarely.
+KEPT = 0.9
+# Size of a group of keyframes: Gaussians that they see together, over the number that fit. In smaller groups, fewer
+# blocks are moved, but what two groups see is optimised for one after the other, which is worse than for both at once.
+TOGETHER = 1.5
+# Share of the Gaussians in sight of the latest keyframe that another one may miss and still be drawn as a view. Views
+# around the camera are drawn in this way, and those of distant places are not.
+MISSING = 0.5
+# Bytes of voxels that a new Gaussian takes, rounded up.
+VOXELS_EACH = 80
+
+
+class Paging:
+    """Keeps the resident part of a map within its limits, `max_gaussians` and `memory`.
+
+    Space is divided into cubes. When a new keyframe lacks room, the blocks that it does not see go to disk, the
+    farthest first, with the complete state of their Gaussians. Before a view is rendered, the blocks that it sees come
+    back. Keyframes of distant places are not drawn as views while the map grows. The voxels of the whole map stay in
+    memory, so that no Gaussian is added where one lies on disk.
+
+    What is moved depends on the map alone, so that runs are reproducible. A map within its limits is not touched.
+
+    Args:
+        gaussians: The resident Gaussians.
+        keyframes: The keyframes of the map.
+        budget: Memory budget of the map.
+        settings: Settings of the mapping.
+        folder: Folder for the files; None for a temporary one.
+
+    Attributes:
+        away: The blocks on disk.
+        group: Group (K,) of each keyframe after `plan`.
+        problem: Why nothing can go to disk any more; None if it can.
+    """
+
+    def __init__(
+        self,
+        gaussians: GaussianField,
+        keyframes: KeyframeStore,
+        budget: MemoryBudget,
+        settings: MappingSettings,
+        folder: Path | None = None,
+    ) -> None:
+        self.gaussians = gaussians
+        self.keyframes = keyframes
+        self.budget = budget
+        self.settings = settings
+        self.away = BlocksOnDisk(gaussians, keyframes, folder)
+        self.group = np.zeros(0, dtype=np.int64)
+        self.problem: str | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians of the whole map."""
+        return len(self.gaussians) + int(self.away.counts.sum())
+
+    def to_numpy(self) -> dict[str, NDArray]:
+        """Return the values of the whole map, the resident Gaussians first, see `GaussianField.to_numpy`.
+
+        Raises:
+            BlockError: If a block's file is missing or damaged. The map is then without it.
+        """
+        here, blocks = self.gaussians.to_numpy(), [self.away.read(block) for block in self.away]
+        return {name: np.concatenate([array, *(records[name] for records in blocks)]) for name, array in here.items()}
+
+    def placed(self) -> tuple[NDArray[np.floating], NDArray[np.int32]]:
+        """Return the position (N, 3) and the anchor (N,) of every Gaussian of the whole map. Raises as `to_numpy`."""
+        blocks = [self.away.read(block) for block in self.away]
+        position = [self.gaussians.to_numpy()["position"], *(records["position"] for records in blocks)]
+        anchor = [self.gaussians.anchors(), *(records["anchor"] for records in blocks)]
+        return np.concatenate(position), np.concatenate(anchor)
+
+    def seen_by(self, keyframes: Sequence[Keyframe]) -> NDArray[np.bool_]:
+        """Return whether each resident Gaussian (N,) is in a block that one of the keyframes sees."""
+        found = np.zeros(len(self.gaussians), dtype=bool)
+        if keyframes:
+            blocks = self._divided()
+            for block in np.flatnonzero(seen(planes_of_views(keyframes), blocks.boxes).any(axis=0)).tolist():
+                found[blocks.of(block)] = True
+        return found
+
+    # ---- while the map grows ---------------------------------------------------------------------------------
+
+    def before_keyframe(self, frame: TrackedFrame) -> None:
+        """Bring in what a frame sees, and make room for what it adds as a keyframe. Call it between two steps.
+
+        Raises:
+            BlockError: If a block's file is missing or damaged. The map is then without it.
+        """
+        area = frame.camera.width * frame.camera.height / (640 * 480)
+        self._prepare(frame, round(self.settings.densify.pixels * area**0.75), bring=True)
+
+    def before_points(self, frame: TrackedFrame) -> None:
+        """Make room for the tracked points of a frame that is no keyframe. Call it between two steps."""
+        self._prepare(frame, 0, bring=False)
+
+    def _prepare(self, frame: TrackedFrame, pixels: int, bring: bool) -> None:
+        """Make room for `pixels` Gaussians, and those at the points of a frame; `bring` in what it sees first."""
+        if len(self.keyframes) == 0:
+            return
+        added = pixels + len(frame.points)
+        nbytes = added * VOXELS_EACH + len(frame.points) * OBSERVATION + self.keyframes.bytes_of(frame)
+        if min(self._spare(nbytes)) < added or (bring and len(self.away)):
+            view = self.keyframes.view(frame)
+            if not bring:
+                self._make_room([view], added, nbytes)
+                return
+            self._bring([view], added, nbytes)
+            position = self.gaussians.to_numpy()["position"].astype(np.float64)
+            in_sight = seen(planes_of_views([view]), Boxes(position, position))
+            self.keyframes.most_missing = round(MISSING * np.count_nonzero(in_sight))
+
+    def rewrite(self, change: Callable[[int], None]) -> None:
+        """Change the Gaussians of all blocks on disk.
+
+        Args:
+            change: Changes the resident Gaussians from a place on. It is called for one block after the other.
+
+        Raises:
+            BlockError: If a block's file is missing or damaged. The map is then without it.
+        """
+        for block in self.away:
+            self._make_room([], block.stored.count, 0)
+            try:
+                self.away.change(block, change)
+            except OSError as error:
+                self.problem = f"blocks of the map cannot be kept on disk: {error.strerror}"
+        self.away.look_again()
+
+    # ---- the finished map ------------------------------------------------------------------------------------
+
+    def plan(self) -> None:
+        """Group the keyframes in order, so that few blocks have to be moved between the views of a group."""
+        self.group = np.zeros(len(self.keyframes), dtype=np.int64)
+        if len(self.away):
+            blocks = self._divided()
+            boxes = Boxes.joined([blocks.boxes, self.away.boxes])
+            sees = (seen(planes[None], boxes)[0] for planes in planes_of_views(self.keyframes))
+            counts = np.concatenate([blocks.counts, self.away.counts])
+            room = len(self.gaussians) + min(self._spare(0))
+            self.group = grouped(sees, counts, round(TOGETHER * room))
+
+    def groups(self) -> list[NDArray[np.int64]]:
+        """Return the places of each group's keyframes. A map without blocks on disk is one group."""
+        if len(self.group) != len(self.keyframes):
+            self.plan()
+        return [np.flatnonzero(self.group == number) for number in range(self.group.max(initial=-1) + 1)]
+
+    def gather(self, views: Sequence[Keyframe]) -> None:
+        """Bring in what keyframes see, before they are rendered. Call it between two steps.
+
+        Raises:
+            BlockError: If a block's file is missing or damaged. The map is then without it.
+        """
+        if any(view.missing for view in views):
+            self._bring(views, 0, 0)
+
+    # ---- room ------------------------------------------------------------------------------------------------
+
+    def _divided(self) -> Blocks:
+        values = self.gaussians.to_numpy()
+        return divide(values["position"], extent_of(values["log_scale"]), SIDE * self.keyframes.scene_depth)
+
+    def _spare(self, nbytes: int, share: float = 1.0) -> tuple[float, float]:
+        """Number of Gaussians for which a share of the pool, and of the memory beside `nbytes`, has room."""
+        memory = np.inf
+        if self.budget.limit is not None:
+            memory = (share * self.budget.limit - self.budget.held() - nbytes) / self.gaussians.bytes_each
+        return share * self.gaussians.capacity - len(self.gaussians), memory
+
+    def _bring(self, views: Sequence[Keyframe], gaussians: int, nbytes: int) -> None:
+        """Bring in the blocks that views see, the nearest to the first view first, as far as there is room.
+
+        Args:
+            views: The views.
+            gaussians: Number of further Gaussians to make room for.
+            nbytes: Number of other bytes to make room for.
+        """
+        boxes, counts, blocks = self.away.boxes, self.away.counts, list(self.away)
+        wanted = np.flatnonzero(seen(planes_of_views(views), boxes).any(axis=0))
+        wanted = wanted[_by_distance(boxes[wanted], views[0])]
+        self._make_room(views, int(counts[wanted].sum()) + gaussians, nbytes)
+        fit = np.cumsum(counts[wanted]) + gaussians <= min(self._spare(nbytes))
+        self.away.fetch([blocks[number] for number in wanted[fit].tolist()])
+
+    def _make_room(self, views: Sequence[Keyframe], gaussians: int, nbytes: int) -> None:
+        """Move blocks to disk that no view sees, the farthest from the first view first, until there is room.
+
+        Args:
+            views: The views. Without any, every block may go.
+            gaussians: Number of Gaussians to make room for.
+            nbytes: Number of other bytes to make room for.
+        """
+        if self.problem is not None or min(self._spare(nbytes)) >= gaussians:
+            return
+        blocks = self._divided()
+        free = np.flatnonzero(~seen(planes_of_views(views), blocks.boxes).any(axis=0))
+        if views:
+            free = free[_by_distance(blocks.boxes[free], views[0])[::-1]]
+        pool, memory = self._spare(nbytes, KEPT)
+        if (
+            memory == np.inf
+        ):  # the number of blocks that go is known beforehand, and the viewers of the others do not matter
+            free = free[: 1 + int(np.searchsorted(pool + np.cumsum(blocks.counts[free]), gaussians))]
+        records = self.away.resident_records()
+        gone = np.zeros(len(self.gaussians), dtype=bool)
+        going, images = [], set()
+        for block, sees in zip(free.tolist(), self.away.viewers(blocks.boxes[free]), strict=True):
+            if min(pool, memory) >= gaussians:
+                break
+            members = blocks.of(block)
+            freed = sum(self.keyframes[place].image_bytes for place in set(sees.tolist()) - images)
+            pool, memory = pool + len(members), memory + len(members) + freed / self.gaussians.bytes_each
+            images.update(sees.tolist())
+            gone[members] = True
+            going.append((records[members], blocks.boxes[block : block + 1], sees))
+        try:
+            self.away.add(going)
+            self.gaussians.remove(~gone)
+            for place in sorted(images):
+                self.away.store_images(self.keyframes[place])
+            self.away.forget_pages()
+        except OSError as error:
+            self.problem = f"blocks of the map cannot be kept on disk: {error.strerror}"
+
+
+def _by_distance(boxes: Boxes, view: Keyframe) -> NDArray[np.int64]:
+    """Return the order of boxes by their distance from a view's camera, the nearest first."""
+    return np.argsort(boxes.distance(view.centre), kind="stable")

@@ -1,0 +1,166 @@
+"""A map with room for a part of the long wall, whose other parts lie on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fields.frames.pose_correction import PoseCorrection
+from fields.runtime.backend import initialise
+from pipelines.blocks import block_files
+from pipelines.blocks.block_files import BlockError
+from pipelines.online import OnlineMapper
+from pipelines.settings import MappingSettings
+from tests.pipelines.blocks.long_wall import frame
+
+pytestmark = pytest.mark.slow
+
+POOL = 3072
+# Out along the wall, and home.
+STEPS = [*range(13), *range(12, -1, -1)]
+OUT = 13
+
+
+def mapper_of(folder: Path | None = None, **settings) -> OnlineMapper:
+    initialise("cpu")
+    chosen = {"sh_degree": 0, "optimise": {"steps": 1}, "densify": {"warm_up": 2}, "max_gaussians": POOL, **settings}
+    return OnlineMapper(MappingSettings(**chosen), 64, 48, seed=1, folder=folder)
+
+
+def walk(mapper: OnlineMapper, first: int = 0, end: int = len(STEPS)) -> OnlineMapper:
+    for index in range(first, end):
+        mapper.process(frame(index, STEPS[index]))
+    return mapper
+
+
+def mean_psnr(mapper: OnlineMapper) -> float:
+    found = []
+    for view in mapper.keyframes:
+        mapper.paging.gather([view])
+        found.append(mapper.optimiser.compare(view, mapper.keyframes.scene_depth).psnr)
+    return float(np.mean(found))
+
+
+@pytest.fixture(scope="module")
+def unlimited(taichi_on_the_cpu: None) -> tuple[int, float]:
+    """Number of Gaussians, and mean PSNR of the keyframes, of the map without a limit."""
+    mapper = walk(mapper_of(max_gaussians=100_000))
+    mapper.finish()
+    assert len(mapper.paging.away) == 0
+    return len(mapper.gaussians), mean_psnr(mapper)
+
+
+def test_a_map_beyond_its_pool_is_as_large_and_as_good(unlimited: tuple[int, float], tmp_path: Path) -> None:
+    mapper = mapper_of(tmp_path / "blocks", max_gaussians=4096)
+    for index, step in enumerate(STEPS):
+        mapper.process(frame(index, step))
+        assert len(mapper.gaussians) <= 4096
+    mapper.finish()
+    count, psnr = unlimited
+    assert count > 1.2 * 4096  # or there is nothing to show
+    assert mapper.caught().warning() is None and mapper.paging.problem is None
+    assert mapper.gaussian_count == pytest.approx(count, rel=0.05)
+    assert mean_psnr(mapper) > psnr - 2.0
+    values = mapper.all_gaussians()
+    assert {len(array) for array in values.values()} == {mapper.gaussian_count}
+    assert list(tmp_path.iterdir()), "the blocks lie in the folder that was given"
+
+
+def test_a_part_that_is_left_is_found_as_it_was_left(taichi_on_the_cpu: None) -> None:
+    mapper = walk(mapper_of(), end=OUT)
+    left = {block.number: mapper.paging.away.read(block) for block in mapper.paging.away}
+    walk(mapper, OUT, OUT + 3)
+    still = [block for block in mapper.paging.away if block.number in left]
+    assert still
+    for block in still:
+        np.testing.assert_array_equal(mapper.paging.away.read(block), left[block.number])
+    mapper.paging.gather([mapper.keyframes[int(still[0].viewers[0])]])
+    here, was = mapper.gaussians.to_numpy() | mapper.gaussians.history(), left[still[0].number]
+    place = np.flatnonzero((here["position"] == was["position"][0]).all(axis=1))[0]
+    for name, array in here.items():
+        np.testing.assert_array_equal(array[place : place + len(was)], was[name])
+
+
+def test_two_walks_are_the_same_byte_for_byte(taichi_on_the_cpu: None) -> None:
+    one, other = (walk(mapper_of(), end=16).all_gaussians() for _ in range(2))
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_a_restored_map_goes_on_as_the_saved_one(taichi_on_the_cpu: None) -> None:
+    mapper = walk(mapper_of(), end=15)
+    state = mapper.state()
+    assert len(mapper.paging.away) > 0
+    arrays = {name: np.array(array) for name, array in state.arrays.items()}
+    walk(mapper, 15, 18).finish()
+    expected = mapper.all_gaussians()
+    again = mapper_of()
+    again.restore(type(state)(arrays, state.numbers), (frame(i, STEPS[i]) for i in range(15)))
+    walk(again, 15, 18).finish()
+    for name, array in again.all_gaussians().items():
+        np.testing.assert_array_equal(array, expected[name])
+
+
+def test_a_correction_moves_what_lies_on_disk(taichi_on_the_cpu: None) -> None:
+    mapper = walk(mapper_of(corrections={"steps": 0}), end=15)
+    before, on_disk = mapper.all_gaussians(), int(mapper.paging.away.counts.sum())
+    assert on_disk > 0
+    shift = np.array([0.0, 2.0, 0.0])
+    index = np.array(list(mapper.trajectory))
+    T = np.stack([mapper.trajectory[int(i)] for i in index])
+    T[:, :3, 3] -= T[:, :3, :3] @ shift
+    report = mapper.correct(PoseCorrection(index, T, np.zeros(0, dtype=np.int64), np.zeros((0, 3))))
+    after = mapper.all_gaussians()
+    assert report.moved and mapper.gaussian_count == len(before["position"])
+    expected = np.sort(before["position"] + shift, axis=0)  # a coordinate at a time, as blocks change their order
+    np.testing.assert_allclose(np.sort(after["position"], axis=0), expected, atol=1e-4)
+    position, _ = mapper.paging.placed()
+    occupied = mapper.densifier.voxels.query(position, mapper.densifier.anchors[0].spacing)
+    assert occupied.all()
+
+
+def test_a_limit_of_memory_moves_images_to_disk(taichi_on_the_cpu: None) -> None:
+    free = walk(mapper_of(max_gaussians=100_000), end=OUT)
+    limit = 0.75 * free.budget.held()
+    count = len(free.gaussians)
+    mapper = walk(mapper_of(max_gaussians=100_000, memory=limit / 1e9), end=OUT)
+    assert mapper.budget.held() <= limit and mapper.caught().keyframes_without_room == 0
+    assert mapper.gaussian_count == pytest.approx(count, rel=0.05)
+    on_disk = [view for view in mapper.keyframes if view.pyramid[0].on_disk]
+    assert on_disk
+    for view in on_disk:
+        np.testing.assert_array_equal(view.rgba, frame(view.index, STEPS[view.index]).rgba)
+
+
+def test_a_damaged_block_is_named_and_the_map_goes_on_without_it(taichi_on_the_cpu: None) -> None:
+    mapper = walk(mapper_of(), end=OUT)
+    block = next(iter(mapper.paging.away))
+    count, path = mapper.gaussian_count, block.stored.path
+    content = bytearray(path.read_bytes())
+    content[block.stored.first + 5] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(BlockError, match=rf"{path}: a block of the map is damaged \({block.stored.count}"):
+        mapper.paging.gather([mapper.keyframes[int(block.viewers[0])]])
+    assert mapper.gaussian_count == count - block.stored.count
+    walk(mapper, OUT, OUT + 2)
+
+
+def test_a_full_disk_is_told_and_leaves_out_what_has_no_room(
+    taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(block_files, "KEPT_FREE", 1 << 60)
+    mapper = walk(mapper_of(max_gaussians=2048), end=10)
+    assert mapper.paging.problem == "blocks of the map cannot be kept on disk: No space left on device"
+    assert len(mapper.paging.away) == 0 and len(mapper.gaussians) <= 2048
+    assert mapper.caught().gaussians_without_room > 0
+
+
+def test_files_go_with_the_map(taichi_on_the_cpu: None, tmp_path: Path) -> None:
+    (tmp_path / "blocks-left").mkdir()
+    mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
+    (folder,) = tmp_path.iterdir()
+    assert folder.name != "blocks-left" and list(folder.glob("*.npy"))
+    mapper.paging.away.close()
+    assert not list(tmp_path.iterdir())
