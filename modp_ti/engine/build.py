@@ -36,7 +36,7 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None =
     """
     settings = config.offline if config.mode == "offline" else config.mapping
     try:
-        return Mapper(camera.width, camera.height, settings, config.seed, pace)
+        return Mapper(camera.width, camera.height, settings, config.seed, pace, config.output / "blocks")
     except ValueError as error:
         raise InputError(str(error)) from None
 

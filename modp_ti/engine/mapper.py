@@ -47,6 +47,7 @@ class Mapper:
             the online loop's defaults.
         seed: Seed of the random numbers.
         pace: How much work a frame of the online loop gets; None for all of the settings.
+        folder: Folder for the parts of an online map that go to disk; None for a temporary one.
 
     Attributes:
         pipeline: The online or offline mapper, with its Gaussians, keyframes and renderer.
@@ -68,13 +69,14 @@ class Mapper:
         settings: MappingSettings | OfflineSettings | None = None,
         seed: int = 0,
         pace: Pace | None = None,
+        folder: Path | None = None,
     ) -> None:
         program()
         self.pipeline: Pipeline
         if isinstance(settings, OfflineSettings):
             self.pipeline = OfflineMapper(settings, width, height, seed)
         else:
-            self.pipeline = OnlineMapper(settings or MappingSettings(), width, height, seed, pace=pace)
+            self.pipeline = OnlineMapper(settings or MappingSettings(), width, height, seed, pace=pace, folder=folder)
         self.frames = DeliveredFrames(trajectory=self.pipeline.trajectory)
         self.finished = True
 
@@ -252,7 +254,7 @@ class Mapper:
         """Return a copy of the current map on the host."""
         store = self.pipeline.keyframes
         return MapVersion(
-            self.pipeline.gaussians.to_numpy(),
+            self.pipeline.all_gaussians(),
             self.trajectory(),
             [store.exposure_at(i) for i in self.frames.index],
             self.pipeline.renderer.view_renders,
@@ -275,7 +277,7 @@ class Mapper:
         if path.suffix == ".ply":
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_splats(path, self.pipeline.gaussians.to_numpy())
+                write_splats(path, self.pipeline.all_gaussians())
             except OSError as error:
                 raise InputError(f"{path}: cannot be written: {error.strerror}") from None
             return path

@@ -27,6 +27,7 @@ from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
 from modp_ti.engine.second_visit import SecondVisit
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
+from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.trackers import Tracker, open_tracker
@@ -36,6 +37,7 @@ from modp_ti.outputs.progress import ProgressLine, StageProgress
 from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import mapped_psnr, retention
 from modp_ti.outputs.time_left import TimeAfterMapping
+from pipelines.blocks.block_files import BlockError
 from pipelines.pace import CompletePace
 from pipelines.settings import RefineSettings
 from pipelines.stopwatch import breakdown_percent
@@ -111,13 +113,17 @@ class _Session:
         self.mapper: Mapper
         self.after_mapping: TimeAfterMapping
         self.checkpointer: Checkpointer
+        self.unfinished: Unfinished
 
     def run(self, resumed: Snapshot | None) -> Path:
         """Run all stages and return the output folder."""
         self._map_the_stream(resumed)
         self._say(*remarks(self.mapper.pipeline))
         self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
-        versions = self._versions()
+        try:
+            versions = self._versions()
+        except BlockError as error:
+            raise self.unfinished.damaged(error) from None
         self._write(versions)
         return self.config.output
 
@@ -152,13 +158,16 @@ class _Session:
             self._make_mapper(first.camera)
             self.mapper.pipeline.stopwatch.seconds["track"] = prepared
             self._open_keeper(resumed, arriving)
+            self.unfinished = Unfinished(self.config, self.mapper, self.tracker, self.checkpointer)
             self.observer.begin(self.mapper, self.tracker.frame_count)
             self.clock.begin_mapping()
             self.stop.begin()
             try:
                 self._map(arriving)
             except RunStopped:
-                raise self._stopped() from None
+                raise self.unfinished.interrupted() from None
+            except BlockError as error:
+                raise self.unfinished.damaged(error) from None
             scoring = self.mapper.pipeline.stopwatch.seconds.get("evaluate", 0.0)
             self.clock.end_mapping(self.observer.waited + scoring)
         self._say(*(note for note in self.tracker.notes if note not in notes))  # a live tracker adds some at its end
@@ -265,7 +274,7 @@ class _Session:
             try:
                 self._refine(config.refine)
             except RunStopped:
-                raise self._stopped() from None
+                raise self.unfinished.interrupted() from None
             versions["refined"] = self.mapper.version()
         return versions
 
@@ -297,7 +306,7 @@ class _Session:
                 versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
                 self.conductor.write_session(results.folder, self.config)
         except InputError as error:
-            raise InputError(f"{error}{self._way_on(versions[last])}") from None
+            raise InputError(f"{error}{self.unfinished.way_on(versions[last])}") from None
         self._say(*self.conductor.notes)
         self.conductor.saved()
         self.observer.on_stage("evaluating the saved map")
@@ -344,7 +353,7 @@ class _Session:
         metrics = {
             "keyframes": len(pipeline.keyframes.selected),
             "views_between": len(pipeline.keyframes) - len(pipeline.keyframes.selected),
-            "gaussians": len(pipeline.gaussians),
+            "gaussians": len(list(versions.values())[-1].gaussians["position"]),
             "backend": self.backend,
             "seed": self.config.seed,
             "frames_per_second": round((len(frames) - self.tracker.before.frames) / self.clock.mapping, 4),
@@ -368,30 +377,6 @@ class _Session:
             if problem:
                 self._say(problem)
         return metrics
-
-    # ---- interruption, viewer, notes -------------------------------------------------------------------------
-
-    def _stopped(self) -> KeyboardInterrupt:
-        """Write a snapshot and the map so far, and return the exception with the message for the user."""
-        resumable = self.checkpointer.keep()
-        frames, keyframes, output = self.mapper.frames, self.mapper.pipeline.keyframes, self.config.output
-        said = f"interrupted after {len(frames)} frames"
-        if len(keyframes):
-            results, version = Results(self.config, frames, self.tracker.undistorter), self.mapper.version()
-            try:
-                with results.writing_map():
-                    results.write_map(version, keyframes, self.mapper.pipeline.near)
-            except InputError as error:
-                raise InputError(f"{error}{self._way_on(version)}") from None
-            said += f"; the map so far is in {output}"
-        return KeyboardInterrupt(f"{said}; modp-ti run --resume {output} goes on" if resumable else said)
-
-    def _way_on(self, version: MapVersion) -> str:
-        """Return the part of an error message that says how to go on, or where the map is."""
-        if self.checkpointer.possible:
-            return self.checkpointer.way_on()
-        results, pipeline = Results(self.config, self.mapper.frames, self.tracker.undistorter), self.mapper.pipeline
-        return results.elsewhere(version, pipeline.keyframes, pipeline.near)
 
     def _say(self, *notes: str) -> None:
         """Print notes, and keep them for the report."""

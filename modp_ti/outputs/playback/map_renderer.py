@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise, on_gpu
+from fields.runtime.engine import engine
 from modp_ti.files.errors import InputError
+from pipelines.blocks.shown_map import ShownMap
 from pipelines.render.renderer import RenderedView, Renderer
 
 __all__ = ["MAX_SIDE", "MapRenderer", "start_device"]
@@ -43,6 +45,8 @@ def start_device(device: str) -> str:
 class MapRenderer:
     """Renders a saved map. Taichi must have been started.
 
+    Of a map that is larger than what the engine can hold, only what a picture shows is loaded before it is rendered.
+
     Args:
         gaussians: Arrays by name, as from `GaussianField.to_numpy`.
         width: Largest picture width [px].
@@ -59,16 +63,26 @@ class MapRenderer:
                 f"{width}x{height}: pictures have at most {MAX_SIDE} pixels on a side; ask for smaller ones"
             )
         count, coefficients = gaussians["sh"].shape[:2]
-        field = GaussianField(round(coefficients**0.5) - 1, max(count, 1) if on_gpu() else max(count, POOL))
+        pool = min(max(count, 1) if on_gpu() else max(count, POOL), engine().max_gaussians)
+        field = GaussianField(round(coefficients**0.5) - 1, pool)
+        self._shown = ShownMap(field, gaussians)
         try:
-            field.load(dict(gaussians))
+            if self._shown.fits:
+                field.load(dict(gaussians))
         except ValueError as error:
             raise InputError(f"the map cannot be rendered: {error}") from None
         self.renderer = Renderer(field, width, height)
         self.near = near
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether the whole map is loaded."""
+        return self._shown.fits
+
     def view(self, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> RenderedView:
         """Render the map from T_camera_world (4, 4) on a black background."""
+        if not self._shown.fits:
+            self._shown.show(camera, T_camera_world)
         return self.renderer.render(camera, T_camera_world, self.near)
 
     def picture(self, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> NDArray[np.uint8]:

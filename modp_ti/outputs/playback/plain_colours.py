@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fields.map.gaussians import SH_C0
 from fields.runtime.engine import ti
+from modp_ti.files.errors import InputError
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
@@ -39,10 +40,15 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
 
     Returns:
         Gaussians by name, as `GaussianField.load` takes them.
+
+    Raises:
+        InputError: If the map has more Gaussians than the engine can hold.
     """
     chosen = run.spread(VIEWS)
     cameras = [run.cameras[index] for index in chosen]
     maps = MapRenderer(run.gaussians, max(c.width for c in cameras), max(c.height for c in cameras), run.record.near)
+    if not maps.is_whole:
+        raise InputError(f"{run.folder}: the map is too large for plain colours, which are fitted to the whole of it")
     views = []
     for camera, T in zip(cameras, run.poses[chosen], strict=True):
         picture = maps.picture(camera, T)
