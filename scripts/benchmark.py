@@ -5,7 +5,8 @@ throughput and memory bandwidth; how it grows; the cost of the voxels; and the f
 measurement runs in its own process. Figures are medians after a warm-up.
 
 With --quality, they contain instead the held-out PSNR of scenes against processor time at several budgets, by this
-version of the program and, with --against, by another one.
+version of the program and, with --against, by another one. With --scale N, they contain the time, memory and quality of
+a map of N copies of a scene side by side.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import quality, quality_report
-from benchmarks.report import report
+from benchmarks.report import report, world_report
 from ending import documented_ending
 from experiments import Job, command_line, execute, named_scenes, parser, write_report
 
@@ -49,6 +50,7 @@ def main() -> None:
         "--budgets", type=int, nargs="+", default=[1, 2, 4, 8, 25], metavar="STEPS", help="steps a keyframe of its runs"
     )
     options.add_argument("--runs", type=int, default=1, help="for --quality: runs of each, medians count (default 1)")
+    options.add_argument("--scale", type=int, metavar="N", help="a map of N copies of the scene, side by side")
     options.add_argument("--measure", help=argparse.SUPPRESS)
     arguments = options.parse_args()
     if arguments.measure:
@@ -59,8 +61,12 @@ def main() -> None:
             options.error("--quality writes a plot: give a folder with -o")
         measure_quality(arguments)
         return
-    figures = collect(arguments)
-    text = report(figures)
+    if arguments.scale:
+        figures = collect_scale(arguments)
+        text = world_report(figures)
+    else:
+        figures = collect(arguments)
+        text = report(figures)
     if arguments.output is None:
         print(text)
     else:
@@ -84,6 +90,14 @@ def measure_quality(arguments: argparse.Namespace) -> None:
     }
     write_report(arguments.output, "quality", quality_report.report(runs), figures)
     quality_report.plot(runs, arguments.output / "quality.png")
+
+
+def collect_scale(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Map copies of the first scene side by side, and return the figures."""
+    scene = (arguments.scene or [str(DEMO)])[0]
+    settings = [f"{key}={value}" for key, value in {"device": arguments.device, **command_line(arguments.set)}.items()]
+    with tempfile.TemporaryDirectory() as folder:
+        return in_process("scale", scene=scene, copies=arguments.scale, settings=settings, folder=folder)
 
 
 def collect(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -125,7 +139,7 @@ def in_process(kind: str, **arguments: Any) -> Any:
 
 def measure(kind: str, **arguments: Any) -> Any:
     """Run one measurement in this process."""
-    from benchmarks import growth, machine, step, voxels
+    from benchmarks import growth, machine, scale, step, voxels
     from benchmarks.scene import Size
 
     if "size" in arguments:
@@ -137,6 +151,7 @@ def measure(kind: str, **arguments: Any) -> Any:
         "step": step.measure_step,
         "growth": growth.measure_growth,
         "frames": growth.measure_frames,
+        "scale": scale.measure_world,
     }
     return kinds[kind](**arguments)
 

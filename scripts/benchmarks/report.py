@@ -10,7 +10,7 @@ from experiments import Figures, markdown_table
 from benchmarks.scene import Size
 from benchmarks.step import ADAM_BYTES, BACKWARD_FLOPS, FORWARD_FLOPS, LOSS_FLOPS, STAGES
 
-__all__ = ["report"]
+__all__ = ["report", "world_report"]
 
 VOXELS = {
     "query": ("query", ".1f"),
@@ -43,6 +43,27 @@ def report(figures: Mapping[str, Any]) -> str:
     if "growth" in figures:
         parts += _whole(figures)
     return "\n\n".join(parts)
+
+
+def world_report(figures: Mapping[str, Any]) -> str:
+    """Return the table of a map of copies (see `measure_world`)."""
+    columns = {
+        "time a frame [s]": ("seconds_per_frame", ".3f"),
+        "Gaussians": ("gaussians", ",.0f"),
+        "in memory": ("resident", ",.0f"),
+        "blocks on disk": ("blocks_on_disk", ",.0f"),
+        "memory [MB]": ("resident_mb", ",.0f"),
+        "PSNR at the end": ("psnr", ".2f"),
+    }
+    rows = {str(number): row for number, row in enumerate(figures["copies"], 1)}
+    return "\n\n".join(
+        [
+            f"# {len(rows)} copies side by side, {figures['frames']:,} frames",
+            markdown_table("copy", columns, rows),
+            f"{figures['gaussians']:,} Gaussians; the last passes took {figures['finishing_seconds']:.0f} s of the "
+            f"processor; peak memory {figures['peak_memory_mb']:,.0f} MB.",
+        ]
+    )
 
 
 def _step(size: Size, runs: Mapping[str, Mapping], machine: Mapping[str, Mapping]) -> list[str]:
