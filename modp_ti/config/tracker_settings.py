@@ -7,15 +7,18 @@ To add a kind, write its model here, add it to `AnyTrackerSettings`, and open it
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import Field, model_validator
 
 from pipelines.settings import StrictModel
 
 __all__ = [
+    "CAPTURE_KINDS",
     "AnyTrackerSettings",
     "AriaSettings",
+    "CaptureKind",
+    "CaptureSettings",
     "ColmapSettings",
     "GivenPosesSettings",
     "KltSettings",
@@ -267,6 +270,40 @@ class SevenScenesSettings(GivenPosesSettings):
     )
 
 
+CaptureKind = Literal[
+    "record3d",
+    "scanner_app",
+    "stray_scanner",
+    "polycam",
+    "nerfcapture",
+    "euroc",
+    "kitti",
+    "scannet",
+    "arkitscenes",
+]
+CAPTURE_KINDS: tuple[str, ...] = get_args(CaptureKind)
+"""Kinds of captures, which are kinds of `source` and of `tracker`."""
+
+
+class CaptureSettings(TrackerSettings):
+    """The poses, and often depth maps, that come with the images of a capture."""
+
+    brings_cameras: ClassVar[bool] = True
+
+    kind: CaptureKind = Field(description="the poses that come with the images of the capture at `source.path`")
+    depth: bool = Field(
+        default=True,
+        description="take the tracked points from the capture's depth maps where it has them; false: triangulate them",
+    )
+    max_points: int = Field(default=400, ge=10, description="largest number of points of a frame from its depth map")
+    max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] that is used")
+    adjust: bool = Field(
+        default=False,
+        description="triangulate the points, and bundle adjust the poses with them before the first frame: for poses "
+        "with errors of more than a pixel",
+    )
+
+
 class SocketSettings(TrackerSettings):
     """Another program that sends frames and poses through a socket."""
 
@@ -306,6 +343,7 @@ AnyTrackerSettings = Annotated[
     | ModpSettings
     | ReplicaSettings
     | SevenScenesSettings
+    | CaptureSettings
     | SocketSettings,
     Field(discriminator="kind"),
 ]

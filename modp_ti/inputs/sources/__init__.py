@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from modp_ti.config.tracker_settings import CAPTURE_KINDS
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources.data_sets import (
     RELEASE_IMAGES,
@@ -86,8 +87,16 @@ def recognised_kind(path: Path) -> str:
     Raises:
         InputError: If the path is a file of an unknown type.
     """
+    # Imported here: captures are built on sources.
+    from modp_ti.inputs.captures import ARCHIVES, recognised_capture
+
     suffix = path.suffix.lower()
     if not path.is_dir():
+        if suffix in ARCHIVES and path.exists():
+            kind = recognised_capture(path)
+            if kind is None:
+                raise InputError(f"{path}: is no capture of a known app; unpack it and name the folder of the images")
+            return kind
         if suffix == ".vrs":
             return "vrs"
         if suffix in VIDEO_SUFFIXES:
@@ -98,6 +107,8 @@ def recognised_kind(path: Path) -> str:
                 "video or a VRS recording; where it is a video, set source.kind: video"
             )
         return "images"
+    if (kind := recognised_capture(path)) is not None:
+        return kind
     if (path / "rgb.txt").is_file():
         return "tum_rgbd"
     if find_replica_images(path):
@@ -116,6 +127,15 @@ def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:
     return AriaRecording(path, source.vrs, source.vignette)
 
 
+def _open_capture(kind: str) -> Callable[[Path, SourceSettings], ImageSource]:
+    def opened(path: Path, source: SourceSettings) -> ImageSource:
+        from modp_ti.inputs.captures.images import open_capture_images
+
+        return open_capture_images(path, kind, source.fps, source.stop)
+
+    return opened
+
+
 _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
     "images": lambda path, source: ImageFolder(path, source.fps),
     "video": lambda path, source: VideoFile(path, source.fps, source.stop),
@@ -124,6 +144,7 @@ _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
     "sevenscenes": lambda path, source: open_sevenscenes(path, source.fps),
     "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
     "vrs": _open_vrs,
+    **{kind: _open_capture(kind) for kind in CAPTURE_KINDS},
 }
 """Functions that open a path, by `source.kind`."""
 

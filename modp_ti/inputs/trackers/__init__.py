@@ -81,6 +81,10 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
             from modp_ti.inputs.trackers.data_sets import open_sevenscenes
 
             return open_sevenscenes(source, tracker, progress)
+        case kinds.CaptureSettings() as tracker:
+            from modp_ti.inputs.trackers.captures import open_capture
+
+            return open_capture(source, tracker, progress)
         case kinds.SocketSettings() as tracker:
             from modp_ti.inputs.tracker_server import open_tracker_server
 
