@@ -129,7 +129,7 @@ def write_stray_scanner(folder: Path, views: Sequence[View]) -> None:
     """The newer table, whose last two columns are empty."""
     lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, distortion_center_x, distortion_center_y"]
     folder.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(str(folder / "rgb.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, views[0].size)
+    video = cv2.VideoWriter(str(folder / "rgb.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, views[0].size)
     for n, view in enumerate(views):
         scale = 1920 / view.size[0]
         focal = [scale * view.K[0, 0], scale * view.K[1, 1], scale * view.K[0, 2], scale * view.K[1, 2]]

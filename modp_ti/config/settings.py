@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from fields.runtime.parallel import available_cores
 from modp_ti.config.camera_settings import IntrinsicsSettings, VrsSettings
-from modp_ti.config.tracker_settings import AnyTrackerSettings, CaptureKind
+from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
 from pipelines.offline_settings import OfflineSettings
 from pipelines.settings import MappingSettings, RefineSettings, StrictModel
@@ -39,9 +39,26 @@ NO_PATH = "source.path is missing: set it to the folder of the images"
 class SourceSettings(StrictModel):
     """The source of the images, and how they are selected, scaled and masked."""
 
-    kind: (
-        Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] | CaptureKind
-    ) = Field(
+    kind: Literal[
+        "auto",
+        "images",
+        "video",
+        "live",
+        "tum_rgbd",
+        "replica",
+        "sevenscenes",
+        "release",
+        "vrs",
+        "record3d",
+        "scanner_app",
+        "stray_scanner",
+        "polycam",
+        "nerfcapture",
+        "euroc",
+        "kitti",
+        "scannet",
+        "arkitscenes",
+    ] = Field(
         default="auto",
         description="type of `path` or `stream`; `auto` detects it. `images`: a folder of images; `release`: the "
         "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; the others: data sets, "

@@ -14,9 +14,8 @@ from urllib.parse import urlsplit
 
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
-from modp_ti.config.tracker_settings import CAPTURE_KINDS
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.captures import ARCHIVES
+from modp_ti.inputs.captures import ARCHIVES, KINDS
 from modp_ti.inputs.sources import recognised_kind
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES
 
@@ -57,7 +56,7 @@ def recorded_scene(
     name = path.resolve().name if path.is_dir() else path.stem
     source = {"path": str(path)}
     kind = recognised_kind(path)
-    tracker = kind if kind in CAPTURE_KINDS else "klt"
+    tracker = kind if kind in KINDS else "klt"
     return scene_from_data(_scene(source, _free(name, path, taken), tracker), str(path), overrides, preset)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tests.fault_injection.corrupted_captures import CAPTURES
 from tests.fault_injection.corrupted_media import IMAGES, MASK, PATH, RUN, VIDEO
 from tests.fault_injection.corrupted_trackers import (
     ARIA,
@@ -91,7 +92,19 @@ def _cases() -> list[Case]:
     for file, corruptions in RUN.items():
         add("run", file, anything() | corruptions)
     add("run", "path.txt", PATH, ("render", "out", "--path", "path.txt", "-o", "film.mp4", "--quiet"))
+    for kind, files in CAPTURES.items():
+        for file, corruptions in files.items():
+            add(kind, file, anything(*_harmless(file)) | corruptions)
     return cases
+
+
+def _harmless(file: str) -> tuple[str, ...]:
+    """Corruptions of a capture's file that have the effect of a missing one, or leave a valid one."""
+    missing = ("missing", "a folder", "a link to itself", "a pipe", "a device")
+    names = ("depth_00003.png", "frame_00003.json", "cameras/1733333.json", "depth/1.png", "pose/1.txt", ".pincam")
+    if file.endswith((*names, "intrinsic_depth.txt")):
+        return missing
+    return ("cut in half", "noise before it") if file.endswith(".r3d") else ("cut in half",)
 
 
 CASES = _cases()

@@ -16,7 +16,7 @@ from threading import Event
 import numpy as np
 
 from modp_ti.files.errors import InputError
-from tests.fault_injection.samples import SAMPLES, write_sample
+from tests.fault_injection.samples import CAPTURES, SAMPLES, write_sample
 
 __all__ = ["READERS", "Reader", "import_readers", "seeds"]
 
@@ -254,6 +254,7 @@ READERS: dict[str, Reader] = {
         Reader("splats", "run", ("out/splats.ply",), _splats),
         Reader("run", "run", RUN_FILES, _run),
         Reader("weights", "weights", ("older.pth", "weights.pth"), _weights),
+        *(Reader(kind, kind, SAMPLES[kind][0].files, _open) for kind in CAPTURES),
         Reader("tracker_server", "tracker_server", ("wire",), _tracker_server),
     )
 }
@@ -261,7 +262,7 @@ READERS: dict[str, Reader] = {
 
 def import_readers() -> None:
     """Import every module that the readers use, once for all forked processes."""
-    kinds = ("aria", "colmap", "data_sets", "modp", "stella_vslam", "transforms", "tum")
+    kinds = ("aria", "captures", "colmap", "data_sets", "modp", "stella_vslam", "transforms", "tum")
     for name in (
         *(
             "config.scene_file",
@@ -278,6 +279,7 @@ def import_readers() -> None:
             "inputs.sources.masks",
         ),
         *(f"inputs.trackers.{kind}" for kind in kinds),
+        "inputs.captures.images",
         "inputs.tracker_server",
     ):
         import_module(f"modp_ti.{name}")

@@ -5,15 +5,18 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import msgpack
 import numpy as np
 
+from tests.captures import WRITERS, View, zipped
 from tests.fault_injection.small_recording import (
     FOCAL,
     FRAMES,
@@ -341,6 +344,45 @@ def _write_tracker_server(folder: Path) -> None:
     write_bytes(folder, "wire", wire())
 
 
+def _write_capture(kind: str, folder: Path) -> None:
+    """Write the recording as a capture, Record3D's in an archive."""
+    views = []
+    for i in range(FRAMES):
+        T = np.eye(4)
+        T[0, 3] = position(i)
+        K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+        views.append(View(picture(i), K, T, lambda _, size: np.full(size[::-1], 3.0)))
+    place = CAPTURES[kind][0].partition("/")[0]
+    WRITERS[kind](folder / ("unpacked" if kind == "record3d" else place), views)
+    if kind == "record3d":
+        zipped(folder / "unpacked", folder / place)
+        shutil.rmtree(folder / "unpacked")
+    scene_file(folder, f"kind: {kind}", f"path: {place}")
+
+
+CAPTURES = {
+    "record3d": ("room.r3d",),
+    "scanner_app": ("app/frame_00003.json", "app/depth_00003.png"),
+    "stray_scanner": ("room/odometry.csv",),
+    "polycam": ("room/keyframes/cameras/1733333.json",),
+    "nerfcapture": ("room/transforms.json",),
+    "euroc": (
+        "room/mav0/cam0/sensor.yaml",
+        "room/mav0/state_groundtruth_estimate0/data.csv",
+        "room/mav0/cam0/data.csv",
+    ),
+    "kitti": ("room/poses.txt", "room/calib.txt", "room/times.txt"),
+    "scannet": (
+        "room/pose/1.txt",
+        "room/intrinsic/intrinsic_color.txt",
+        "room/intrinsic/intrinsic_depth.txt",
+        "room/depth/1.png",
+    ),
+    "arkitscenes": ("room/lowres_wide.traj", "room/lowres_wide_intrinsics/42_3000.101.pincam"),
+}
+"""The files under test of captures, by kind."""
+
+
 EXPORT = ("export", "out", "--format", "points", "-o", "written.ply", "--quiet")
 RUN_MODEL = tuple(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D"))
 SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
@@ -385,6 +427,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("run", ("out/splats.ply", "out/trajectory.txt", "out/frames.json", *RUN_MODEL), EXPORT), _write_run),
         (Sample("weights", ("weights.pth", "older.pth")), _write_weights),
         (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
+        *((Sample(kind, files), partial(_write_capture, kind)) for kind, files in CAPTURES.items()),
     )
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
+from modp_ti.files import LARGEST
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.replay import checked_pose
@@ -134,7 +134,7 @@ def checked_numbers(values: Any, count: int, where: str) -> list[float]:
     """Return a list of `count` finite numbers. Raises InputError if the values are something else."""
     listed = values if isinstance(values, list) else [values]
     good = len(listed) == count and all(
-        isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) for value in listed
+        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST for value in listed
     )
     if not good:
         what = "a finite number" if count == 1 else f"{count} finite numbers"

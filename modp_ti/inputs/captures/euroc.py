@@ -22,7 +22,8 @@ __all__ = ["is_euroc", "read_euroc"]
 LISTING, SENSOR, TRUTH = "cam0/data.csv", "cam0/sensor.yaml", "state_groundtruth_estimate0/data.csv"
 MAX_DIFFERENCE = 0.01  # [s] between an image and its pose; the truth has 200 poses a second
 NANOSECOND = 1e-9
-LONGEST_SENSOR = 1 << 16  # bytes
+# Bounds on the file of the camera, which has some 40 lines: characters, and lists that could be nested.
+LONGEST_SENSOR, MOST_LISTS = 1 << 14, 64
 
 
 def is_euroc(tree: FileTree) -> bool:
@@ -79,7 +80,8 @@ def _sensor(tree: FileTree, name: str) -> dict[str, Any]:
         text = tree.read(name).decode("utf-8-sig")
     lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
     try:
-        data = None if len(text) > LONGEST_SENSOR else yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
+        large = len(text) > LONGEST_SENSOR or text.count("[") + text.count("{") > MOST_LISTS
+        data = None if large else yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
     except (yaml.YAMLError, ValueError, RecursionError):
         data = None
     if not isinstance(data, dict):

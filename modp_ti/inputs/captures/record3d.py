@@ -179,7 +179,7 @@ def _unpacked(data: bytes, size: int) -> bytes:
         raise OSError(0, f"it unpacks to {_claimed(data)} bytes instead of {size}")
     try:
         unpacked = lzfse.decompress(data)
-    except lzfse.error:
+    except (lzfse.error, MemoryError):  # both for damaged data
         raise OSError(0, "it is damaged") from None
     if len(unpacked) != size:
         raise OSError(0, "it is damaged")

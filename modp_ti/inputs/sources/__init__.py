@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from modp_ti.config.tracker_settings import CAPTURE_KINDS
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources.data_sets import (
     RELEASE_IMAGES,
@@ -69,7 +68,7 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
             raise
     path = source.require_path()
     kind = recognised_kind(path) if source.kind == "auto" else source.kind
-    images = _OPENERS[kind](path, source)
+    images = _OPENERS[kind](path, source) if kind in _OPENERS else _open_capture(path, kind, source)
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
         images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
     images = _scaled(_with_camera(images, source), source)
@@ -127,13 +126,10 @@ def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:
     return AriaRecording(path, source.vrs, source.vignette)
 
 
-def _open_capture(kind: str) -> Callable[[Path, SourceSettings], ImageSource]:
-    def opened(path: Path, source: SourceSettings) -> ImageSource:
-        from modp_ti.inputs.captures.images import open_capture_images
+def _open_capture(path: Path, kind: str, source: SourceSettings) -> ImageSource:
+    from modp_ti.inputs.captures.images import open_capture_images
 
-        return open_capture_images(path, kind, source.fps, source.stop)
-
-    return opened
+    return open_capture_images(path, kind, source.fps, source.stop)
 
 
 _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
@@ -144,9 +140,8 @@ _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
     "sevenscenes": lambda path, source: open_sevenscenes(path, source.fps),
     "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
     "vrs": _open_vrs,
-    **{kind: _open_capture(kind) for kind in CAPTURE_KINDS},
 }
-"""Functions that open a path, by `source.kind`."""
+"""Functions that open a path, by `source.kind`; the other kinds are captures."""
 
 
 def _with_camera(images: ImageSource, source: SourceSettings) -> ImageSource:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import CaptureSettings
+from modp_ti.config.tracker_settings import CaptureSettings, DepthCaptureSettings
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame
 from modp_ti.inputs.captures.depth_maps import depth_points
@@ -57,7 +57,11 @@ def open_capture(source: SourceSettings, tracker: CaptureSettings, progress: Pro
         frames, note = adjusted_frames(images, frames, solving(frames, source), progress)
         return ReplayedTracker(reader, frames, [*notes, note])
     captured = [found[name] for name in poses]
-    if tracker.depth and any(frame.depth is not None for frame in captured):
+    if (
+        isinstance(tracker, DepthCaptureSettings)
+        and tracker.depth
+        and any(frame.depth is not None for frame in captured)
+    ):
         frames, more = _with_depths(capture, captured, turns, frames, tracker, progress)
         notes += more
     if not any(len(frame.points) for frame in frames):
@@ -82,7 +86,7 @@ def _with_depths(
     captured: Sequence[CapturedFrame],
     turns: Sequence[Turn],
     frames: Sequence[PosedImage],
-    tracker: CaptureSettings,
+    tracker: DepthCaptureSettings,
     progress: Progress | None,
 ) -> tuple[list[PosedImage], list[str]]:
     """Give each frame points of its depth map. Damaged maps are left out, up to a share `FEW` of them."""

@@ -41,14 +41,16 @@ def views(plane_scene) -> list[View]:
     result = []
     for name, T in zip(plane_scene.names, plane_scene.T_camera_world, strict=True):
         there = np.linalg.inv(T)
-        image = cv2.imread(str(plane_scene.folder / name))
+        image = np.asarray(cv2.imread(str(plane_scene.folder / name)), np.uint8)
         result.append(View(image, plane_scene.K, there, lambda K, size, there=there: plane_depth(there, K, size)))
     return result
 
 
 def opened(path: Path, kind: str, source: dict | None = None, **tracker: object) -> ReplayedTracker:
     settings = {"source": {"path": path, **(source or {})}, "tracker": {"kind": kind, **tracker}, "output": Path("out")}
-    return open_tracker(SceneConfig.model_validate(settings))
+    result = open_tracker(SceneConfig.model_validate(settings))
+    assert isinstance(result, ReplayedTracker)
+    return result
 
 
 def needs_lzfse(kind: str) -> None:
@@ -175,7 +177,7 @@ def test_depths_that_are_far_or_at_edges_are_not_used(views, tmp_path):
     WRITERS["scannet"](tmp_path / "scene", views[:2])
     for n in range(2):
         file = str(tmp_path / f"scene/depth/{n}.png")
-        depth = cv2.imread(file, cv2.IMREAD_UNCHANGED)
+        depth = np.array(cv2.imread(file, cv2.IMREAD_UNCHANGED))
         depth[10:20, 10:20] = 2000  # before the plane, with an edge around it
         cv2.imwrite(file, depth)
     frames = opened(tmp_path / "scene", "scannet", max_points=2000).frames
