@@ -34,7 +34,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 # the front camera. The pictures are upright.
 DEPTH_SIZES = {192 * 256: (192, 256), 480 * 640: (480, 640)}
 CONFIDENT = 2  # of 0, 1 and 2
-INSTALL = "depths need `pip install 'modp-ti[record3d]'`"
+INSTALL = "its depths need lzfse: pip install 'modp-ti[record3d]'"
 
 
 def is_record3d(tree: FileTree) -> bool:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from modp_ti.commands import app as cli
-from modp_ti.config.settings import SceneConfig, SourceSettings
+from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.captures import KINDS, recognised_capture
@@ -26,31 +24,6 @@ from tests.captures import OPENGL, WRITERS, View, zipped
 
 WITH_DEPTH = ("record3d", "scanner_app", "stray_scanner", "polycam", "scannet", "arkitscenes")
 ARCHIVED = ("record3d", "polycam", "nerfcapture")
-
-
-def plane_depth(T_world_camera: NDArray, K: NDArray, size: tuple[int, int]) -> NDArray:
-    """Depths of the plane z = 0 of the world."""
-    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], axis=-1)
-    return -T_world_camera[2, 3] / (rays @ T_world_camera[2, :3])
-
-
-@pytest.fixture
-def views(plane_scene) -> list[View]:
-    """Seven views of the plane."""
-    result = []
-    for name, T in zip(plane_scene.names, plane_scene.T_camera_world, strict=True):
-        there = np.linalg.inv(T)
-        image = np.asarray(cv2.imread(str(plane_scene.folder / name)), np.uint8)
-        result.append(View(image, plane_scene.K, there, lambda K, size, there=there: plane_depth(there, K, size)))
-    return result
-
-
-def opened(path: Path, kind: str, source: dict | None = None, **tracker: object) -> ReplayedTracker:
-    settings = {"source": {"path": path, **(source or {})}, "tracker": {"kind": kind, **tracker}, "output": Path("out")}
-    result = open_tracker(SceneConfig.model_validate(settings))
-    assert isinstance(result, ReplayedTracker)
-    return result
 
 
 def needs_lzfse(kind: str) -> None:
@@ -71,7 +44,7 @@ def assert_delivers(tracker: ReplayedTracker, views: list[View], least_points: i
 
 
 @pytest.mark.parametrize("kind", WITH_DEPTH)
-def test_poses_cameras_and_points_of_the_depth_maps_are_the_true_ones(kind, views, tmp_path):
+def test_poses_cameras_and_points_of_the_depth_maps_are_the_true_ones(kind, views, tmp_path, opened):
     needs_lzfse(kind)
     WRITERS[kind](tmp_path / kind, views)
     tracker = opened(tmp_path / kind, kind, max_depth=20)
@@ -87,7 +60,7 @@ def test_poses_cameras_and_points_of_the_depth_maps_are_the_true_ones(kind, view
 
 
 @pytest.mark.parametrize("kind", [kind for kind in WRITERS if kind not in WITH_DEPTH])
-def test_without_depth_maps_points_are_triangulated(kind, views, tmp_path):
+def test_without_depth_maps_points_are_triangulated(kind, views, tmp_path, opened):
     WRITERS[kind](tmp_path / kind, views[:4])
     tracker = opened(tmp_path / kind, kind)
     assert len(tracker.frames) == 4
@@ -99,7 +72,7 @@ def test_without_depth_maps_points_are_triangulated(kind, views, tmp_path):
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_images_are_those_of_their_poses_and_in_order_of_time(kind, views, tmp_path):
+def test_images_are_those_of_their_poses_and_in_order_of_time(kind, views, tmp_path, opened):
     needs_lzfse(kind)
     WRITERS[kind](tmp_path / kind, views)
     tracker = opened(tmp_path / kind, kind, {"step": 3, "scale": 0.5, "holdout": 2}, **_untriangulated(kind))
@@ -118,7 +91,7 @@ def _untriangulated(kind: str) -> dict[str, object]:
 
 @pytest.mark.parametrize("kind", ARCHIVED)
 @pytest.mark.parametrize("top", ["", "capture"])
-def test_an_archive_is_the_same_as_its_folder(kind, top, views, tmp_path):
+def test_an_archive_is_the_same_as_its_folder(kind, top, views, tmp_path, opened):
     needs_lzfse(kind)
     WRITERS[kind](tmp_path / "folder", views[:3])
     file = zipped(tmp_path / "folder", tmp_path / f"room.{'r3d' if kind == 'record3d' else 'zip'}", top)
@@ -147,7 +120,7 @@ def test_every_kind_is_written_by_a_test():
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_a_wrong_axes_convention_is_found_by_check(kind, views, tmp_path, monkeypatch):
+def test_a_wrong_axes_convention_is_found_by_check(kind, views, tmp_path, monkeypatch, opened):
     """The images tell it: points of depth maps fit the poses whatever these are. Triangulation would take seconds."""
     monkeypatch.setattr(captures, "triangulated_frames", lambda _, frames, *__: frames)
     needs_lzfse(kind)
@@ -164,7 +137,7 @@ def test_check_accepts_a_capture_alone(views, tmp_path):
     assert result.exit_code < 2, result.output
 
 
-def test_damaged_depth_maps_are_left_out_up_to_a_few(views, tmp_path):
+def test_damaged_depth_maps_are_left_out_up_to_a_few(views, tmp_path, opened):
     WRITERS["scanner_app"](tmp_path / "app", views[:3])
     (tmp_path / "app" / "depth_00003.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"depth_00003.png: unreadable depth map.*tracker.depth: false"):
@@ -173,7 +146,7 @@ def test_damaged_depth_maps_are_left_out_up_to_a_few(views, tmp_path):
     assert all(len(frame.points) > 50 for frame in tracker.frames)
 
 
-def test_depths_that_are_far_or_at_edges_are_not_used(views, tmp_path):
+def test_depths_that_are_far_or_at_edges_are_not_used(views, tmp_path, opened):
     WRITERS["scannet"](tmp_path / "scene", views[:2])
     for n in range(2):
         file = str(tmp_path / f"scene/depth/{n}.png")
@@ -189,7 +162,7 @@ def test_depths_that_are_far_or_at_edges_are_not_used(views, tmp_path):
     assert np.concatenate([frame.points.depths(frame.T_camera_world) for frame in near]).max() == pytest.approx(2.0)
 
 
-def test_poses_are_adjusted_where_it_is_asked_for(views, tmp_path):
+def test_poses_are_adjusted_where_it_is_asked_for(views, tmp_path, opened):
     rng = np.random.default_rng(2)
     moved = []
     for view in views[:4]:
@@ -214,7 +187,7 @@ def test_another_tracker_gets_the_images_and_the_first_camera(views, tmp_path):
     assert len(images) == 3
 
 
-def test_a_tracker_of_another_kind_is_refused(views, tmp_path):
+def test_a_tracker_of_another_kind_is_refused(views, tmp_path, opened):
     WRITERS["polycam"](tmp_path / "polycam", views[:2])
     with pytest.raises(InputError, match=r"is no capture of kind record3d, which holds metadata and rgbd"):
         opened(tmp_path / "polycam", "record3d")
