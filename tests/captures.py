@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["DEPTH_SIZE", "KITTI_OFFSET", "MOUNT", "OPENGL", "WRITERS", "View", "lzfse_stored", "zipped"]
+__all__ = ["DEPTH_SIZE", "KITTI_OFFSET", "MOUNT", "OPENGL", "WRITERS", "View", "exr_file", "lzfse_stored", "zipped"]
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # T_body_camera of the sequences in EuRoC's layout.
@@ -84,6 +84,27 @@ def _quaternion(T: NDArray[np.float64]) -> list[float]:
 def lzfse_stored(data: bytes) -> bytes:
     """LZFSE data of one block that is not packed."""
     return struct.pack("<4sI", b"bvx-", len(data)) + data + b"bvx$"
+
+
+def exr_file(values: NDArray, channel: str = "R") -> bytes:
+    """An EXR file of one channel of float32 that is not packed, line by line."""
+    height, width = values.shape
+
+    def attribute(name: str, kind: str, data: bytes) -> bytes:
+        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<I", len(data)) + data
+
+    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    header = struct.pack("<II", 20000630, 2)
+    header += attribute("channels", "chlist", channel.encode() + b"\0" + struct.pack("<4i", 2, 0, 1, 1) + b"\0")
+    header += attribute("compression", "compression", b"\0") + attribute("dataWindow", "box2i", box)
+    header += attribute("displayWindow", "box2i", box) + attribute("lineOrder", "lineOrder", b"\0")
+    header += attribute("pixelAspectRatio", "float", struct.pack("<f", 1.0))
+    header += attribute("screenWindowCenter", "v2f", bytes(8))
+    header += attribute("screenWindowWidth", "float", struct.pack("<f", 1.0)) + b"\0"
+    lines = [struct.pack("<2i", y, 4 * width) + row.astype("<f4").tobytes() for y, row in enumerate(values)]
+    first = len(header) + 8 * height
+    offsets = b"".join(struct.pack("<Q", first + y * len(lines[0])) for y in range(height))
+    return header + offsets + b"".join(lines)
 
 
 def write_record3d(folder: Path, views: Sequence[View]) -> None:

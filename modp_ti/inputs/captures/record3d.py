@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import struct
 from typing import Any
 
@@ -23,7 +22,6 @@ from modp_ti.inputs.captures.capture import (
     plausible_camera,
 )
 from modp_ti.inputs.sources.image_header import read_image_header
-from modp_ti.inputs.sources.listed_images import decoded_as
 
 __all__ = ["is_record3d", "read_record3d"]
 
@@ -33,6 +31,8 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 # Sizes (width, height) of depth maps by their number of pixels, for older archives that do not state them: LiDAR and
 # the front camera. The pictures are upright.
 DEPTH_SIZES = {192 * 256: (192, 256), 480 * 640: (480, 640)}
+# Names and types of two attributes of EXR files, and the largest side that a depth map may have [px].
+CHANNELS, WINDOW, MOST_EXR = b"channels\0chlist\0", b"dataWindow\0box2i\0", 1 << 12
 CONFIDENT = 2  # of 0, 1 and 2
 INSTALL = "its depths need lzfse: pip install 'modp-ti[record3d]'"
 
@@ -161,14 +161,34 @@ def _read_depth(tree: FileTree, frame: CapturedFrame, size: tuple[Any, ...]) -> 
 
 
 def _read_exr(data: bytes) -> NDArray[np.float32]:
-    # OpenCV reads EXR only where this is set before the first such file.
-    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
-    import cv2
+    """Read the depths (H, W) of an EXR file, which has one channel, or three alike."""
+    import av
+    from av.error import FFmpegError
 
-    metres = decoded_as(data, cv2.IMREAD_UNCHANGED) if data else None
-    if metres is None:
-        raise OSError(0, "it is damaged, or OpenCV reads no EXR here")
-    return np.asarray(metres if metres.ndim == 2 else metres[..., -1], np.float32)
+    size = _exr_size(data)
+    if size is None or max(size) > MOST_EXR:
+        raise OSError(0, "it is damaged, or no EXR")
+    # FFmpeg reads one channel if it is called Y.
+    at = data.index(CHANNELS) + len(CHANNELS) + 4
+    if data[at + 1 : at + 2] == b"\0" == data[at + 18 : at + 19]:
+        data = data[:at] + b"Y" + data[at + 1 :]
+    try:
+        decoder = av.CodecContext.create("exr", "r")
+        assert isinstance(decoder, av.VideoCodecContext)
+        (frame,) = decoder.decode(av.Packet(data))
+        metres = frame.to_ndarray()
+    except (FFmpegError, ValueError):
+        raise OSError(0, "it is damaged, or an EXR that FFmpeg cannot read") from None
+    return np.asarray(metres if metres.ndim == 2 else metres[..., 0], np.float32)
+
+
+def _exr_size(data: bytes) -> tuple[int, int] | None:
+    """Return the size (width, height) that the header of an EXR file states; None if there is none."""
+    at = data.find(WINDOW)
+    if not data.startswith(b"\x76\x2f\x31\x01") or at < 0 or CHANNELS not in data or len(data) < at + 64:
+        return None
+    left, top, right, bottom = struct.unpack_from("<4i", data, at + len(WINDOW) + 4)
+    return right - left + 1, bottom - top + 1
 
 
 def _unpacked(data: bytes, size: int) -> bytes:
