@@ -87,10 +87,7 @@ def test_kitti_drives_forward_as_the_camera_looks(shared_data, tmp_path):
     np.testing.assert_allclose(frames[0].T_camera_world[:3, 3], [0.0597, 0, 0], atol=0.005)
 
 
-def test_all_images_of_tanks_and_temples_are_registered(
-    shared_data, tmp_path: Path, opened, untriangulated, monkeypatch
-):
-
+def test_cameras_of_tanks_and_temples_look_at_what_they_go_round(shared_data, tmp_path, opened, monkeypatch):
     monkeypatch.setattr(given_poses, "triangulated_frames", lambda _, frames, *__: frames)
     for n in range(151):
         cv2.imwrite(str(tmp_path / f"{n + 1:06d}.png"), np.zeros((36, 64, 3), np.uint8))
