@@ -10,6 +10,7 @@ from tests.fault_injection.corrupted_trackers import (
     ARIA,
     COLMAP,
     COLMAP_TEXT,
+    MATRICES,
     MODP,
     ORBSLAM3,
     PLY,
@@ -17,6 +18,7 @@ from tests.fault_injection.corrupted_trackers import (
     SCENE,
     SEVENSCENES,
     STELLA,
+    TANKSANDTEMPLES,
     TRANSFORMS,
     TUM,
     TUM_RGBD,
@@ -72,6 +74,8 @@ def _cases() -> list[Case]:
     add("ply", "points.ply", anything() | PLY)
     add("orbslam3", "CameraTrajectory.txt", anything() | TEXT | ORBSLAM3)
     add("tum_rgbd", "rgb.txt", anything("cut in half") | TEXT | TUM_RGBD)
+    add("matrices", "poses.txt", anything() | TEXT | MATRICES)
+    add("tanksandtemples", "scene.log", anything("a link to itself") | TEXT | TANKSANDTEMPLES)
     add("replica", "traj.txt", anything() | TEXT | REPLICA)
     # Corruptions that have the same effect as a missing file.
     unseen = ("missing", "a folder", "a link to itself", "a pipe", "a device")

@@ -245,6 +245,8 @@ READERS: dict[str, Reader] = {
         Reader("points", "ply", ("points.ply",), _points),
         Reader("listing", "tum_rgbd", ("rgb.txt",), _listing),
         Reader("matrices", "replica", ("traj.txt",), _open),
+        Reader("matrices_per_line", "matrices", ("poses.txt",), _open),
+        Reader("tanksandtemples", "tanksandtemples", ("scene.log",), _open),
         Reader("modp", "modp", SAMPLES["modp"][0].files, _open),
         Reader("aria", "aria", SAMPLES["aria"][0].files, _aria),
         Reader("stella_vslam", "stella_vslam", ("map.msg",), _stella),
@@ -262,7 +264,7 @@ READERS: dict[str, Reader] = {
 
 def import_readers() -> None:
     """Import every module that the readers use, once for all forked processes."""
-    kinds = ("aria", "captures", "colmap", "data_sets", "modp", "stella_vslam", "transforms", "tum")
+    kinds = ("aria", "captures", "colmap", "data_sets", "matrices", "modp", "stella_vslam", "transforms", "tum")
     for name in (
         *(
             "config.scene_file",

@@ -163,6 +163,20 @@ def _write_replica(folder: Path) -> None:
     scene_file(folder, "kind: replica, points: points.txt", f"path: ., kind: replica, {INTRINSICS}")
 
 
+def _write_matrices(folder: Path) -> None:
+    write_images(folder)
+    write_text(folder, "poses.txt", [" ".join(_matrix(i)[:3]) for i in range(FRAMES)])
+    points_file(folder)
+    scene_file(folder, "kind: matrices, points: points.txt")
+
+
+def _write_log(folder: Path) -> None:
+    write_images(folder)
+    write_text(folder, "scene.log", [line for i in range(FRAMES) for line in (f"{i} {i} 0", *_matrix(i))])
+    points_file(folder)
+    scene_file(folder, "kind: tanksandtemples, points: points.txt")
+
+
 def _write_sevenscenes(folder: Path) -> None:
     write_images(folder, inside="seq")
     for i in range(FRAMES):
@@ -400,6 +414,8 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("orbslam3", ("CameraTrajectory.txt",)), _write_orbslam3),
         (Sample("tum_rgbd", ("rgb.txt",)), _write_tum_rgbd),
         (Sample("replica", ("traj.txt",)), _write_replica),
+        (Sample("matrices", ("poses.txt",)), _write_matrices),
+        (Sample("tanksandtemples", ("scene.log",)), _write_log),
         (Sample("sevenscenes", ("seq/frame-000001.pose.txt",)), _write_sevenscenes),
         (
             Sample("modp", ("trajectory.json", "point_cloud/point_cloud_1.txt", "point_cloud/point_cloud_2.npy")),
