@@ -161,7 +161,7 @@ def _read_depth(tree: FileTree, frame: CapturedFrame, size: tuple[Any, ...]) -> 
 
 
 def _read_exr(data: bytes) -> NDArray[np.float32]:
-    """Read the depths (H, W) of an EXR file, which has one channel, or three alike."""
+    """Read the depths (H, W) of an EXR file, which has one channel, or three alike. Rows that are cut off become 0."""
     import av
     from av.error import FFmpegError
 

@@ -42,8 +42,8 @@ def views(plane_scene) -> list[View]:
 def opened() -> Opened:
     """Open a capture as a run does: `opened(path, kind, source settings, tracker settings...)`."""
 
-    def opened(path: Path, kind: str, source: dict | None = None, **tracker: object) -> ReplayedTracker:
-        settings = {"source": {"path": path, **(source or {})}, "tracker": {"kind": kind, **tracker}, "output": "out"}
+    def opened(place: Path, kind: str, source: dict | None = None, **tracker: object) -> ReplayedTracker:
+        settings = {"source": {"path": place, **(source or {})}, "tracker": {"kind": kind, **tracker}, "output": "out"}
         result = open_tracker(SceneConfig.model_validate(settings))
         assert isinstance(result, ReplayedTracker)
         return result

@@ -61,7 +61,7 @@ def test_record3d_metadata_of_the_older_kind(shared_data, tmp_path):
     assert len(capture.frames) == 49
     poses = np.array([frame.T_camera_world for frame in capture.frames])
     np.testing.assert_allclose(poses[0], np.eye(4) @ np.diag([1, -1, -1, 1]), atol=1e-6)  # ARKit's axes, turned
-    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 0.05  # a hand, at 60 frames a second
+    assert np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)) < 0.02  # a hand, at 60 frames a second
     camera = capture.frames[0].camera
     assert abs(camera.cx - 360) < 5 and abs(camera.cy - 480) < 5
 
@@ -79,7 +79,7 @@ def test_kitti_drives_forward_as_the_camera_looks(shared_data, tmp_path):
             tmp_path / "image_2/000000.png", file
         )
     frames = read_capture(tmp_path, "kitti").frames
-    first, last = (frames[n].T_camera_world for n in (100, 110))
+    first, last = (frames[n].T_camera_world for n in (0, 5))
     assert first is not None and last is not None
     moved = (first @ np.linalg.inv(last))[:3, 3]
     assert moved[2] > 3 * np.abs(moved[:2]).max()

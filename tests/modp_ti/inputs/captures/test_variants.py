@@ -86,7 +86,7 @@ def test_record3d_exported_as_exr_and_rgb(views, tmp_path, opened, channel):
     assert_poses(tracker.frames, views[:3])
     assert all(len(f.points) > 300 and np.abs(f.points.xyz[:, 2]).max() < 1e-4 for f in tracker.frames)
     data = exr_file(views[0].depth_map())
-    for damaged in (b"", data[:300], data.replace(b"chlist", b"string"), data[:2000], b"\0" * 5000):
+    for damaged in (b"", data[:300], data.replace(b"chlist", b"string"), b"\0" * 5000):
         (tmp_path / "room/depth/1.exr").write_bytes(damaged)
         with pytest.raises(InputError, match=r"1.exr: unreadable depth map: it is damaged"):
             opened(tmp_path / "room", "record3d")
