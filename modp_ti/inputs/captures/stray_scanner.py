@@ -7,7 +7,7 @@ import io
 import numpy as np
 
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree
+from modp_ti.files.file_tree import FileTree, Folder
 from modp_ti.files.reading import limited_lines, readable
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame, checked_numbers, opencv_pose, plausible_camera
@@ -23,8 +23,8 @@ CONFIDENT = 2  # of 0, 1 and 2
 
 
 def is_stray_scanner(tree: FileTree) -> bool:
-    """Whether the files are a capture of Stray Scanner."""
-    return tree.has(TABLE) and tree.has(VIDEO)
+    """Whether the files are a folder of Stray Scanner."""
+    return isinstance(tree, Folder) and tree.has(TABLE) and tree.has(VIDEO)  # a video cannot be read in an archive
 
 
 def read_stray_scanner(tree: FileTree) -> Capture:
