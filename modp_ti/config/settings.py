@@ -39,10 +39,30 @@ NO_PATH = "source.path is missing: set it to the folder of the images"
 class SourceSettings(StrictModel):
     """The source of the images, and how they are selected, scaled and masked."""
 
-    kind: Literal["auto", "images", "video", "live", "tum_rgbd", "replica", "sevenscenes", "release", "vrs"] = Field(
+    kind: Literal[
+        "auto",
+        "images",
+        "video",
+        "live",
+        "tum_rgbd",
+        "replica",
+        "sevenscenes",
+        "release",
+        "vrs",
+        "record3d",
+        "scanner_app",
+        "stray_scanner",
+        "polycam",
+        "nerfcapture",
+        "euroc",
+        "kitti",
+        "scannet",
+        "arkitscenes",
+    ] = Field(
         default="auto",
         description="type of `path` or `stream`; `auto` detects it. `images`: a folder of images; `release`: the "
-        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording",
+        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; the others: data sets, "
+        "and captures of phones (docs/trackers.md)",
     )
     path: Path | None = Field(
         default=None,

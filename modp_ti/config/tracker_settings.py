@@ -16,17 +16,30 @@ from pipelines.settings import StrictModel
 __all__ = [
     "AnyTrackerSettings",
     "AriaSettings",
+    "ArkitScenesSettings",
+    "CaptureSettings",
     "ColmapSettings",
+    "DepthCaptureSettings",
+    "EurocSettings",
     "GivenPosesSettings",
+    "KittiSettings",
     "KltSettings",
+    "MatricesSettings",
     "ModpSettings",
+    "NerfCaptureSettings",
     "OrbSlam3Settings",
+    "PolycamSettings",
+    "Record3dSettings",
     "RecordedSettings",
     "ReplicaSettings",
+    "ScanNetSettings",
+    "ScannerAppSettings",
     "SevenScenesSettings",
     "SfmSettings",
     "SocketSettings",
     "StellaVslamSettings",
+    "StrayScannerSettings",
+    "TanksAndTemplesSettings",
     "TimedPosesSettings",
     "TrackerSettings",
     "TransformsSettings",
@@ -249,6 +262,29 @@ class ReplicaSettings(GivenPosesSettings):
     )
 
 
+class MatricesSettings(GivenPosesSettings):
+    """Matrices, one per line."""
+
+    kind: Literal["matrices"] = Field(
+        default="matrices", description="text with a 3x4 or 4x4 matrix, camera to world, per line"
+    )
+    path: Path | None = Field(
+        default=None,
+        description="the file or its folder; empty: `poses.txt` or `traj.txt` in the images' folder or next to it",
+    )
+
+
+class TanksAndTemplesSettings(GivenPosesSettings):
+    """The poses of Tanks and Temples."""
+
+    kind: Literal["tanksandtemples"] = Field(
+        default="tanksandtemples", description="a `.log` of Tanks and Temples or Redwood"
+    )
+    path: Path | None = Field(
+        default=None, description="the file; empty: the only `*.log` in the images' folder or next to it"
+    )
+
+
 class SevenScenesSettings(GivenPosesSettings):
     """The pose files of Microsoft's 7-Scenes."""
 
@@ -265,6 +301,88 @@ class SevenScenesSettings(GivenPosesSettings):
         description="without `points`: bundle adjust the poses with the triangulated points before the first frame. "
         "Empty: true, since the poses are those of the depth camera",
     )
+
+
+class CaptureSettings(TrackerSettings):
+    """Base class for captures, whose cameras and poses come with the images of `source.path`."""
+
+    brings_cameras: ClassVar[bool] = True
+
+    adjust: bool = Field(
+        default=False,
+        description="bundle adjust the poses with triangulated points before the first frame: for poses with errors of "
+        "more than a pixel",
+    )
+
+
+class DepthCaptureSettings(CaptureSettings):
+    """Base class for captures with depth maps."""
+
+    depth: bool = Field(
+        default=True,
+        description="take the tracked points from the depth maps, where there are some; false, and with `adjust`: "
+        "triangulate them",
+    )
+    max_points: int = Field(default=400, ge=10, description="largest number of points of a frame from its depth map")
+    max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] that is used")
+
+
+class Record3dSettings(DepthCaptureSettings):
+    """A capture of Record3D."""
+
+    kind: Literal["record3d"] = Field(
+        default="record3d", description="a capture of Record3D, `.r3d` or its export of EXR and RGB files"
+    )
+
+
+class ScannerAppSettings(DepthCaptureSettings):
+    """A capture of 3D Scanner App."""
+
+    kind: Literal["scanner_app"] = Field(
+        default="scanner_app", description='a capture of 3D Scanner App, exported as "All Data"'
+    )
+
+
+class StrayScannerSettings(DepthCaptureSettings):
+    """A capture of Stray Scanner."""
+
+    kind: Literal["stray_scanner"] = Field(default="stray_scanner", description="a capture of Stray Scanner")
+
+
+class PolycamSettings(DepthCaptureSettings):
+    """A raw export of Polycam."""
+
+    kind: Literal["polycam"] = Field(default="polycam", description="a raw export of Polycam, a folder or zip")
+
+
+class NerfCaptureSettings(CaptureSettings):
+    """A capture of NeRFCapture."""
+
+    kind: Literal["nerfcapture"] = Field(default="nerfcapture", description="a capture of NeRFCapture, a folder or zip")
+
+
+class EurocSettings(CaptureSettings):
+    """A sequence in EuRoC's layout."""
+
+    kind: Literal["euroc"] = Field(default="euroc", description="the true poses of a sequence in EuRoC's layout")
+
+
+class KittiSettings(CaptureSettings):
+    """A sequence of KITTI odometry."""
+
+    kind: Literal["kitti"] = Field(default="kitti", description="the true poses of a sequence of KITTI odometry")
+
+
+class ScanNetSettings(DepthCaptureSettings):
+    """A scene of ScanNet."""
+
+    kind: Literal["scannet"] = Field(default="scannet", description="the poses of a scene of ScanNet")
+
+
+class ArkitScenesSettings(DepthCaptureSettings):
+    """A scene of ARKitScenes."""
+
+    kind: Literal["arkitscenes"] = Field(default="arkitscenes", description="the poses of a scene of ARKitScenes")
 
 
 class SocketSettings(TrackerSettings):
@@ -305,7 +423,18 @@ AnyTrackerSettings = Annotated[
     | AriaSettings
     | ModpSettings
     | ReplicaSettings
+    | MatricesSettings
+    | TanksAndTemplesSettings
     | SevenScenesSettings
+    | Record3dSettings
+    | ScannerAppSettings
+    | StrayScannerSettings
+    | PolycamSettings
+    | NerfCaptureSettings
+    | EurocSettings
+    | KittiSettings
+    | ScanNetSettings
+    | ArkitScenesSettings
     | SocketSettings,
     Field(discriminator="kind"),
 ]

@@ -1,4 +1,7 @@
-"""The scene of `modp-ti run` on a video, a folder of images or a stream: defaults, tracker `klt`, output `out/NAME`."""
+"""The scene of `modp-ti run` on a recording or a stream: defaults, output `out/NAME`.
+
+The tracker is `klt`, or that of the capture if its poses come with the images.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +15,28 @@ from urllib.parse import urlsplit
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.captures import ARCHIVES, KINDS
+from modp_ti.inputs.sources import recognised_kind
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES
 
 __all__ = ["is_recording", "recorded_scene", "streamed_scene"]
 
 OUTPUTS = Path("out")
 SCENE = "scene.yaml"
-RECORDING_SUFFIXES = (*VIDEO_SUFFIXES, ".vrs")
+RECORDING_SUFFIXES = (*VIDEO_SUFFIXES, ".vrs", *ARCHIVES)
 # Longest name of an output folder [characters]. File systems take 255 bytes, and a run adds a suffix for a time.
 MAX_NAME = 60
 
 
 def is_recording(path: Path) -> bool:
-    """Whether the argument of `modp-ti run` is a recording and not a scene file: a folder, a video or a VRS file."""
+    """Whether the argument of `modp-ti run` is a recording and not a scene file: a folder, a video or an archive."""
     return path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES
 
 
 def recorded_scene(
     path: Path, overrides: Iterable[str] = (), preset: str | None = None, taken: Collection[Path] = ()
 ) -> SceneConfig:
-    """Return the settings for a video, a VRS recording or a folder that has no scene file.
+    """Return the settings for a video, a VRS recording, a capture or a folder that has no scene file.
 
     The output folder is `out/NAME`, where NAME is that of the file without its suffix or of the folder. If it holds
     the map of another recording, it is `out/NAME-2` and so on.
@@ -50,7 +55,9 @@ def recorded_scene(
         raise InputError(f"{path} has a {SCENE}: name that file, or the folder of the images")
     name = path.resolve().name if path.is_dir() else path.stem
     source = {"path": str(path)}
-    return scene_from_data(_scene(source, _free(name, path, taken)), str(path), overrides, preset)
+    kind = recognised_kind(path)
+    tracker = kind if kind in KINDS else "klt"
+    return scene_from_data(_scene(source, _free(name, path, taken), tracker), str(path), overrides, preset)
 
 
 def streamed_scene(stream: str, overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
@@ -71,8 +78,8 @@ def streamed_scene(stream: str, overrides: Iterable[str] = (), preset: str | Non
     return scene_from_data(_scene(source, _free(_stream_name(stream))), "--stream", overrides, preset)
 
 
-def _scene(source: dict[str, Any], output: Path) -> dict[str, Any]:
-    return {"source": source, "tracker": {"kind": "klt"}, "output": str(output)}
+def _scene(source: dict[str, Any], output: Path, tracker: str = "klt") -> dict[str, Any]:
+    return {"source": source, "tracker": {"kind": tracker}, "output": str(output)}
 
 
 def _stream_name(stream: str) -> str:

@@ -35,6 +35,7 @@ __all__ = [
     "ARIA",
     "COLMAP",
     "COLMAP_TEXT",
+    "MATRICES",
     "MODP",
     "ORBSLAM3",
     "PLY",
@@ -42,6 +43,7 @@ __all__ = [
     "SCENE",
     "SEVENSCENES",
     "STELLA",
+    "TANKSANDTEMPLES",
     "TRANSFORMS",
     "TUM",
     "TUM_RGBD",
@@ -242,6 +244,28 @@ REPLICA: dict[str, Corruption] = rows_of("1 0 0 0.1 0 1 0 0 0 0 1 0 0 0 0 1", 3,
     "another last row": with_line(1, "1 0 0 0.1 0 1 0 0 0 0 1 0 0 0 1 1"),
     "a position of 1e20": with_line(1, "1 0 0 1e20 0 1 0 0 0 0 1 0 0 0 0 1"),
     "a rotation of 1e20": with_line(1, "1e20 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"),
+}
+
+MATRICES: dict[str, Corruption] = rows_of("1 0 0 0.1 0 1 0 0 0 0 1 0", 3, 1) | {
+    "shear": with_line(1, "1 0.5 0 0.1 0 1 0 0 0 0 1 0"),
+    "a mirror": with_line(1, "-1 0 0 0.1 0 1 0 0 0 0 1 0"),
+    "zeros for a matrix": with_line(1, "0 " * 12),
+    "a position of 1e20": with_line(1, "1 0 0 1e20 0 1 0 0 0 0 1 0"),
+    "four columns more": with_line(1, "1 0 0 0.1 0 1 0 0 0 0 1 0 0 0 0 1"),
+}
+
+TANKSANDTEMPLES: dict[str, Corruption] = rows_of("1 0 0 0.1", 3, 6) | {
+    "words for integers": with_line(5, "one 1 0"),
+    "a fraction for an integer": with_line(5, "0.5 1 0"),
+    "a negative position": with_line(5, "-1 1 0"),
+    "a position of 1e20": with_line(5, "1e20 1 0"),
+    "two integers": with_line(5, "1 1"),
+    "an image twice": with_line(5, "0 1 0"),
+    "images that are missing": whole("7 7 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
+    "images that are not registered": changed(lambda data: data.replace(b"0 0 0\n", b"0 -1 0\n", 1)[:40]),
+    "shear": with_line(6, "1 0.5 0 0.1"),
+    "a mirror": with_line(6, "-1 0 0 0.1"),
+    "another last row": with_line(9, "0 0 1 1"),
 }
 
 SEVENSCENES: dict[str, Corruption] = rows_of("1 0 0 0.1", 3, 0) | {

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tests.fault_injection.corrupted_captures import CAPTURES
 from tests.fault_injection.corrupted_media import IMAGES, MASK, PATH, RUN, VIDEO
 from tests.fault_injection.corrupted_trackers import (
     ARIA,
     COLMAP,
     COLMAP_TEXT,
+    MATRICES,
     MODP,
     ORBSLAM3,
     PLY,
@@ -16,6 +18,7 @@ from tests.fault_injection.corrupted_trackers import (
     SCENE,
     SEVENSCENES,
     STELLA,
+    TANKSANDTEMPLES,
     TRANSFORMS,
     TUM,
     TUM_RGBD,
@@ -71,6 +74,8 @@ def _cases() -> list[Case]:
     add("ply", "points.ply", anything() | PLY)
     add("orbslam3", "CameraTrajectory.txt", anything() | TEXT | ORBSLAM3)
     add("tum_rgbd", "rgb.txt", anything("cut in half") | TEXT | TUM_RGBD)
+    add("matrices", "poses.txt", anything() | TEXT | MATRICES)
+    add("tanksandtemples", "scene.log", anything("a link to itself") | TEXT | TANKSANDTEMPLES)
     add("replica", "traj.txt", anything() | TEXT | REPLICA)
     # Corruptions that have the same effect as a missing file.
     unseen = ("missing", "a folder", "a link to itself", "a pipe", "a device")
@@ -91,7 +96,19 @@ def _cases() -> list[Case]:
     for file, corruptions in RUN.items():
         add("run", file, anything() | corruptions)
     add("run", "path.txt", PATH, ("render", "out", "--path", "path.txt", "-o", "film.mp4", "--quiet"))
+    for kind, files in CAPTURES.items():
+        for file, corruptions in files.items():
+            add(kind, file, anything(*_harmless(file)) | corruptions)
     return cases
+
+
+def _harmless(file: str) -> tuple[str, ...]:
+    """Corruptions of a capture's file that have the effect of a missing one, or leave a valid one."""
+    missing = ("missing", "a folder", "a link to itself", "a pipe", "a device")
+    names = ("depth_00003.png", "frame_00003.json", "cameras/1733333.json", "depth/1.png", "pose/1.txt", ".pincam")
+    if file.endswith((*names, "intrinsic_depth.txt")):
+        return missing
+    return ("cut in half", "noise before it") if file.endswith(".r3d") else ("cut in half",)
 
 
 CASES = _cases()

@@ -16,7 +16,7 @@ from threading import Event
 import numpy as np
 
 from modp_ti.files.errors import InputError
-from tests.fault_injection.samples import SAMPLES, write_sample
+from tests.fault_injection.samples import CAPTURES, SAMPLES, write_sample
 
 __all__ = ["READERS", "Reader", "import_readers", "seeds"]
 
@@ -245,6 +245,8 @@ READERS: dict[str, Reader] = {
         Reader("points", "ply", ("points.ply",), _points),
         Reader("listing", "tum_rgbd", ("rgb.txt",), _listing),
         Reader("matrices", "replica", ("traj.txt",), _open),
+        Reader("matrices_per_line", "matrices", ("poses.txt",), _open),
+        Reader("tanksandtemples", "tanksandtemples", ("scene.log",), _open),
         Reader("modp", "modp", SAMPLES["modp"][0].files, _open),
         Reader("aria", "aria", SAMPLES["aria"][0].files, _aria),
         Reader("stella_vslam", "stella_vslam", ("map.msg",), _stella),
@@ -254,6 +256,7 @@ READERS: dict[str, Reader] = {
         Reader("splats", "run", ("out/splats.ply",), _splats),
         Reader("run", "run", RUN_FILES, _run),
         Reader("weights", "weights", ("older.pth", "weights.pth"), _weights),
+        *(Reader(kind, kind, SAMPLES[kind][0].files, _open) for kind in CAPTURES),
         Reader("tracker_server", "tracker_server", ("wire",), _tracker_server),
     )
 }
@@ -261,7 +264,7 @@ READERS: dict[str, Reader] = {
 
 def import_readers() -> None:
     """Import every module that the readers use, once for all forked processes."""
-    kinds = ("aria", "colmap", "data_sets", "modp", "stella_vslam", "transforms", "tum")
+    kinds = ("aria", "captures", "colmap", "data_sets", "matrices", "modp", "stella_vslam", "transforms", "tum")
     for name in (
         *(
             "config.scene_file",
@@ -278,6 +281,7 @@ def import_readers() -> None:
             "inputs.sources.masks",
         ),
         *(f"inputs.trackers.{kind}" for kind in kinds),
+        "inputs.captures.images",
         "inputs.tracker_server",
     ):
         import_module(f"modp_ti.{name}")

@@ -5,15 +5,18 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import msgpack
 import numpy as np
 
+from tests.captures import WRITERS, View, zipped
 from tests.fault_injection.small_recording import (
     FOCAL,
     FRAMES,
@@ -158,6 +161,20 @@ def _write_replica(folder: Path) -> None:
     write_text(folder, "traj.txt", [" ".join(_matrix(i)) for i in range(FRAMES)])
     points_file(folder)
     scene_file(folder, "kind: replica, points: points.txt", f"path: ., kind: replica, {INTRINSICS}")
+
+
+def _write_matrices(folder: Path) -> None:
+    write_images(folder)
+    write_text(folder, "poses.txt", [" ".join(_matrix(i)[:3]) for i in range(FRAMES)])
+    points_file(folder)
+    scene_file(folder, "kind: matrices, points: points.txt")
+
+
+def _write_log(folder: Path) -> None:
+    write_images(folder)
+    write_text(folder, "scene.log", [line for i in range(FRAMES) for line in (f"{i} {i} 0", *_matrix(i))])
+    points_file(folder)
+    scene_file(folder, "kind: tanksandtemples, points: points.txt")
 
 
 def _write_sevenscenes(folder: Path) -> None:
@@ -341,6 +358,45 @@ def _write_tracker_server(folder: Path) -> None:
     write_bytes(folder, "wire", wire())
 
 
+def _write_capture(kind: str, folder: Path) -> None:
+    """Write the recording as a capture, Record3D's in an archive."""
+    views = []
+    for i in range(FRAMES):
+        T = np.eye(4)
+        T[0, 3] = position(i)
+        K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+        views.append(View(picture(i), K, T, lambda _, size: np.full(size[::-1], 3.0)))
+    place = CAPTURES[kind][0].partition("/")[0]
+    WRITERS[kind](folder / ("unpacked" if kind == "record3d" else place), views)
+    if kind == "record3d":
+        zipped(folder / "unpacked", folder / place)
+        shutil.rmtree(folder / "unpacked")
+    scene_file(folder, f"kind: {kind}", f"path: {place}")
+
+
+CAPTURES = {
+    "record3d": ("room.r3d",),
+    "scanner_app": ("app/frame_00003.json", "app/depth_00003.png"),
+    "stray_scanner": ("room/odometry.csv",),
+    "polycam": ("room/keyframes/cameras/1733333.json",),
+    "nerfcapture": ("room/transforms.json",),
+    "euroc": (
+        "room/mav0/cam0/sensor.yaml",
+        "room/mav0/state_groundtruth_estimate0/data.csv",
+        "room/mav0/cam0/data.csv",
+    ),
+    "kitti": ("room/poses.txt", "room/calib.txt", "room/times.txt"),
+    "scannet": (
+        "room/pose/1.txt",
+        "room/intrinsic/intrinsic_color.txt",
+        "room/intrinsic/intrinsic_depth.txt",
+        "room/depth/1.png",
+    ),
+    "arkitscenes": ("room/lowres_wide.traj", "room/lowres_wide_intrinsics/42_3000.101.pincam"),
+}
+"""The files under test of captures, by kind."""
+
+
 EXPORT = ("export", "out", "--format", "points", "-o", "written.ply", "--quiet")
 RUN_MODEL = tuple(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D"))
 SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
@@ -358,6 +414,8 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("orbslam3", ("CameraTrajectory.txt",)), _write_orbslam3),
         (Sample("tum_rgbd", ("rgb.txt",)), _write_tum_rgbd),
         (Sample("replica", ("traj.txt",)), _write_replica),
+        (Sample("matrices", ("poses.txt",)), _write_matrices),
+        (Sample("tanksandtemples", ("scene.log",)), _write_log),
         (Sample("sevenscenes", ("seq/frame-000001.pose.txt",)), _write_sevenscenes),
         (
             Sample("modp", ("trajectory.json", "point_cloud/point_cloud_1.txt", "point_cloud/point_cloud_2.npy")),
@@ -385,6 +443,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("run", ("out/splats.ply", "out/trajectory.txt", "out/frames.json", *RUN_MODEL), EXPORT), _write_run),
         (Sample("weights", ("weights.pth", "older.pth")), _write_weights),
         (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
+        *((Sample(kind, files), partial(_write_capture, kind)) for kind, files in CAPTURES.items()),
     )
 }
 

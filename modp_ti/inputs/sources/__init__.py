@@ -68,7 +68,7 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
             raise
     path = source.require_path()
     kind = recognised_kind(path) if source.kind == "auto" else source.kind
-    images = _OPENERS[kind](path, source)
+    images = _OPENERS[kind](path, source) if kind in _OPENERS else _open_capture(path, kind, source)
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
         images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
     images = _scaled(_with_camera(images, source), source)
@@ -86,8 +86,16 @@ def recognised_kind(path: Path) -> str:
     Raises:
         InputError: If the path is a file of an unknown type.
     """
+    # Imported here: captures are built on sources.
+    from modp_ti.inputs.captures import ARCHIVES, recognised_capture
+
     suffix = path.suffix.lower()
     if not path.is_dir():
+        if suffix in ARCHIVES and path.exists():
+            kind = recognised_capture(path)
+            if kind is None:
+                raise InputError(f"{path}: is no capture of a known app; unpack it and name the folder of the images")
+            return kind
         if suffix == ".vrs":
             return "vrs"
         if suffix in VIDEO_SUFFIXES:
@@ -98,6 +106,8 @@ def recognised_kind(path: Path) -> str:
                 "video or a VRS recording; where it is a video, set source.kind: video"
             )
         return "images"
+    if (kind := recognised_capture(path)) is not None:
+        return kind
     if (path / "rgb.txt").is_file():
         return "tum_rgbd"
     if find_replica_images(path):
@@ -116,6 +126,12 @@ def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:
     return AriaRecording(path, source.vrs, source.vignette)
 
 
+def _open_capture(path: Path, kind: str, source: SourceSettings) -> ImageSource:
+    from modp_ti.inputs.captures.images import open_capture_images
+
+    return open_capture_images(path, kind, source.fps, source.stop)
+
+
 _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
     "images": lambda path, source: ImageFolder(path, source.fps),
     "video": lambda path, source: VideoFile(path, source.fps, source.stop),
@@ -125,7 +141,7 @@ _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
     "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
     "vrs": _open_vrs,
 }
-"""Functions that open a path, by `source.kind`."""
+"""Functions that open a path, by `source.kind`; the other kinds are captures."""
 
 
 def _with_camera(images: ImageSource, source: SourceSettings) -> ImageSource:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,7 @@ class ListedImages(ImageSource):
         """
         turn, _ = self.turn(name), self._bits  # both add their notes when the source is opened
         try:
-            with open_file(self.path / name) as file:
+            with self._open(name) as file:
                 header = read_image_header(file)
         except OSError as error:
             raise self._unreadable(name, error.strerror or "it cannot be opened") from None
@@ -109,10 +110,18 @@ class ListedImages(ImageSource):
             raise self._unreadable(name, "it is damaged or no image")
         return turn.image(image)
 
+    def _open(self, name: str) -> BinaryIO:
+        """Open an image file. Raises OSError."""
+        return open_file(self.path / name)
+
+    def _content(self, name: str) -> bytes:
+        """Read an image file. Raises OSError."""
+        return read_bytes(self.path / name)
+
     def _checked(self, name: str) -> bytes:
         """Read an image file and check that it can be decoded. Raises UnreadableImageError."""
         try:
-            data = read_bytes(self.path / name)
+            data = self._content(name)
         except OSError as error:
             raise self._unreadable(name, error.strerror or "it cannot be opened") from None
         header = read_image_header(io.BytesIO(data))
@@ -154,7 +163,7 @@ class ListedImages(ImageSource):
         """The header of each JPEG and PNG file that can be read, by name. All are read when the first is needed."""
         headers = {}
         for name in self.names:
-            with suppress(OSError), open_file(self.path / name) as file:
+            with suppress(OSError), self._open(name) as file:
                 header = read_image_header(file)
                 if header is not None and header.width > 0:
                     headers[name] = header

@@ -15,6 +15,7 @@ from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 
 if TYPE_CHECKING:
+    from modp_ti.inputs.captures.capture import Capture
     from modp_ti.inputs.sources.backlog import Arrivals
 
 __all__ = ["IMAGE_SUFFIXES", "ImageSource", "require_intrinsics"]
@@ -35,6 +36,7 @@ class ImageSource(ABC):
         intrinsics: Camera of the stored images, from the user or else from the source. None if unknown.
         vignette: Share of the light (H, W, 3) float32, at most 1, that reaches each part of the stored image's field of
             view. None if unknown.
+        capture: Poses and depth maps that come with the images. None if none do.
         T_device_camera: Pose (4, 4) of the camera on a device with other sensors, camera to device, OpenCV axes. None
             for a camera alone.
         scale: Factor from the stored images' width and height to those of the frames, as `source.scale` says.
@@ -44,6 +46,7 @@ class ImageSource(ABC):
         self.path = path
         self.intrinsics: Intrinsics | None = None
         self.vignette: NDArray[np.float32] | None = None
+        self.capture: Capture | None = None
         self.T_device_camera: NDArray[np.float64] | None = None
         self.scale = 1.0
         self._size: tuple[int, int] | None = None  # (width, height) of every image, where they have one size

@@ -77,10 +77,22 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
             from modp_ti.inputs.trackers.data_sets import open_replica
 
             return open_replica(source, tracker, progress)
+        case kinds.MatricesSettings() as tracker:
+            from modp_ti.inputs.trackers.matrices import open_matrices
+
+            return open_matrices(source, tracker, progress)
+        case kinds.TanksAndTemplesSettings() as tracker:
+            from modp_ti.inputs.trackers.matrices import open_tanksandtemples
+
+            return open_tanksandtemples(source, tracker, progress)
         case kinds.SevenScenesSettings() as tracker:
             from modp_ti.inputs.trackers.data_sets import open_sevenscenes
 
             return open_sevenscenes(source, tracker, progress)
+        case kinds.CaptureSettings() as tracker:
+            from modp_ti.inputs.trackers.captures import open_capture
+
+            return open_capture(source, tracker, progress)
         case kinds.SocketSettings() as tracker:
             from modp_ti.inputs.tracker_server import open_tracker_server
 

@@ -17,6 +17,7 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files import is_file
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.captures.capture import OPENCV_OPENGL
 from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
@@ -29,9 +30,6 @@ from modp_ti.inputs.trackers.stored_cameras import turn_of_camera, turned_note
 __all__ = ["open_transforms"]
 
 NAME = "transforms.json"
-
-# From OpenGL camera axes (x right, y up, z back) to OpenCV axes. The matrix is its own inverse.
-OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
@@ -62,20 +60,48 @@ def open_transforms(
         turn = turn_of_camera(images, name, raw.width, raw.height, str(file))
         turns.append(turn)
         raw, distortion = turn.camera(raw, distortion)
-        undistorter = undistorters.setdefault((raw, distortion), Undistorter(raw, distortion, images.scale))
+        undistorter = undistorters.get((raw, distortion))
+        if undistorter is None:
+            like = frames[0].undistorter.camera if frames else None
+            undistorter = undistorters[raw, distortion] = _undistorter(raw, distortion, images.scale, like, name)
         frames.append(PosedImage(name, undistorter, turn.T_turned_stored @ _pose(entry, file)))
     notes += turned_note(turns, str(file))
+    size = frames[0].undistorter.raw.width, frames[0].undistorter.raw.height
+    others = sum((frame.undistorter.raw.width, frame.undistorter.raw.height) != size for frame in frames)
+    if others:
+        notes.append(f"{others} of {len(frames)} images have another size than the first: they are scaled to its size")
     reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(file))
 
     cloud = data.get("ply_file_path")
-    if isinstance(cloud, str) and is_file(file.parent / cloud):
+    cloud = cloud.replace("\\", "/") if isinstance(cloud, str) else None  # as Windows writes it
+    if cloud is not None and is_file(file.parent / cloud):
         xyz = read_ply_points(file.parent / cloud)
         frames = [f.with_points(visible_points(xyz, f.undistorter, f.T_camera_world)) for f in frames]
     else:
-        if isinstance(cloud, str):
+        if cloud is not None:
             notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
         frames = triangulated_frames(images, frames, solving(frames, source), progress)
     return ReplayedTracker(reader, frames, notes)
+
+
+def _undistorter(
+    raw: PinholeCamera, lens: Distortion, scale: float, like: PinholeCamera | None, name: str
+) -> Undistorter:
+    """Return the undistorter to the working size, which is that of the camera `like` if there is one.
+
+    Raises:
+        InputError: If the image has another shape, so that it cannot be scaled to that size.
+    """
+    found = Undistorter(raw, lens, scale)
+    if like is None or (found.camera.width, found.camera.height) == (like.width, like.height):
+        return found
+    found = Undistorter(raw, lens, like.width / raw.width)
+    if (found.camera.width, found.camera.height) != (like.width, like.height):
+        raise InputError(
+            f"{name} is {raw.width}x{raw.height}, which has another shape than the first image, mapped at "
+            f"{like.width}x{like.height}: all images of a scene must have one shape; map those of each camera alone"
+        )
+    return found
 
 
 def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:

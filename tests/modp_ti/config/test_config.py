@@ -210,7 +210,11 @@ def test_missing_key_is_named_with_its_meaning(scene, text, parts):
         ("{kind: colmap, pth: x}", ["unknown key `tracker.pth`; did you mean `tracker.path`?"]),
         (
             "{kind: colmap, points: x}",
-            ["unknown key `tracker.points`", "tum, orbslam3, replica and sevenscenes, not colmap", "`tracker.path`"],
+            [
+                "unknown key `tracker.points`",
+                "replica, matrices, tanksandtemples and sevenscenes, not colmap",
+                "`tracker.path`",
+            ],
         ),
         (
             "{kind: klt, path: x}",

@@ -17,7 +17,10 @@ from typer.testing import CliRunner
 
 from modp_ti.commands import app as cli
 from modp_ti.config.scene_file import load_scene
+from modp_ti.config.settings import SceneConfig
+from modp_ti.inputs.captures import KINDS
 from modp_ti.inputs.trackers import open_tracker
+from tests.captures import WRITERS, View, zipped
 
 PAGE = Path(__file__).resolve().parents[4] / "docs" / "trackers.md"
 SHARED = Path(__file__).resolve().parents[5] / "shared" / "data"
@@ -40,8 +43,10 @@ def test_every_block_is_a_valid_scene_of_its_section(kind, number, text, tmp_pat
 
 
 def test_every_reader_has_its_page():
-    assert list(blocks()) == ["tum", "orbslam3", "stella_vslam", "aria", "modp", "replica", "sevenscenes"]
-    assert all(texts for texts in blocks().values())
+    given = ["tum", "orbslam3", "stella_vslam", "aria", "modp", "replica", "sevenscenes", "matrices", "tanksandtemples"]
+    sections = {name: texts for name, texts in blocks().items() if not name.startswith("Captures")}
+    assert list(sections) == [*given, *KINDS]
+    assert all(texts for texts in sections.values())
 
 
 def images(recording, folder: Path, size: tuple[int, int], names: Callable[[int], str]) -> None:
@@ -141,6 +146,48 @@ def test_replica(recording):
 def test_sevenscenes(tmp_path):
     from_shared(tmp_path, "redkitchen", "redkitchen")
     assert len(delivered(tmp_path, "sevenscenes", 0, "source.stop=2")) == 2
+
+
+def test_matrices(recording):
+    images(recording, recording.root / "room/images", (640, 480), lambda i: f"{i}.png")
+    recording.write("room/poses.txt", [" ".join(map(str, T.ravel())) for T in recording.poses_in_world])
+    frames = delivered(recording.root, "matrices", 0, "source.stop=2")
+    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
+
+
+def test_tanksandtemples(recording):
+    images(recording, recording.root / "Truck/images", (1957, 1091), lambda i: f"{i + 1:06d}.jpg")
+    lines = []
+    for i, T in enumerate(recording.poses_in_world):
+        lines += [f"{i} {i} 0", *(" ".join(map(str, row)) for row in T)]
+    recording.write("Truck/Truck.log", lines)
+    frames = delivered(recording.root, "tanksandtemples", 0, "source.stop=2")
+    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_captures(recording, kind):
+    views = []
+    for i in range(2):
+        picture = np.asarray(cv2.imread(str(recording.root / "images" / recording.names[i])), np.uint8)
+        far = lambda K, size: np.full(size[::-1], 3.0)  # noqa: E731
+        views.append(View(picture, recording.K, recording.poses_in_world[i], far))
+    path = load_example(recording.root, kind).source.path
+    assert path is not None
+    WRITERS[kind](recording.root / "unpacked", views)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix:
+        zipped(recording.root / "unpacked", path)
+    else:
+        (recording.root / "unpacked").rename(path)
+    frames = delivered(recording.root, kind, 0, "source.step=1")
+    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-6)
+
+
+def load_example(root: Path, kind: str) -> SceneConfig:
+    file = root / "scene.yaml"
+    file.write_text(blocks()[kind][0])
+    return load_scene(file)
 
 
 def test_what_is_wrong_is_one_line_and_exit_code_2(recording):

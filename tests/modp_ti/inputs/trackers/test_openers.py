@@ -9,6 +9,7 @@ import pytest
 from modp_ti.config.keys import variants_of
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.captures import KINDS as CAPTURES
 from modp_ti.inputs.trackers import open_tracker
 
 KINDS = variants_of(SceneConfig.model_fields["tracker"])
@@ -28,6 +29,6 @@ def test_settings_know_their_kind_and_what_it_can_do(kind):
     settings = KINDS[kind]()
     assert settings.kind == kind
     assert settings.needs_source == (kind != "socket")
-    assert settings.brings_cameras == (kind in ("colmap", "transforms", "socket"))
+    assert settings.brings_cameras == (kind in ("colmap", "transforms", "socket", *CAPTURES))
     assert settings.follows_streams == (kind == "klt")
     assert settings.is_live == (kind == "socket")

@@ -271,3 +271,45 @@ def test_held_out_images_do_not_decide_where_a_point_lies(plane_scene):
     # Which features are joined may depend on held-out views; where two or more others agree on a point, it
     # stays put.
     assert len(places[0] & places[1]) > 0.7 * len(places[0])
+
+
+def test_paths_of_windows_are_read(with_cloud):
+    with_cloud.write_transforms(ply_file_path=".\\points.ply")
+    file = with_cloud.folder.parent / "transforms.json"
+    data = json.loads(file.read_text())
+    for frame in data["frames"]:
+        frame["file_path"] = ".\\" + frame["file_path"].replace("/", "\\")
+    file.write_text(json.dumps(data))
+    tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    assert [frame.name for frame in tracker.frames] == with_cloud.names
+    assert all(len(frame.points) for frame in tracker.frames)
+
+
+def with_another_camera(scene, width: int, height: int) -> None:
+    """Image 1 is of a second camera with another size, whose keys are those of the frame."""
+    image = cv2.imread(str(scene.folder / scene.names[1]))
+    cv2.imwrite(str(scene.folder / scene.names[1]), cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    file = scene.write_transforms(ply_file_path="points.ply")
+    data = json.loads(file.read_text())
+    x, y = width / scene.size[0], height / scene.size[1]
+    (fx, _, cx), (_, fy, cy), _ = scene.K.tolist()
+    data["frames"][1] |= {"w": width, "h": height, "fl_x": x * fx, "fl_y": y * fy, "cx": x * cx, "cy": y * cy}
+    file.write_text(json.dumps(data))
+
+
+def test_images_of_several_sizes_are_delivered_at_that_of_the_first(with_cloud):
+    whole = list(open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings()))
+    with_another_camera(with_cloud, 160, 120)
+    tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    assert "1 of 7 images have another size than the first: they are scaled to its size" in tracker.notes
+    for frame, before in zip(tracker, whole, strict=True):
+        assert frame.image.shape == before.image.shape
+        np.testing.assert_allclose(frame.camera.matrix(), before.camera.matrix())
+        np.testing.assert_allclose(frame.points.pixels, before.points.pixels, atol=1e-9)
+        assert np.abs(frame.image - before.image).mean() < 0.05
+
+
+def test_an_image_of_another_shape_is_refused(with_cloud):
+    with_another_camera(with_cloud, 160, 160)
+    with pytest.raises(InputError, match=r"view9.png is 160x160, which has another shape than the first image"):
+        open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())

@@ -1,0 +1,88 @@
+"""Sequences of KITTI odometry."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+
+from modp_ti.files.errors import InputError
+from modp_ti.files.file_tree import FileTree, Folder
+from modp_ti.inputs.captures.capture import Capture, CapturedFrame, checked_numbers, opencv_pose, plausible_camera
+from modp_ti.inputs.captures.tables import read_lines, read_numbers
+from modp_ti.inputs.sources.image_header import read_image_header
+
+__all__ = ["is_kitti", "read_kitti"]
+
+CALIBRATION, TIMES = "calib.txt", "times.txt"
+CAMERAS = (2, 0, 3, 1)  # colour before grey, left before right
+
+
+def is_kitti(tree: FileTree) -> bool:
+    """Whether the files are a sequence of KITTI odometry, such as `sequences/00`."""
+    return tree.has(CALIBRATION) and tree.has(TIMES) and any(tree.listed(f"image_{n}") for n in CAMERAS)
+
+
+def read_kitti(tree: FileTree) -> Capture:
+    """Read the images of one camera, the left colour one if it is there.
+
+    The poses are those of camera 0, from `poses.txt` in the folder or `poses/NAME.txt` two folders up. The offset of
+    another camera is that of its projection matrix.
+
+    Raises:
+        InputError: If a file is missing or malformed.
+    """
+    camera = next((n for n in CAMERAS if tree.listed(f"image_{n}")), CAMERAS[0])
+    images = [name for name in tree.listed(f"image_{camera}") if name.lower().endswith((".png", ".jpg"))]
+    if not images:
+        raise InputError(f"{tree.path}: holds no image image_{camera}/000000.png, ...")
+    P = _projection(tree, camera)
+    where = f"{tree.path / CALIBRATION}: P{camera}"
+    try:
+        header = read_image_header(io.BytesIO(tree.read(images[0])))
+    except OSError:
+        header = None
+    if header is None:
+        raise InputError(f"{tree.path / images[0]}: unreadable image; copy the sequence again")
+    # The calibration has pixel centres at whole numbers.
+    pinhole = plausible_camera(P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5, (header.width, header.height), where)
+    T_camera_left = np.eye(4)
+    T_camera_left[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+
+    times, _ = read_numbers(tree, TIMES, 1, "the time of an image [s]")
+    place, file = _poses_file(tree)
+    rows, lines = read_numbers(place, file, 12, "a 3x4 matrix, camera to world, row by row")
+    frames = []
+    for n, name in enumerate(images[: len(times)]):
+        T = opencv_pose(rows[n], f"{place.path / file}:{lines[n]}") if n < len(rows) else None
+        frames.append(CapturedFrame(name, float(times[n, 0]), pinhole, None if T is None else T_camera_left @ T))
+    notes = [f"{tree.path}: is a sequence of KITTI odometry, of which image_{camera} is used"]
+    return Capture("kitti", tree, str(place.path / file), frames, notes)
+
+
+def _projection(tree: FileTree, camera: int) -> np.ndarray:
+    """Return the projection matrix (3, 4) of a camera."""
+    where = tree.path / CALIBRATION
+    for number, line in read_lines(tree, CALIBRATION):
+        name, _, rest = line.partition(":")
+        if name.strip() in (f"P{camera}", f"P_rect_{camera:02d}"):
+            try:
+                words = [float(word) for word in rest.split()]
+            except ValueError:
+                words = []
+            P = np.array(checked_numbers(words, 12, f"{where}:{number}: P{camera}")).reshape(3, 4)
+            if np.abs(P).max() > 1e9 or abs(np.linalg.det(P[:, :3])) < 1e-6:
+                break
+            return P
+    raise InputError(f"{where}: holds no projection matrix P{camera}: of a camera")
+
+
+def _poses_file(tree: FileTree) -> tuple[FileTree, str]:
+    """Return the file of the poses, and the folder that it lies in."""
+    if tree.has("poses.txt"):
+        return tree, "poses.txt"
+    name = tree.path.resolve().name
+    above = Folder(tree.path.resolve().parent.parent)
+    if above.has(f"poses/{name}.txt"):
+        return above, f"poses/{name}.txt"
+    raise InputError(f"{tree.path}: its poses are neither in poses.txt nor in {above.path / 'poses' / name}.txt")
