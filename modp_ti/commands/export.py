@@ -13,6 +13,7 @@ from modp_ti.commands.shared import AsJson, Device, Quiet, examples, outcome, pr
 __all__ = ["EXAMPLES", "export"]
 
 EXAMPLES = examples(
+    "modp-ti export out/room --format html   (out/room/map.html: one file to send to a friend)",
     "modp-ti export out/room --format mesh   (out/room/mesh.ply)",
     "modp-ti export out/room --format mesh -o room.glb   (for browsers)",
     "modp-ti export out/room --format spz   (splats, 1/5 to 1/4 of the size)",
@@ -27,7 +28,9 @@ class Format(str, Enum):
     mesh = "mesh"
     splat = "splat"
     spz = "spz"
+    sog = "sog"
     compressed_ply = "compressed-ply"
+    html = "html"
     colmap = "colmap"
     nerfstudio = "nerfstudio"
     video = "video"
@@ -40,14 +43,14 @@ def export(
         typer.Option(
             "--format",
             "-f",
-            help="`points`: coloured points (PLY); `mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, "
-            "`compressed-ply`: splats, small, for viewers; `colmap`, `nerfstudio`: images with poses and points, to "
-            "train on; `video`: the recorded path",
+            help="`html`: a page that shows the map in any browser, without network; `points`: coloured points (PLY); "
+            "`mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, `sog`, `compressed-ply`: splats, small, for "
+            "viewers; `colmap`, `nerfstudio`: images with poses and points, to train on; `video`: the recorded path",
         ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="PATH", help="file or new folder; empty: in OUT, see docs/export.md"),
+        typer.Option("--output", "-o", metavar="PATH", help="file or new folder; empty: in OUT"),
     ] = None,
     voxel: Annotated[
         float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
@@ -56,7 +59,7 @@ def export(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a finished map as points, mesh, compressed splats, data set or video."""
+    """Write a finished map as web page, points, mesh, compressed splats, data set or video."""
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.outputs.playback.export_map import ExportOptions, export_map

@@ -77,9 +77,9 @@ def write_web_splat(path: str | os.PathLike[str], state: Mapping[str, NDArray]) 
     table = np.zeros(len(order), RECORD)
     table["position"] = state["position"][order]
     table["scale"] = np.exp(state["log_scale"][order])
-    table["rgba"][:, :3] = _to_bits(0.5 + SH_C0 * state["sh"][order, 0], 8)
-    table["rgba"][:, 3] = _to_bits(opacity[order], 8)
-    table["rotation"] = np.clip(np.round(_unit_quaternions(state)[order] * 128.0) + 128.0, 0, 255)
+    table["rgba"][:, :3] = to_bits(0.5 + SH_C0 * state["sh"][order, 0], 8)
+    table["rgba"][:, 3] = to_bits(opacity[order], 8)
+    table["rotation"] = np.clip(np.round(unit_quaternions(state)[order] * 128.0) + 128.0, 0, 255)
     replace_file(path, table.tobytes())
 
 
@@ -90,7 +90,7 @@ def write_compressed_ply(path: str | os.PathLike[str], state: Mapping[str, NDArr
         path: The file.
         state: Gaussians by name, as from `GaussianField.to_numpy`.
     """
-    order = _morton_order(state["position"])
+    order = morton_order(state["position"])
     state = {name: values[order] for name, values in state.items()}
     first = np.arange(0, len(order), CHUNK)
     chunk = np.arange(len(order)) // CHUNK
@@ -104,7 +104,7 @@ def write_compressed_ply(path: str | os.PathLike[str], state: Mapping[str, NDArr
         relative.append((values - low[chunk]) / np.maximum(high - low, 1e-12)[chunk])
     packed = np.zeros((len(order), 4), "<u4")
     packed[:, 0] = _packed(relative[0].T, (11, 10, 11))
-    largest, others = _smallest_three(_unit_quaternions(state))
+    largest, others = smallest_three(unit_quaternions(state))
     packed[:, 1] = largest.astype(np.uint32) << 30 | _packed(others.T / np.sqrt(2.0) + 0.5, (10, 10, 10))
     packed[:, 2] = _packed(relative[1].T, (11, 10, 11))
     packed[:, 3] = _packed([*relative[2].T, opacities(state)], (8, 8, 8, 8))
@@ -124,16 +124,16 @@ def _packed(parts: NDArray[np.float64] | list[NDArray[np.float64]], bits: tuple[
     """Pack numbers in [0, 1] into one word with the given bits each, the first in the highest bits."""
     word = np.zeros(len(parts[0]), np.uint32)
     for part, count in zip(parts, bits, strict=True):
-        word = word << np.uint32(count) | _to_bits(part, count)
+        word = word << np.uint32(count) | to_bits(part, count)
     return word
 
 
-def _morton_order(position: NDArray[np.floating]) -> NDArray[np.int64]:
+def morton_order(position: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return the order (N,) along a Morton curve with 10 bits per coordinate."""
     if len(position) == 0:
         return np.zeros(0, np.int64)
     low, high = position.min(axis=0), position.max(axis=0)
-    cell = _to_bits((position - low) / np.maximum(high - low, 1e-12), 10).astype(np.uint64)
+    cell = to_bits((position - low) / np.maximum(high - low, 1e-12), 10).astype(np.uint64)
     key = np.zeros(len(position), np.uint64)
     for bit in range(10):
         for axis in range(3):
@@ -163,14 +163,14 @@ def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> Non
         )
     fixed = np.round(position * 2.0**fractional).astype("<i4")
     degree = round(state["sh"].shape[1] ** 0.5) - 1
-    largest, others = _smallest_three(_unit_quaternions(state)[:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0])
+    largest, others = smallest_three(unit_quaternions(state)[:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0])
     components = [part for value in others.T for part in ((value < 0).astype(np.float64), np.abs(value) * np.sqrt(2.0))]
     rest = state["sh"][:, 1:].astype(np.float64) * TURNED[: state["sh"].shape[1] - 1, None]
     arrays = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3],
         # 0 and 255 are excluded, as their logits are infinite.
-        np.clip(_to_bits(opacities(state), 8), 1, 254).astype(np.uint8),
-        _to_bits(0.15 * state["sh"][:, 0].astype(np.float64) + 0.5, 8).astype(np.uint8),
+        np.clip(to_bits(opacities(state), 8), 1, 254).astype(np.uint8),
+        to_bits(0.15 * state["sh"][:, 0].astype(np.float64) + 0.5, 8).astype(np.uint8),
         np.clip(np.round(16.0 * (state["log_scale"].astype(np.float64) + 10.0)), 0, 255).astype(np.uint8),
         (largest.astype(np.uint32) << 30 | _packed(components, (1, 9) * 3)).astype("<u4"),
         np.clip(np.round(128.0 * rest) + 128.0, 0, 255).astype(np.uint8),
@@ -185,13 +185,13 @@ def opacities(state: Mapping[str, NDArray]) -> NDArray[np.float64]:
     return 1.0 / (1.0 + np.exp(-state["opacity_logit"].astype(np.float64)))
 
 
-def _unit_quaternions(state: Mapping[str, NDArray]) -> NDArray[np.float64]:
+def unit_quaternions(state: Mapping[str, NDArray]) -> NDArray[np.float64]:
     """Return the rotations (N, 4) as unit quaternions w, x, y, z."""
     q = state["quaternion"].astype(np.float64)
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
-def _smallest_three(q: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def smallest_three(q: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Split unit quaternions (N, 4) into the index of the largest component (N,) and the other three (N, 3), in order.
 
     The sign is chosen such that the largest component is positive and need not be stored.
@@ -203,7 +203,7 @@ def _smallest_three(q: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[
     return largest, others
 
 
-def _to_bits(values: NDArray, bits: int) -> NDArray[np.uint32]:
+def to_bits(values: NDArray, bits: int) -> NDArray[np.uint32]:
     """Quantise values in [0, 1], after clipping, to the nearest of the levels 0 to 2^bits - 1."""
     most = (1 << bits) - 1
     return np.round(np.clip(values, 0.0, 1.0) * most).astype(np.uint32)

@@ -10,6 +10,7 @@ from modp_ti.outputs.formats.compressed_splats import write_compressed_ply, writ
 from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
+from modp_ti.outputs.formats.sog import write_sog
 from modp_ti.outputs.playback.film import is_video
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.flight import film, plan_flight
@@ -18,6 +19,9 @@ from modp_ti.outputs.playback.mapped_images import dataset_names, write_images
 from modp_ti.outputs.playback.plain_colours import with_plain_colours
 from modp_ti.outputs.playback.surface import surface_views
 from modp_ti.outputs.progress import ProgressLine
+from modp_ti.outputs.report.page import show_link_to_map
+from modp_ti.outputs.splat_page.flight import level, moved, viewer_settings
+from modp_ti.outputs.splat_page.page import write_splat_page
 
 __all__ = ["DEFAULT_NAMES", "export_map"]
 
@@ -27,12 +31,14 @@ DEFAULT_NAMES = {
     "mesh": "mesh.ply",
     "splat": "splats.splat",
     "spz": "splats.spz",
+    "sog": "splats.sog",
     "compressed-ply": "splats.compressed.ply",
+    "html": "map.html",
     "colmap": "colmap-dataset",
     "nerfstudio": "nerfstudio",
     "video": "recorded.mp4",
 }
-SPLATS = {"spz": write_spz, "compressed-ply": write_compressed_ply}
+SPLATS = {"spz": write_spz, "sog": write_sog, "compressed-ply": write_compressed_ply}
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL = 1 / 160
 FARTHEST = 4.0
@@ -68,6 +74,7 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         InputError: If the export is not possible.
     """
     target = _target(run, format, output)
+    _make_folder(target.absolute().parent)
     try:
         if format == "points":
             with line.working("writing points"):
@@ -80,6 +87,9 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         elif format in SPLATS:
             with line.working("writing splats"):
                 SPLATS[format](target, run.gaussians)
+        elif format == "html":
+            with line.working("writing the page"):
+                _page(run, target)
         elif format == "video":
             film(run, plan_flight(run, "recorded"), target, False, options.device, line)
         else:
@@ -92,8 +102,6 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
 def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
     """Return the output path. Raises InputError if it is not usable, before anything is computed."""
     target = run.folder / DEFAULT_NAMES[format] if output is None else output.expanduser()
-    if not target.absolute().parent.is_dir():
-        raise InputError(f"{target.absolute().parent}: no such folder; make it first")
     if format in ("colmap", "nerfstudio"):
         return target
     if target.is_dir():
@@ -109,11 +117,27 @@ def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
     return target
 
 
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror or error}; name another folder") from None
+
+
 def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     voxel = options.voxel or VOXEL * run.record.scene_depth
     grid = fused(surface_views(run, options.device, line), voxel, FARTHEST * run.record.scene_depth)
     with line.working("extracting the surface"):
         write_mesh(target, without_floating_parts(extracted(grid)))
+
+
+def _page(run: FinishedRun, target: Path) -> None:
+    """Write the page, and show the link to it in the run's report if it lies beside it under its default name."""
+    upright = level(run.poses, run.record.scene_depth)
+    state = moved(run.gaussians, upright.R, upright.scale)
+    write_splat_page(target, run.folder.absolute().name, state, viewer_settings(run, upright))
+    if target.resolve() == (run.folder / DEFAULT_NAMES["html"]).resolve():
+        show_link_to_map(run.folder / "report.html")
 
 
 def _dataset(run: FinishedRun, target: Path, format: str, line: ProgressLine) -> None:

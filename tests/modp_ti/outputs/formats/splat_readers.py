@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import gzip
+import json
 import struct
+import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData
@@ -112,4 +115,47 @@ def read_compressed_ply(path: Path) -> State:
     }
 
 
-READERS = {"splat": read_splat, "spz": read_spz, "compressed-ply": read_compressed_ply}
+def read_sog(path: Path) -> State:
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+
+        def pixels(part: dict, number: int = 0) -> NDArray:
+            data = np.frombuffer(archive.read(part["files"][number]), np.uint8)
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+            if image.shape[2] == 3:
+                image = np.dstack([image, np.full(image.shape[:2], 255, np.uint8)])
+            return image[..., [2, 1, 0, 3]].reshape(-1, 4).astype(np.int64)
+
+        count = meta["count"]
+        assert (meta["version"], meta["model"]) == (2, "antialiased")
+        means = meta["means"]
+        steps = (pixels(means, 0) + 256 * pixels(means, 1))[:count, :3]
+        place = means["mins"] + steps / 65535 * (np.array(means["maxs"]) - means["mins"])
+        scales = np.array(meta["scales"]["codebook"])[pixels(meta["scales"])[:count, :3]]
+        quats = pixels(meta["quats"])[:count]
+        sh0 = pixels(meta["sh0"])[:count]
+        sh = np.array(meta["sh0"]["codebook"])[sh0[:, :3]][:, None]
+        if "shN" in meta:
+            coefficients = (meta["shN"]["bands"] + 1) ** 2 - 1
+            table = np.array(meta["shN"]["codebook"])[pixels(meta["shN"], 0)[:, :3]].reshape(-1, coefficients, 3)
+            labels = pixels(meta["shN"], 1)[:count]
+            label = labels[:, 0] + 256 * labels[:, 1]
+            assert label.max() < meta["shN"]["count"]
+            sh = np.concatenate([sh, table[label]], axis=1)
+    quaternion = np.zeros((count, 4))  # w, x, y, z
+    for row, (a, b, c, largest) in zip(quaternion, quats.tolist(), strict=True):
+        three = [(value / 255 * 2 - 1) * np.sqrt(0.5) for value in (a, b, c)]
+        for place_of in range(4):
+            if place_of != largest - 252:
+                row[place_of] = three.pop(0)
+        row[largest - 252] = np.sqrt(1 - (row**2).sum())
+    return {
+        "position": np.sign(place) * (np.exp(np.abs(place)) - 1),
+        "log_scale": scales,
+        "sh": sh,
+        "opacity_logit": logit(sh0[:, 3] / 255),
+        "quaternion": quaternion,
+    }
+
+
+READERS = {"splat": read_splat, "spz": read_spz, "sog": read_sog, "compressed-ply": read_compressed_ply}
