@@ -1,4 +1,4 @@
-"""Writer of `.sog`, PlayCanvas's compressed splats, version 2: a zip archive of lossless WebP images and `meta.json`.
+"""`.sog`, PlayCanvas's compressed splats, version 2: a zip archive of lossless WebP images and `meta.json`.
 
 Pixel i of an image belongs to Gaussian i, row by row. Images have red, green, blue and alpha in 8 bits each.
 
@@ -19,14 +19,25 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.atomic import replace_file
-from modp_ti.outputs.formats.compressed_splats import morton_order, opacities, smallest_three, to_bits, unit_quaternions
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.splat_packing import (
+    logits,
+    morton_order,
+    opacities,
+    smallest_three,
+    to_bits,
+    unit_quaternions,
+    with_largest,
+)
 
-__all__ = ["sog_bytes", "write_sog"]
+__all__ = ["read_sog", "sog_bytes", "write_sog"]
 
 CODES = 256
 # Rounds of Lloyd's algorithm for a codebook and for the palette.
@@ -36,6 +47,8 @@ LARGEST_PALETTE, SHARE = 1 << 12, 16
 ENTRIES_PER_ROW = 64
 # Gaussians whose distances to the palette are computed at once.
 BLOCK = 4096
+# Largest image, and largest meta.json, that is read [px, bytes].
+MOST_PIXELS, MOST_TEXT = 1 << 27, 1 << 20
 
 
 def write_sog(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
@@ -77,7 +90,7 @@ def sog_bytes(state: Mapping[str, NDArray]) -> bytes:
     add("quats", to_bits(others * np.sqrt(0.5) + 0.5, 8), 252 + largest)
     constant_codes, constants = codebook(state["sh"][:, 0])
     add("sh0", constants, to_bits(opacities(state), 8))
-    meta = {
+    meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "MODP-Ti"},
         "count": count,
@@ -103,6 +116,73 @@ def sog_bytes(state: Mapping[str, NDArray]) -> bytes:
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
     return _archive(meta, images)
+
+
+def read_sog(data: bytes, path: Path) -> dict[str, NDArray]:
+    """Read the content of a `.sog` file of version 2.
+
+    Args:
+        data: The content.
+        path: The file, for error messages.
+
+    Returns:
+        Gaussians by name, as `GaussianField.load` takes them.
+
+    Raises:
+        InputError: If the file is damaged or of another version.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if archive.getinfo("meta.json").file_size > MOST_TEXT:
+                raise ValueError("a large meta.json")
+            return _read(archive, json.loads(archive.read("meta.json")))
+    except InputError:
+        raise
+    # What the archive, the images and their numbers raise where they are damaged.
+    except (zipfile.BadZipFile, KeyError, ValueError, TypeError, IndexError, OSError, AttributeError, RuntimeError):
+        raise InputError(f"{path}: not a .sog file of version 2, or a damaged one") from None
+
+
+def _read(archive: zipfile.ZipFile, meta: dict[str, Any]) -> dict[str, NDArray]:
+    count = meta["count"]
+    if meta["version"] != 2 or not isinstance(count, int) or count < 1:
+        raise ValueError("another version")
+    means, harmonics = meta["means"], meta.get("shN")
+    low, high = (np.array(means[bound], np.float64).reshape(3) for bound in ("mins", "maxs"))
+    files = means["files"]
+    steps = _pixels(archive, files[0])[:count, :3] + 256.0 * _pixels(archive, files[1])[:count, :3]
+    place = low + steps / 65535.0 * (high - low)
+    quats = _pixels(archive, meta["quats"]["files"][0])[:count]
+    constant = _pixels(archive, meta["sh0"]["files"][0])[:count]
+    sh = np.array(meta["sh0"]["codebook"], np.float64)[constant[:, :3]][:, None]
+    if harmonics is not None:
+        coefficients = (harmonics["bands"] + 1) ** 2 - 1
+        entries = np.array(harmonics["codebook"], np.float64)[_pixels(archive, harmonics["files"][0])[:, :3]]
+        labels = _pixels(archive, harmonics["files"][1])[:count].astype(np.int64)
+        rest = entries.reshape(-1, coefficients, 3)[labels[:, 0] + 256 * labels[:, 1]]
+        sh = np.concatenate([sh, rest], axis=1)
+    largest = quats[:, 3].astype(np.int64) - 252
+    if not len(steps) == len(quats) == len(constant) == count or largest.min() < 0:
+        raise ValueError("images of different sizes")
+    return {
+        "position": np.sign(place) * np.expm1(np.abs(place)),
+        "log_scale": np.array(meta["scales"]["codebook"], np.float64)[
+            _pixels(archive, meta["scales"]["files"][0])[:count, :3]
+        ],
+        "quaternion": with_largest(largest, (quats[:, :3] / 255.0 * 2.0 - 1.0) * np.sqrt(0.5)),
+        "opacity_logit": logits(constant[:, 3] / 255.0),
+        "sh": sh,
+    }
+
+
+def _pixels(archive: zipfile.ZipFile, name: str) -> NDArray[np.uint8]:
+    """Return the pixels (N, 4) of an image in the archive, row by row."""
+    from PIL import Image
+
+    with archive.open(name) as file, Image.open(io.BytesIO(file.read()), formats=["WEBP"]) as image:
+        if image.width * image.height > MOST_PIXELS:
+            raise ValueError("a large image")
+        return np.asarray(image.convert("RGBA")).reshape(-1, 4)
 
 
 def codebook(values: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

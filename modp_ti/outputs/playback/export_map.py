@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.compressed_splats import write_compressed_ply, write_spz, write_web_splat
+from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
 from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
 from modp_ti.outputs.formats.sog import write_sog
+from modp_ti.outputs.formats.splat_glb import write_splat_glb
+from modp_ti.outputs.formats.spz import DEFAULT_VERSION, write_spz
+from modp_ti.outputs.formats.web_splat import write_web_splat
 from modp_ti.outputs.playback.film import is_video
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.flight import film, plan_flight
@@ -33,12 +36,13 @@ DEFAULT_NAMES = {
     "spz": "splats.spz",
     "sog": "splats.sog",
     "compressed-ply": "splats.compressed.ply",
+    "splat-glb": "splats.glb",
     "html": "map.html",
     "colmap": "colmap-dataset",
     "nerfstudio": "nerfstudio",
     "video": "recorded.mp4",
 }
-SPLATS = {"spz": write_spz, "sog": write_sog, "compressed-ply": write_compressed_ply}
+SPLATS = {"sog": write_sog, "compressed-ply": write_compressed_ply, "splat-glb": write_splat_glb}
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL = 1 / 160
 FARTHEST = 4.0
@@ -51,10 +55,12 @@ class ExportOptions:
     Attributes:
         voxel: Edge of the mesh's voxels [scene units], None for VOXEL times the scene's depth.
         device: Device for rendering.
+        spz_version: Version of `.spz` to write.
     """
 
     voxel: float | None = None
     device: str = "auto"
+    spz_version: int = DEFAULT_VERSION
 
 
 def export_map(run: FinishedRun, format: str, output: Path | None, options: ExportOptions, line: ProgressLine) -> Path:
@@ -84,6 +90,9 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         elif format == "splat":
             start_device(options.device)
             write_web_splat(target, with_plain_colours(run, line))
+        elif format == "spz":
+            with line.working("writing splats"):
+                write_spz(target, run.gaussians, options.spz_version)
         elif format in SPLATS:
             with line.working("writing splats"):
                 SPLATS[format](target, run.gaussians)
@@ -106,7 +115,9 @@ def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
         return target
     if target.is_dir():
         raise InputError(f"{target}: is a folder; name a file, for example {target / DEFAULT_NAMES[format]}")
-    wanted = {"mesh": MESH_SUFFIXES, "points": (".ply",), "compressed-ply": (".ply",)}.get(format, (f".{format}",))
+    wanted = {"mesh": MESH_SUFFIXES, "points": (".ply",), "compressed-ply": (".ply",), "splat-glb": (".glb",)}.get(
+        format, (f".{format}",)
+    )
     if format == "video":
         if not is_video(target):
             raise InputError(f"{target}: a video's name ends in .mp4 or .webm")

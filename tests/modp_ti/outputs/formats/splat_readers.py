@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 from plyfile import PlyData
 
@@ -36,9 +37,21 @@ def read_splat(path: Path) -> State:
 
 
 def read_spz(path: Path) -> State:
-    data = gzip.decompress(path.read_bytes())
+    data = path.read_bytes()
+    if data[:4] == b"NGSP":
+        streams, table = data[15], struct.unpack_from("<I", data, 16)[0]
+        sizes = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(streams)]
+        at, content = table + 16 * streams, data[:15] + b"\0"
+        for there, here in sizes:
+            content += zstandard.ZstdDecompressor().decompress(data[at : at + there], max_output_size=here)
+            at += there
+        assert at == len(data)
+        data = content
+    else:
+        data = gzip.decompress(data)
+        assert struct.unpack_from("<I", data, 4)[0] < 4
     magic, version, count, degree, fractional, flags, reserved = struct.unpack_from("<IIIBBBB", data)
-    assert (magic, version, flags, reserved) == (0x5053474E, 3, 1, 0)
+    assert (magic, flags, reserved) == (0x5053474E, 1, 0)
     at = 16
 
     def take(each: int) -> NDArray:
@@ -50,12 +63,17 @@ def read_spz(path: Path) -> State:
     places = take(9).reshape(count, 3, 3)
     fixed = places[..., 0] + (places[..., 1] << 8) + (places[..., 2] << 16)
     fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
-    alphas, colours, scales, rotations = take(1)[:, 0], take(3), take(3), take(4)
+    alphas, colours, scales, rotations = take(1)[:, 0], take(3), take(3), take(3 if version == 2 else 4)
     coefficients = (degree + 1) ** 2 - 1
     rest = (take(3 * coefficients).reshape(count, coefficients, 3) - 128) / 128
     assert at == len(data)
     quaternion = np.zeros((count, 4))
-    for row, (a, b, c, d) in zip(quaternion, rotations.tolist(), strict=True):
+    for row, (a, b, c, *more) in zip(quaternion, rotations.tolist(), strict=True):
+        if version == 2:
+            row[:3] = [value / 127.5 - 1 for value in (a, b, c)]
+            row[3] = np.sqrt(max(1 - (row[:3] ** 2).sum(), 0))
+            continue
+        d = more[0]
         word = a | b << 8 | c << 16 | d << 24
         largest = word >> 30
         for place in (3, 2, 1, 0):  # x, y, z, w from the high bits down
