@@ -106,8 +106,7 @@ def test_a_file_of_splats_is_shown_without_a_run(tmp_path: Path):
         viewer.serve(lambda: bool(got))
     finally:
         viewer.close()
-    seen = got[0].max(axis=2) > 128
-    assert seen[24:40, 36:60].mean() > 0.9 and not seen[0].any()  # the wall is in the middle
+    assert (got[0].max(axis=2) > 128).mean() > 0.9  # the wall fills this narrow view
 
 
 def test_the_chosen_frame_is_shown_with_its_picture(run: FinishedRun):
