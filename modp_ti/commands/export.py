@@ -13,6 +13,7 @@ from modp_ti.commands.shared import AsJson, Device, Quiet, examples, outcome, pr
 __all__ = ["EXAMPLES", "export"]
 
 EXAMPLES = examples(
+    "modp-ti export out/room --format html   (one page for a friend)",
     "modp-ti export out/room --format mesh   (out/room/mesh.ply)",
     "modp-ti export out/room --format mesh -o room.glb   (for browsers)",
     "modp-ti export out/room --format spz   (splats, 1/5 to 1/4 of the size)",
@@ -27,7 +28,10 @@ class Format(str, Enum):
     mesh = "mesh"
     splat = "splat"
     spz = "spz"
+    sog = "sog"
     compressed_ply = "compressed-ply"
+    splat_glb = "splat-glb"
+    html = "html"
     colmap = "colmap"
     nerfstudio = "nerfstudio"
     video = "video"
@@ -40,30 +44,31 @@ def export(
         typer.Option(
             "--format",
             "-f",
-            help="`points`: coloured points (PLY); `mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, "
-            "`compressed-ply`: splats, small, for viewers; `colmap`, `nerfstudio`: images with poses and points, to "
-            "train on; `video`: the recorded path",
+            help="`html`: a page that shows the map in any browser, without network; `points`: coloured points (PLY); "
+            "`mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, `sog`, `compressed-ply`, `splat-glb`: "
+            "splats for viewers; `colmap`, `nerfstudio`: images with poses and points, to train on; `video`: the path",
         ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="PATH", help="file or new folder; empty: in OUT, see docs/export.md"),
+        typer.Option("--output", "-o", metavar="PATH", help="file or new folder; empty: in OUT"),
     ] = None,
     voxel: Annotated[
         float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
     ] = None,
+    spz_version: Annotated[int, typer.Option(min=2, max=4, help="`spz`: version of the format, 2 to 4")] = 3,
     device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a finished map as points, mesh, compressed splats, data set or video."""
+    """Write a finished map as web page, points, mesh, compressed splats, data set or video."""
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.outputs.playback.export_map import ExportOptions, export_map
         from modp_ti.outputs.playback.finished_run import open_run
         from modp_ti.outputs.progress import ProgressLine
 
-        options = ExportOptions(voxel or None, device.value)
+        options = ExportOptions(voxel or None, device.value, spz_version)
         line = ProgressLine(progress_console(quiet))
         with line.working("reading the run"):
             run = open_run(out)

@@ -1,4 +1,4 @@
-"""`modp-ti view OUT`: shows a finished map in the browser."""
+"""`modp-ti view OUT`: shows a finished map, or a file of splats, in the browser."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from modp_ti.commands.shared import Device, Quiet, examples, outcome, progress_c
 
 __all__ = ["EXAMPLES", "view"]
 
-EXAMPLES = examples("modp-ti view out/room", "modp-ti view out/room --port 0 --max-splats 1000000")
+EXAMPLES = examples(
+    "modp-ti view out/room", "modp-ti view scene.spz", "modp-ti view out/room --port 0 --max-splats 1000000"
+)
 
 
 def view(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run, or a file of splats")],
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="address to serve at; 0.0.0.0 is for all that reach this machine")
     ] = "127.0.0.1",
@@ -24,15 +26,16 @@ def view(
     device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
 ) -> None:
-    """Show a finished map as a web page, until Ctrl-C."""
+    """Show a finished map, or any splats, as a web page, until Ctrl-C."""
     with outcome(as_json=False):
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.config.settings import ViewSettings
         from modp_ti.outputs.playback.finished_run import open_run
+        from modp_ti.outputs.playback.splat_file import open_splats
         from modp_ti.outputs.progress import ProgressLine
         from modp_ti.outputs.viewer.finished import FinishedViewer
 
-        run = open_run(out)
+        run = open_splats(out.expanduser()) if out.expanduser().is_file() else open_run(out)
         settings = ViewSettings(enabled=True, host=host, port=port, max_splats=max_splats)
         with ProgressLine(progress_console(quiet)).working("reading the map"):
             viewer = FinishedViewer(run, settings, device.value)

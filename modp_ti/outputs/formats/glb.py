@@ -14,16 +14,17 @@ from __future__ import annotations
 import json
 import os
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.atomic import replace_file
 
-__all__ = ["write_glb"]
+__all__ = ["glb_bytes", "linear_colours", "write_glb"]
 
-UINT16, UINT32, FLOAT32 = 5123, 5125, 5126
-TRIANGLES, VERTICES, INDICES = 4, 34962, 34963
+UINT8, UINT16, UINT32, FLOAT32 = 5121, 5123, 5125, 5126
+POINTS, TRIANGLES, VERTICES, INDICES = 0, 4, 34962, 34963
 
 
 def write_glb(
@@ -38,9 +39,8 @@ def write_glb(
         colours: (V, 3) sRGB colours in [0, 1].
     """
     positions = np.ascontiguousarray(vertices, "<f4")
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     rgba = np.ones((len(positions), 4))
-    rgba[:, :3] = linear
+    rgba[:, :3] = linear_colours(colours)
     parts = (
         np.ascontiguousarray(triangles, "<u4").tobytes(),
         positions.tobytes(),
@@ -76,8 +76,17 @@ def write_glb(
         "bufferViews": views,
         "buffers": [{"byteLength": starts[-1]}],
     }
+    replace_file(path, glb_bytes(document, b"".join(parts)))
+
+
+def linear_colours(colours: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the linear values of sRGB colours in [0, 1]."""
+    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+
+
+def glb_bytes(document: dict[str, Any], body: bytes) -> bytes:
+    """Return the content of a file with this JSON part and this buffer, whose length is a multiple of four bytes."""
     head = json.dumps(document, separators=(",", ":")).encode("ascii")
     head += b" " * (-len(head) % 4)
-    body = b"".join(parts)  # the length of every part is a multiple of four bytes
     chunks = struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(body), b"BIN\0") + body
-    replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -15,8 +15,10 @@ from modp_ti.files.ply import parse_ply_header
 
 __all__ = ["read_splats", "write_splats"]
 
-# The filter that the map was optimised with. Other renderers must use the same to reproduce the images.
-COMMENT = "rendered with 0.3 px^2 blur and mip-splatting opacity compensation (antialiased)"
+# The filter that the map was optimised with: 0.3 px^2 of blur and the opacity compensation of mip-splatting. Other
+# renderers must use the same to reproduce the images. Brush and splat-transform read this comment and do so by
+# themselves.
+COMMENT = "SplatRenderMode: mip"
 
 
 def _names(sh_count: int) -> list[str]:

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.compressed_splats import write_compressed_ply, write_spz, write_web_splat
+from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
 from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
+from modp_ti.outputs.formats.sog import write_sog
+from modp_ti.outputs.formats.splat_glb import write_splat_glb
+from modp_ti.outputs.formats.spz import DEFAULT_VERSION, write_spz
+from modp_ti.outputs.formats.web_splat import write_web_splat
 from modp_ti.outputs.playback.film import is_video
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.flight import film, plan_flight
@@ -18,6 +22,9 @@ from modp_ti.outputs.playback.mapped_images import dataset_names, write_images
 from modp_ti.outputs.playback.plain_colours import with_plain_colours
 from modp_ti.outputs.playback.surface import surface_views
 from modp_ti.outputs.progress import ProgressLine
+from modp_ti.outputs.report.page import show_link_to_map
+from modp_ti.outputs.splat_page.flight import level, moved, viewer_settings
+from modp_ti.outputs.splat_page.page import write_splat_page
 
 __all__ = ["DEFAULT_NAMES", "export_map"]
 
@@ -27,12 +34,15 @@ DEFAULT_NAMES = {
     "mesh": "mesh.ply",
     "splat": "splats.splat",
     "spz": "splats.spz",
+    "sog": "splats.sog",
     "compressed-ply": "splats.compressed.ply",
+    "splat-glb": "splats.glb",
+    "html": "map.html",
     "colmap": "colmap-dataset",
     "nerfstudio": "nerfstudio",
     "video": "recorded.mp4",
 }
-SPLATS = {"spz": write_spz, "compressed-ply": write_compressed_ply}
+SPLATS = {"sog": write_sog, "compressed-ply": write_compressed_ply, "splat-glb": write_splat_glb}
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL = 1 / 160
 FARTHEST = 4.0
@@ -45,10 +55,12 @@ class ExportOptions:
     Attributes:
         voxel: Edge of the mesh's voxels [scene units], None for VOXEL times the scene's depth.
         device: Device for rendering.
+        spz_version: Version of `.spz` to write.
     """
 
     voxel: float | None = None
     device: str = "auto"
+    spz_version: int = DEFAULT_VERSION
 
 
 def export_map(run: FinishedRun, format: str, output: Path | None, options: ExportOptions, line: ProgressLine) -> Path:
@@ -68,6 +80,7 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         InputError: If the export is not possible.
     """
     target = _target(run, format, output)
+    _make_folder(target.absolute().parent)
     try:
         if format == "points":
             with line.working("writing points"):
@@ -77,9 +90,15 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         elif format == "splat":
             start_device(options.device)
             write_web_splat(target, with_plain_colours(run, line))
+        elif format == "spz":
+            with line.working("writing splats"):
+                write_spz(target, run.gaussians, options.spz_version)
         elif format in SPLATS:
             with line.working("writing splats"):
                 SPLATS[format](target, run.gaussians)
+        elif format == "html":
+            with line.working("writing the page"):
+                _page(run, target)
         elif format == "video":
             film(run, plan_flight(run, "recorded"), target, False, options.device, line)
         else:
@@ -92,13 +111,13 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
 def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
     """Return the output path. Raises InputError if it is not usable, before anything is computed."""
     target = run.folder / DEFAULT_NAMES[format] if output is None else output.expanduser()
-    if not target.absolute().parent.is_dir():
-        raise InputError(f"{target.absolute().parent}: no such folder; make it first")
     if format in ("colmap", "nerfstudio"):
         return target
     if target.is_dir():
         raise InputError(f"{target}: is a folder; name a file, for example {target / DEFAULT_NAMES[format]}")
-    wanted = {"mesh": MESH_SUFFIXES, "points": (".ply",), "compressed-ply": (".ply",)}.get(format, (f".{format}",))
+    wanted = {"mesh": MESH_SUFFIXES, "points": (".ply",), "compressed-ply": (".ply",), "splat-glb": (".glb",)}.get(
+        format, (f".{format}",)
+    )
     if format == "video":
         if not is_video(target):
             raise InputError(f"{target}: a video's name ends in .mp4 or .webm")
@@ -109,11 +128,27 @@ def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
     return target
 
 
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror or error}; name another folder") from None
+
+
 def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     voxel = options.voxel or VOXEL * run.record.scene_depth
     grid = fused(surface_views(run, options.device, line), voxel, FARTHEST * run.record.scene_depth)
     with line.working("extracting the surface"):
         write_mesh(target, without_floating_parts(extracted(grid)))
+
+
+def _page(run: FinishedRun, target: Path) -> None:
+    """Write the page, and show the link to it in the run's report if it lies beside it under its default name."""
+    upright = level(run.poses, run.record.scene_depth)
+    state = moved(run.gaussians, upright.R, upright.scale)
+    write_splat_page(target, run.folder.absolute().name, state, viewer_settings(run, upright))
+    if target.resolve() == (run.folder / DEFAULT_NAMES["html"]).resolve():
+        show_link_to_map(run.folder / "report.html")
 
 
 def _dataset(run: FinishedRun, target: Path, format: str, line: ProgressLine) -> None:

@@ -21,7 +21,11 @@ from modp_ti.outputs.report.pictures import FULL_SCALE, Comparison, as_uri, erro
 from modp_ti.outputs.report.plan import floor_plan, plan_of
 from modp_ti.outputs.report.record import RunRecord
 
-__all__ = ["ReportedRun", "write_report"]
+__all__ = ["ReportedRun", "show_link_to_map", "write_report"]
+
+# The link to the page that `modp-ti export --format html` writes, hidden while there is none.
+MAP_PAGE = "map.html"
+HIDDEN_LINK, SHOWN_LINK = '<p id="map" hidden>', '<p id="map">'
 
 
 @dataclass(frozen=True)
@@ -75,8 +79,19 @@ def write_report(path: Path, run: ReportedRun) -> None:
         drawings={name: as_uri("svg+xml", svg.encode("utf-8")) for name, svg in _drawings(run).items()},
         scale=_scale(),
         full_scale=FULL_SCALE,
+        map_page=MAP_PAGE,
     )
     replace_text(path, page)
+    if (path.parent / MAP_PAGE).exists():
+        show_link_to_map(path)
+
+
+def show_link_to_map(path: Path) -> None:
+    """Show the link to `map.html` in a report that was written before it. Does nothing without a report."""
+    if path.is_file():
+        page = path.read_text("utf-8")
+        if HIDDEN_LINK in page:
+            replace_text(path, page.replace(HIDDEN_LINK, SHOWN_LINK))
 
 
 def _drawings(run: ReportedRun) -> dict[str, str]:

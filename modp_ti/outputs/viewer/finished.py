@@ -38,7 +38,7 @@ class FinishedViewer:
     the page shows the chosen frame's image and offers the error mode.
 
     Args:
-        run: The finished run.
+        run: The finished run, or a file of splats (`open_splats`).
         settings: The viewer's settings.
         device: "cpu", "cuda", "vulkan", "metal" or "auto".
 
@@ -64,9 +64,8 @@ class FinishedViewer:
         self.page.show_keyframes(run.poses[keyframes], run.cameras[keyframes[0]])
         self.page.show_points(points)
         self.page.show_splats(splats_of(gaussians, self.page.units, settings.max_splats))
-        self.page.show_numbers(
-            f"**{len(run)}** frames, {len(keyframes)} keyframes  \n{len(gaussians['position']):,} Gaussians"
-        )
+        frames = f"**{len(run)}** frames, {len(keyframes)} keyframes  \n" if run.folder.is_dir() else ""
+        self.page.show_numbers(f"{frames}{len(gaussians['position']):,} Gaussians")
         self._show_frame(0)
         self._renderer.view(PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16), run.poses[0])  # compiles the kernels
 
@@ -129,7 +128,9 @@ def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
 
 
 def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:
-    """Return the points (N, 3) of the run's COLMAP model, at most MAX_POINTS of them."""
+    """Return the points (N, 3) of the run's COLMAP model, at most MAX_POINTS of them. None of a file of splats."""
+    if not run.folder.is_dir():
+        return np.zeros((0, 3))
     points = read_colmap_model(run.folder / "colmap").points3D
     xyz = np.array([points[number].xyz for number in sorted(points)]).reshape(-1, 3)
     return xyz if len(xyz) <= MAX_POINTS else xyz[np.arange(MAX_POINTS) * len(xyz) // MAX_POINTS]

@@ -290,7 +290,7 @@ def test_wrong_options_end_with_two(arguments):
     assert "Usage:" in result.stderr
 
 
-COMMANDS = ["run", "batch", "cameras", "check", "render", "export", "locate", "view", "warmup"]
+COMMANDS = ["run", "batch", "cameras", "check", "render", "export", "convert", "locate", "view", "warmup"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -361,7 +361,7 @@ HEAVY_TO_COMPLETE = "('taichi', 'quadrants', 'torch', 'open3d', 'pycolmap', 'mat
     [
         ("modp-ti ", COMMANDS),
         ("modp-ti run scene.yaml --q", ["--quiet"]),
-        ("modp-ti export out --format sp", ["splat", "spz"]),
+        ("modp-ti export out --format sp", ["splat", "spz", "splat-glb"]),
         ("modp-ti render out --path ", ["recorded", "smoothed", "orbit"]),
         ("modp-ti run scene.yaml --set source.sc", ["source.scale=auto"]),
         ("modp-ti run scene.yaml --set tracker.kind=t", ["tracker.kind=transforms", "tracker.kind=tum"]),

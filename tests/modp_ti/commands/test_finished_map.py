@@ -27,7 +27,12 @@ from modp_ti.outputs.playback.map_renderer import MapRenderer
 from tests.modp_ti.outputs.formats.splat_readers import READERS
 from tests.room import HIGH, LOW
 
-DEFAULTS = {"splat": "splats.splat", "spz": "splats.spz", "compressed-ply": "splats.compressed.ply"}
+DEFAULTS = {
+    "splat": "splats.splat",
+    "spz": "splats.spz",
+    "sog": "splats.sog",
+    "compressed-ply": "splats.compressed.ply",
+}
 
 
 pytestmark = pytest.mark.slow
@@ -170,7 +175,7 @@ def renderer(out: Path, taichi_on_the_cpu: None) -> Callable[[], MapRenderer]:
 
 
 def test_every_form_of_the_splats_shows_the_same_map(out: Path, renderer: Callable[[], MapRenderer]) -> None:
-    """Read by another implementation: at most 0.01 dB from ours for the PLY, half a decibel for what is compressed."""
+    """Read by another implementation: at most 0.01 dB from ours for the PLY, 0.3 of 38 dB for what is compressed."""
     vertex = PlyData.read(out / "splats.ply")["vertex"]
     rest = [p.name for p in vertex.properties if p.name.startswith("f_rest_")]
 
@@ -199,7 +204,22 @@ def test_every_form_of_the_splats_shows_the_same_map(out: Path, renderer: Callab
     clipped = psnr(show, out, {**ply, "sh": (held - 0.5) / 0.2820948})
     for form, path in files.items():
         there = psnr(show, out, READERS[form](path))
-        assert there > clipped if form == "splat" else abs(there - ours) <= 0.5, form
+        assert there > clipped if form == "splat" else abs(there - ours) <= 0.3, form
+
+
+def test_an_export_makes_the_folder_that_it_writes_into(out: Path, tmp_path: Path) -> None:
+    assert done("export", out, "--format", "points", "-o", tmp_path / "new" / "folder" / "p.ply").is_file()
+    failure("export", out, "--format", "points", "-o", tmp_path / "other" / "p.glb")
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_report_links_to_the_page_of_the_map_once_it_is_there(out: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(out, tmp_path / "run")
+    (run / "report.html").write_text('<p id="map" hidden><a href="map.html">the map in 3D</a></p>')
+    done("export", run, "--format", "html", "-o", tmp_path / "elsewhere.html")
+    assert "hidden" in (run / "report.html").read_text()
+    assert done("export", run, "--format", "html") == run / "map.html"
+    assert (run / "report.html").read_text() == '<p id="map"><a href="map.html">the map in 3D</a></p>'
 
 
 def test_points_are_the_opaque_gaussians(out: Path, tmp_path: Path) -> None:
@@ -288,7 +308,7 @@ def failure(*arguments: str | Path) -> str:
     ("arguments", "part"),
     [
         (["--format", "mesh", "-o", "m.stl"], "--format mesh writes a file in .ply, .glb, .obj"),
-        (["--format", "spz", "-o", "none/here.spz"], "no such folder; make it first"),
+        (["--format", "spz", "-o", "{out}/splats.ply/here.spz"], "cannot be made: "),
         (["--format", "points", "-o", "{out}/splats.ply"], "is the map itself"),
         (["--format", "video", "-o", "film.avi"], "in .mp4 or .webm"),
     ],

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import json
 import struct
+import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 from plyfile import PlyData
 
@@ -33,9 +37,21 @@ def read_splat(path: Path) -> State:
 
 
 def read_spz(path: Path) -> State:
-    data = gzip.decompress(path.read_bytes())
+    data = path.read_bytes()
+    if data[:4] == b"NGSP":
+        streams, table = data[15], struct.unpack_from("<I", data, 16)[0]
+        sizes = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(streams)]
+        at, content = table + 16 * streams, data[:15] + b"\0"
+        for there, here in sizes:
+            content += zstandard.ZstdDecompressor().decompress(data[at : at + there], max_output_size=here)
+            at += there
+        assert at == len(data)
+        data = content
+    else:
+        data = gzip.decompress(data)
+        assert struct.unpack_from("<I", data, 4)[0] < 4
     magic, version, count, degree, fractional, flags, reserved = struct.unpack_from("<IIIBBBB", data)
-    assert (magic, version, flags, reserved) == (0x5053474E, 3, 1, 0)
+    assert (magic, flags, reserved) == (0x5053474E, 1, 0)
     at = 16
 
     def take(each: int) -> NDArray:
@@ -47,12 +63,17 @@ def read_spz(path: Path) -> State:
     places = take(9).reshape(count, 3, 3)
     fixed = places[..., 0] + (places[..., 1] << 8) + (places[..., 2] << 16)
     fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
-    alphas, colours, scales, rotations = take(1)[:, 0], take(3), take(3), take(4)
+    alphas, colours, scales, rotations = take(1)[:, 0], take(3), take(3), take(3 if version == 2 else 4)
     coefficients = (degree + 1) ** 2 - 1
     rest = (take(3 * coefficients).reshape(count, coefficients, 3) - 128) / 128
     assert at == len(data)
     quaternion = np.zeros((count, 4))
-    for row, (a, b, c, d) in zip(quaternion, rotations.tolist(), strict=True):
+    for row, (a, b, c, *more) in zip(quaternion, rotations.tolist(), strict=True):
+        if version == 2:
+            row[:3] = [value / 127.5 - 1 for value in (a, b, c)]
+            row[3] = np.sqrt(max(1 - (row[:3] ** 2).sum(), 0))
+            continue
+        d = more[0]
         word = a | b << 8 | c << 16 | d << 24
         largest = word >> 30
         for place in (3, 2, 1, 0):  # x, y, z, w from the high bits down
@@ -112,4 +133,47 @@ def read_compressed_ply(path: Path) -> State:
     }
 
 
-READERS = {"splat": read_splat, "spz": read_spz, "compressed-ply": read_compressed_ply}
+def read_sog(path: Path) -> State:
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+
+        def pixels(part: dict, number: int = 0) -> NDArray:
+            data = np.frombuffer(archive.read(part["files"][number]), np.uint8)
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+            if image.shape[2] == 3:
+                image = np.dstack([image, np.full(image.shape[:2], 255, np.uint8)])
+            return image[..., [2, 1, 0, 3]].reshape(-1, 4).astype(np.int64)
+
+        count = meta["count"]
+        assert (meta["version"], meta["model"]) == (2, "antialiased")
+        means = meta["means"]
+        steps = (pixels(means, 0) + 256 * pixels(means, 1))[:count, :3]
+        place = means["mins"] + steps / 65535 * (np.array(means["maxs"]) - means["mins"])
+        scales = np.array(meta["scales"]["codebook"])[pixels(meta["scales"])[:count, :3]]
+        quats = pixels(meta["quats"])[:count]
+        sh0 = pixels(meta["sh0"])[:count]
+        sh = np.array(meta["sh0"]["codebook"])[sh0[:, :3]][:, None]
+        if "shN" in meta:
+            coefficients = (meta["shN"]["bands"] + 1) ** 2 - 1
+            table = np.array(meta["shN"]["codebook"])[pixels(meta["shN"], 0)[:, :3]].reshape(-1, coefficients, 3)
+            labels = pixels(meta["shN"], 1)[:count]
+            label = labels[:, 0] + 256 * labels[:, 1]
+            assert label.max() < meta["shN"]["count"]
+            sh = np.concatenate([sh, table[label]], axis=1)
+    quaternion = np.zeros((count, 4))  # w, x, y, z
+    for row, (a, b, c, largest) in zip(quaternion, quats.tolist(), strict=True):
+        three = [(value / 255 * 2 - 1) * np.sqrt(0.5) for value in (a, b, c)]
+        for place_of in range(4):
+            if place_of != largest - 252:
+                row[place_of] = three.pop(0)
+        row[largest - 252] = np.sqrt(1 - (row**2).sum())
+    return {
+        "position": np.sign(place) * (np.exp(np.abs(place)) - 1),
+        "log_scale": scales,
+        "sh": sh,
+        "opacity_logit": logit(sh0[:, 3] / 255),
+        "quaternion": quaternion,
+    }
+
+
+READERS = {"splat": read_splat, "spz": read_spz, "sog": read_sog, "compressed-ply": read_compressed_ply}

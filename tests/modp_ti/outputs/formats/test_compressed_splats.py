@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.compressed_splats import write_compressed_ply, write_spz, write_web_splat
+from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
+from modp_ti.outputs.formats.spz import write_spz
+from modp_ti.outputs.formats.web_splat import write_web_splat
 from tests.modp_ti.outputs.formats.splat_readers import READERS
 from tests.pipelines.reference import sh_basis
 

@@ -19,6 +19,7 @@ from modp_ti.outputs.formats.frames_json import FramesRecord
 from modp_ti.outputs.formats.splats_ply import write_splats
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer
+from modp_ti.outputs.playback.splat_file import open_splats
 from modp_ti.outputs.viewer.finished import FinishedViewer
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import MODES, UNSEEN
@@ -91,6 +92,21 @@ def test_a_browser_at_a_frames_place_gets_the_frames_picture_in_every_mode(run: 
         assert got["opacity"].min() > 230
     finally:
         viewer.close()
+
+
+def test_a_file_of_splats_is_shown_without_a_run(tmp_path: Path):
+    write_splats(tmp_path / "wall.ply", wall())
+    run = open_splats(tmp_path / "wall.ply")
+    viewer = FinishedViewer(run, ViewSettings(port=0), "cpu")
+    got: list[np.ndarray] = []
+    viewer.page.show_picture = lambda client, picture: got.append(picture)
+    try:
+        viewer.page.requests.show("opacity")
+        looks(viewer, run.poses[0], 96, 64)
+        viewer.serve(lambda: bool(got))
+    finally:
+        viewer.close()
+    assert (got[0].max(axis=2) > 128).mean() > 0.9  # the wall fills this narrow view
 
 
 def test_the_chosen_frame_is_shown_with_its_picture(run: FinishedRun):
