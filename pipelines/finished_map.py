@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from pipelines.densify.densifier import Anchor
 from pipelines.online_map import OnlineMap
 from pipelines.render.cpu.photometric_model import IDENTITY
 
-__all__ = ["FinishedMap", "go_on_with", "placed_by"]
+__all__ = ["FinishedMap", "go_on_with", "placed_by", "take_in_frames", "take_in_gaussians"]
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,12 @@ class FinishedMap:
 
     Attributes:
         gaussians: The Gaussians, as from `GaussianField.to_numpy`.
-        frames: All of its frames in order, with their refined poses. They are iterated over once.
+        frames: All of its frames in order, with their refined poses, or the tracked ones if `poses` has the refined
+            ones. They are iterated over once.
         keyframes: Indices of the keyframes.
         exposures: Exposure (3, 4) by frame index, for the frames that have one.
         scene_depth: Depth of keyframes without tracked points [scene units].
+        poses: Refined T_camera_world (4, 4) by frame index, where it is not that of the frame.
     """
 
     gaussians: Mapping[str, NDArray]
@@ -35,6 +37,7 @@ class FinishedMap:
     keyframes: Collection[int]
     exposures: Mapping[int, NDArray[np.float64]]
     scene_depth: float
+    poses: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
 
 def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
@@ -51,7 +54,17 @@ def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
     Raises:
         ValueError: If the Gaussians do not fit the settings, or none of the keyframes is among the frames.
     """
-    mapper.gaussians.load(dict(finished.gaussians))
+    mapper.gaussians.load(dict(finished.gaussians))  # first, for the memory budget of the keyframes
+    take_in_frames(mapper, finished)
+    take_in_gaussians(mapper, finished.gaussians)
+
+
+def take_in_frames(mapper: OnlineMap, finished: FinishedMap) -> None:
+    """Take the frames of a finished map into a new one: their poses, and the keyframes as views.
+
+    Raises:
+        ValueError: If none of the keyframes is among the frames.
+    """
     unexposed = np.array(IDENTITY) if mapper.settings.exposure.enabled is True else None
     for frame in finished.frames:
         mapper.trajectory.add(frame)
@@ -60,13 +73,24 @@ def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
         mapper.frame_count += 1
         view = _view_of(mapper, frame, frame.index in finished.keyframes)
         if view is not None:
+            if frame.index in finished.poses:
+                view.T_camera_world = finished.poses[frame.index]
             view.exposure = finished.exposures.get(frame.index, unexposed)
             if len(view.points) == 0:
                 view.median_depth = finished.scene_depth
     if len(mapper.keyframes) == 0:
         raise ValueError("none of the map's keyframes is among its frames")
     mapper.keyframes.take_in_depths()
-    _restore_anchors(mapper, finished.gaussians["position"].astype(np.float64))
+
+
+def take_in_gaussians(mapper: OnlineMap, gaussians: Mapping[str, NDArray]) -> None:
+    """Take the Gaussians of a finished map into a new one that has its frames, with anchors, voxels and errors.
+
+    Raises:
+        ValueError: If the Gaussians do not fit the settings.
+    """
+    mapper.gaussians.load(dict(gaussians))
+    _restore_anchors(mapper, gaussians["position"].astype(np.float64))
     for view in mapper.keyframes:
         mapper.paging.gather([view])
         values = mapper.optimiser.compare(view, mapper.keyframes.scene_depth)

@@ -11,7 +11,7 @@ from typing import Any
 
 from modp_ti.files.atomic import replacing
 
-__all__ = ["SceneResult", "State", "as_row", "figures", "write_csv", "write_parquet"]
+__all__ = ["SceneResult", "State", "as_row", "figures", "last_stage", "write_csv", "write_parquet"]
 
 
 class State(str, Enum):
@@ -81,7 +81,7 @@ COUNTS = ("attempts", "frames", "keyframes", "gaussians", "resumed")
 
 def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a `SceneResult` from the content of `metrics.json`."""
-    stage = next(metrics[stage] for stage in ("refined", "online", "offline") if metrics.get(stage))
+    stage = last_stage(metrics)
     scored = "held_out" if stage["held_out"]["count"] else "all"
     of_run = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "ate_rmse")
     return {
@@ -91,6 +91,11 @@ def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
         "seconds": metrics["seconds"]["total"],
         "resumed": metrics["snapshots"]["resumed"],
     }
+
+
+def last_stage(metrics: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the entry of the final map in the content of `metrics.json`."""
+    return next(metrics[stage] for stage in ("refined", "online", "offline") if metrics.get(stage))
 
 
 def as_row(result: SceneResult) -> dict[str, Any]:

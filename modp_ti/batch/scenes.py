@@ -13,7 +13,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.bare_recording import is_recording, recorded_scene
 from modp_ti.tasks import Resources
 
-__all__ = ["SNAPSHOT_EVERY", "Scene", "read_scenes", "with_resources", "with_store"]
+__all__ = ["SNAPSHOT_EVERY", "Scene", "for_a_task", "read_scenes", "with_resources", "with_store"]
 
 # Frames between snapshots where the scene does not set `snapshot_every`.
 SNAPSHOT_EVERY = 50
@@ -70,6 +70,13 @@ def _read(path: Path, overrides: Sequence[str], preset: str | None, taken: list[
         config = load_scene(path, overrides, preset)
     if config.is_live:
         raise InputError(f"{path}: a live source has no place in a batch: map it with `modp-ti run`")
+    if config.parts is not None:
+        raise InputError(f"{path}: parts are mapped by tasks of their own: map it with `modp-ti run`, or remove parts")
+    return for_a_task(config)
+
+
+def for_a_task(config: SceneConfig) -> SceneConfig:
+    """Return a scene's settings for a run in a process that may be lost, and that nobody watches."""
     every = config.snapshot_every
     if every is None and config.can_be_resumed:
         every = SNAPSHOT_EVERY

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from modp_ti.commands.shared import (
+    Address,
     AsJson,
     Best,
     Fast,
     Overrides,
     Quiet,
+    Where,
     chosen_preset,
     examples,
     outcome,
@@ -34,13 +35,6 @@ UNFINISHED = 1
 GIGABYTE = 1 << 30
 
 
-class Where(str, Enum):
-    """The engines."""
-
-    local = "local"
-    ray = "ray"
-
-
 def batch(
     scenes: Annotated[
         list[Path], typer.Argument(metavar="SCENES...", help="scene files (YAML), videos and folders of images")
@@ -48,10 +42,7 @@ def batch(
     engine: Annotated[
         Where, typer.Option(help="`local`: processes on this machine; `ray`: a Ray cluster (extra `cluster`)")
     ] = Where.local,
-    address: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="`ray`: address of the cluster; empty: RAY_ADDRESS, or this machine"),
-    ] = None,
+    address: Address = None,
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, help="`local`: scenes at a time; empty: as many as the cores allow")
     ] = None,

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modp_ti.commands.shared import (
+    Address,
     AsJson,
     Best,
     Fast,
     Overrides,
     Quiet,
+    Where,
     chosen_preset,
     examples,
     outcome,
@@ -34,6 +36,7 @@ EXAMPLES = examples(
     "modp-ti run --stream 0 --view   (a camera; modp-ti cameras lists them)",
     "modp-ti run scene.yaml --set mode=offline --set output=out/3dgs",
     "modp-ti run second.yaml --onto OUT   (go on with a finished map)",
+    "modp-ti run scene.yaml --parts 4   (by several processes; docs/scale.md)",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
     "modp-ti run --replay OUT   (repeat a recorded realtime run)",
@@ -75,6 +78,16 @@ def run(
             "--onto", metavar="OUT", help="go on with the finished map of this output folder (docs/second_visit.md)"
         ),
     ] = None,
+    parts: Annotated[
+        int | None,
+        typer.Option(
+            "--parts", min=2, help="map the recording in so many parts, each by a task of its own, and merge their maps"
+        ),
+    ] = None,
+    engine: Annotated[
+        Where | None, typer.Option(help="of `--parts`: `local`, processes on this machine; `ray`, a Ray cluster")
+    ] = None,
+    address: Address = None,
     fast: Fast = False,
     best: Best = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
@@ -95,15 +108,21 @@ def run(
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
         if onto is not None:
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
-        if onto is not None and (resume is not None or replay is not None):
-            raise InputError("--onto is for a scene: a run that goes on or is repeated has its settings already")
+        if parts is not None:
+            overrides.append(f"parts={parts}")
+        for option, given in (("onto", onto), ("parts", parts)):
+            if given is not None and (resume is not None or replay is not None):
+                raise InputError(
+                    f"--{option} is for a scene: a run that goes on or is repeated has its settings already"
+                )
         preset = _preset(resume or replay, scene, fast, best)
         if len(sources) > 1 and (stream is not None or replay is not None):
             raise InputError("--stream and --replay need no scene file and no --resume: give one of them")
         if replay is not None:
             folder = _replay(replay, overrides, quiet)
         else:
-            folder = _run(scene, stream, resume, overrides, preset, quiet)
+            tasks = None if engine is None and address is None else (engine or Where.local, address)
+            folder = _run(scene, stream, resume, overrides, preset, quiet, tasks)
         result.text = f"written to {folder}"
         if as_json:
             metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
@@ -119,7 +138,13 @@ def _preset(resume: Path | None, scene: Path | None, fast: bool, best: bool) -> 
 
 
 def _run(
-    scene: Path | None, stream: str | None, resume: Path | None, overrides: list[str], preset: str | None, quiet: bool
+    scene: Path | None,
+    stream: str | None,
+    resume: Path | None,
+    overrides: list[str],
+    preset: str | None,
+    quiet: bool,
+    tasks: tuple[Where, str | None] | None,
 ) -> Path:
     snapshot = None
     if resume is not None:
@@ -134,7 +159,12 @@ def _run(
         config = _new_scene(scene, stream, overrides, preset)
     if config.output.exists() and not config.output.is_dir():
         raise InputError(f"{config.output}: output must be a folder, this is a file")
+    if config.parts is not None:
+        from modp_ti.parts.mapping import map_in_parts
 
+        return map_in_parts(config, *(tasks or (Where.local, None)), progress_console(quiet))
+    if tasks is not None:
+        raise InputError("--engine and --address are for --parts, whose tasks they carry out")
     from modp_ti.engine.session import run_scene
 
     return run_scene(config, progress_console(quiet), snapshot)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 __all__ = [
+    "Address",
     "AsJson",
     "Best",
     "Device",
@@ -30,6 +31,7 @@ __all__ = [
     "Outcome",
     "Overrides",
     "Quiet",
+    "Where",
     "chosen_preset",
     "examples",
     "matching_settings",
@@ -55,6 +57,13 @@ class Device(str, Enum):
     cuda = "cuda"
     vulkan = "vulkan"
     metal = "metal"
+
+
+class Where(str, Enum):
+    """The engines of tasks."""
+
+    local = "local"
+    ray = "ray"
 
 
 def matching_settings(incomplete: str) -> list[tuple[str, str]]:
@@ -88,6 +97,11 @@ Overrides = Annotated[
         help="sets a key of the scene file, for example --set source.scale=0.5; repeatable",
         autocompletion=matching_settings,
     ),
+]
+
+Address = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="`ray`: address of the cluster; empty: RAY_ADDRESS, or this machine"),
 ]
 
 

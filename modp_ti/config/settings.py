@@ -1,8 +1,8 @@
 """The settings of a scene as one strict model, `SceneConfig`.
 
 `modp_ti.config.scene_file` reads and writes its files. The cameras of `source` are defined in
-`modp_ti.config.camera_settings`, the `tracker` section in `modp_ti.config.tracker_settings`; `mapping`, `refine` and
-`offline` in `pipelines.settings`.
+`modp_ti.config.camera_settings`, the `tracker` section in `modp_ti.config.tracker_settings`; `evaluation`, `export`
+and `view` in `modp_ti.config.output_settings`; `mapping`, `refine` and `offline` in `pipelines.settings`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from fields.runtime.parallel import available_cores
 from modp_ti.config.camera_settings import IntrinsicsSettings, VrsSettings
+from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
 from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
 from pipelines.offline_settings import OfflineSettings
@@ -93,6 +94,11 @@ class SourceSettings(StrictModel):
     start: int = Field(default=0, ge=0, description="position of the first frame in the folder")
     stop: int | None = Field(default=None, ge=1, description="position after the last frame; empty: all frames")
     step: int = Field(default=1, ge=1, description="use every n-th frame")
+    part: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = Field(
+        default=None,
+        description="[first, end]: of the tracked frames, only those at the positions from `first` to before `end` are "
+        "mapped. The whole recording is tracked, and the same frames are held out. Empty: all of them",
+    )
     masks: Path | None = Field(
         default=None,
         description="folder of masks with the names and sizes of the images: white pixels are valid, black ones "
@@ -172,78 +178,9 @@ class SourceSettings(StrictModel):
     def _range_is_not_empty(self) -> SourceSettings:
         if self.stop is not None and self.stop <= self.start:
             raise ValueError(f"source.stop ({self.stop}) must be larger than source.start ({self.start})")
+        if self.part is not None and self.part[1] <= self.part[0]:
+            raise ValueError(f"source.part ends at {self.part[1]}, which must be larger than {self.part[0]}")
         return self
-
-
-class EvaluationSettings(StrictModel):
-    """The evaluation of the finished map."""
-
-    lpips_weights: Path | None = Field(
-        default=None,
-        description="folder with `alexnet-owt-7be5be79.pth` (torchvision) and `alex.pth` (the `lpips` package, v0.1); "
-        "empty: they are searched in torch's cache and in the installed package. Without them, LPIPS is null",
-    )
-
-
-class ExportSettings(StrictModel):
-    """Optional output files of a run."""
-
-    images: bool = Field(
-        default=False,
-        description="write the undistorted images to `colmap/images`. The cameras in `colmap/` belong to these images, "
-        "so other programs need them",
-    )
-    session: bool = Field(
-        default=False,
-        description="write `session.zip`, all that arrived in a realtime run and what was decided by the clock, with "
-        "which `modp-ti run --replay OUT` repeats it exactly",
-    )
-    report: bool = Field(
-        default=True, description="write `report.html`, a page with the metrics, plots, images and settings of the run"
-    )
-
-
-class ViewSettings(StrictModel):
-    """The live viewer."""
-
-    enabled: bool = Field(
-        default=False,
-        description="serve a web page that shows the growing map (docs/viewer.md). `view: true` is a short form, and "
-        "setting any other key of this section enables the viewer too",
-    )
-    host: str = Field(
-        default="127.0.0.1",
-        description="address of the server: 127.0.0.1 is reachable only from this machine, 0.0.0.0 from the network",
-    )
-    port: int = Field(
-        default=8080,
-        ge=0,
-        le=65535,
-        description="port of the server; if it is in use, the next free one; 0: any free port",
-    )
-    paused: bool = Field(
-        default=False, description="pause after the first frame until the run is continued in the browser"
-    )
-    max_cost: float = Field(
-        default=5.0,
-        gt=0,
-        le=100,
-        description="largest share of the mapping time [%] that the viewer uses; it updates less often instead",
-    )
-    max_splats: int = Field(
-        default=100_000,
-        ge=100,
-        description="largest number of splats in the browser. Of a larger map, a subset with enlarged splats is shown",
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_form(cls, given: object) -> object:
-        if isinstance(given, bool):
-            return {"enabled": given}
-        if isinstance(given, dict) and given and "enabled" not in given:
-            return {"enabled": True, **given}
-        return given
 
 
 class SceneConfig(StrictModel):
@@ -265,6 +202,12 @@ class SceneConfig(StrictModel):
         default=None,
         description="output folder of a finished run whose map this recording goes on with (docs/second_visit.md): it "
         "is located there, and `output` gets the map of both. The finished run stays as it is. Empty: a new map",
+    )
+    parts: int | None = Field(
+        default=None,
+        ge=2,
+        description="map the recording in so many parts, each a process of its own, and merge their maps "
+        "(docs/scale.md). Empty: as one",
     )
     device: Literal["cpu", "cuda", "vulkan", "metal", "auto"] = Field(
         default="auto", description="`auto`: the GPU by CUDA, by Metal (macOS) or by Vulkan, otherwise the CPU"
@@ -331,7 +274,8 @@ class SceneConfig(StrictModel):
     @property
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
-        return self.mode == "online" and not (self.is_live or self.is_realtime or self.source.realtime)
+        one = self.mode == "online" and self.parts is None
+        return one and not (self.is_live or self.is_realtime or self.source.realtime)
 
     def of_map(self, place: int) -> SceneConfig:
         """Return the settings of a run of its own for the map of this place by size, of tracker `klt`."""
@@ -347,6 +291,8 @@ class SceneConfig(StrictModel):
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:
         if self.snapshot_every and not self.can_be_resumed:
+            if self.parts is not None:
+                return self  # it is for the runs of the parts
             if self.mode != "online":
                 raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
             if not self.is_live:
@@ -364,6 +310,24 @@ class SceneConfig(StrictModel):
             raise ValueError("onto needs frames that wait while they are located: record them, or remove onto")
         if self.tracker.kind == "klt" and self.tracker.maps == "all":
             raise ValueError("onto goes on with one map: set tracker.maps to first, largest or a number")
+        return self
+
+    @model_validator(mode="after")
+    def _recording_can_be_cut(self) -> SceneConfig:
+        key = "parts" if self.parts is not None else "source.part" if self.source.part is not None else None
+        if key is None:
+            return self
+        if self.tracker.follows_streams or self.tracker.is_live:
+            raise ValueError(
+                f"{key} needs the poses of all frames beforehand, and tracker.kind: {self.tracker.kind} finds them "
+                "while it maps: take tracker.kind: sfm, or another program's poses"
+            )
+        if self.mode != "online" or self.is_realtime or self.source.realtime:
+            raise ValueError(f"{key} is for mode: online and frames that wait; remove it")
+        if self.parts is not None and self.onto is not None:
+            raise ValueError("parts makes a new map, and onto goes on with one: remove one of them")
+        if self.parts is not None and self.source.part is not None:
+            raise ValueError("parts cuts the whole recording: remove source.part")
         return self
 
     @model_validator(mode="after")

@@ -8,15 +8,19 @@ from contextlib import ExitStack
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.engine.conductor import Conductor
+from modp_ti.engine.earlier_map import EarlierMap
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
 from modp_ti.engine.realtime import RealtimeRun
 from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
+from modp_ti.engine.second_visit import SecondVisit
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
+from modp_ti.outputs.progress import ProgressLine
+from modp_ti.parts.merged_parts import MergedParts
 from pipelines.pace import CompletePace, Pace
 
-__all__ = ["EXPECTED", "build_mapper", "open_conductor", "open_observer"]
+__all__ = ["EXPECTED", "build_mapper", "open_conductor", "open_earlier_map", "open_observer"]
 
 # The camera that the mapper of a realtime run is made for before the stream has opened. The images of most are smaller:
 # `source.scale: auto` makes none of them larger than 480 pixels.
@@ -39,6 +43,21 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None =
         return Mapper(camera.width, camera.height, settings, config.seed, pace, config.output / "blocks")
     except ValueError as error:
         raise InputError(str(error)) from None
+
+
+def open_earlier_map(config: SceneConfig, line: ProgressLine) -> EarlierMap:
+    """Return the map that a run starts with.
+
+    Args:
+        config: The scene's settings.
+        line: Shows the progress.
+
+    Raises:
+        InputError: If there is no finished run to go on with, or a damaged one.
+    """
+    if config.onto is not None:
+        return SecondVisit(config, line)
+    return EarlierMap() if config.parts is None else MergedParts(config)
 
 
 def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Conductor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from modp_ti.outputs.formats.colmap_model import image_names
 from modp_ti.outputs.formats.map_folder import appearing, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.finished_map import FinishedMap
+from pipelines.merging.merge import MappedPart, merge
 from pipelines.offline import OfflineMapper
 from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
@@ -207,6 +208,18 @@ class Mapper:
             raise ValueError("an offline map cannot go on with a finished one")
         self.pipeline.go_on_with(replace(finished, frames=self._noted(finished.frames)))
         self.finished = True
+
+    def merge(self, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
+        """Put the maps of the parts of a recording into this new mapper, see `pipelines.merging.merge`.
+
+        Raises:
+            ValueError: If the maps do not fit the settings of this mapper, or this mapper is for offline maps.
+        """
+        if not isinstance(self.pipeline, OnlineMapper):
+            raise ValueError("an offline map is not made of parts")
+        kept = merge(self.pipeline, parts, self._noted(frames))
+        self.finished = True
+        return kept
 
     def _noted(self, frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
         """Yield the frames, and keep their metadata."""

@@ -12,6 +12,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.runtime.backend import initialise
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.earlier_map import EarlierMap
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.files.errors import InputError
@@ -42,7 +43,7 @@ MOST_TRIED, MOST_WAITING = 40, 240
 APART = 0.08
 
 
-class SecondVisit:
+class SecondVisit(EarlierMap):
     """Finds the place of a recording in a finished map, and goes on with that map.
 
     The finished run's folder is only read.
@@ -88,25 +89,29 @@ class SecondVisit:
         return JoinedTracker(self._earlier, tracker, placement, taken, events)
 
     @property
-    def note(self) -> str:
+    def notes(self) -> list[str]:
         """One line on how the recording was joined."""
         found = self._alignment
-        return (
+        return [
             f"joined to {self._run.folder}: {found.agreeing} of {found.placed} located frames agree within "
             f"{found.residual:.2f} px, at a scale of {found.scale:.5g}"
-        )
+        ]
+
+    @property
+    def working(self) -> str:
+        return f"going on with {self._config.onto}"
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """The entry `onto` of `metrics.json`."""
         found = self._alignment
-        return {
+        entry = {
             "frames": len(self._run),
             "located": found.placed,
             "agreeing": found.agreeing,
             "residual_px": round(found.residual, 4),
             "scale": found.scale,
         }
+        return super().metrics | {"onto": entry}
 
     def go_on(self, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest) -> None:
         """Take the frames of the finished run from the joined tracker, and put its map into the mapper.

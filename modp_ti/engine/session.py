@@ -16,8 +16,9 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.build import EXPECTED, build_mapper, open_conductor, open_observer
+from modp_ti.engine.build import EXPECTED, build_mapper, open_conductor, open_earlier_map, open_observer
 from modp_ti.engine.conductor import Conductor, Event, first_frame, of_one_size
+from modp_ti.engine.earlier_map import EarlierMap
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
@@ -25,7 +26,6 @@ from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.remarks import remarks
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
-from modp_ti.engine.second_visit import SecondVisit
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
@@ -108,7 +108,7 @@ class _Session:
         self.compiling = 0.0  # [s]; 0 until the mapper is made
         # Set while the stream is opened.
         self.tracker: Tracker
-        self.visit: SecondVisit | None = None
+        self.earlier: EarlierMap
         self.conductor: Conductor
         self.mapper: Mapper
         self.after_mapping: TimeAfterMapping
@@ -133,12 +133,10 @@ class _Session:
         """Open the tracker, make the mapper for its first frame, and map all frames, or those after `resumed`."""
         tick = time.perf_counter()
         self.held.enter_context(self.stop)
-        if self.config.onto is not None:
-            self.visit = SecondVisit(self.config, self.line)
-        self.tracker = self.replayed or open_tracker(self.config, self.line.prepare)
-        self.held.callback(self.tracker.close)
-        if self.visit is not None:
-            self.tracker = self.visit.join(self.tracker)
+        self.earlier = open_earlier_map(self.config, self.line)
+        tracker = self.replayed or open_tracker(self.config, self.line.prepare)
+        self.held.callback(tracker.close)
+        self.tracker = self.earlier.join(tracker)
         self.conductor = open_conductor(self.config, self.tracker, self.held)
         if self.config.is_realtime:  # the kernels are loaded while the tracker opens
             self._make_mapper(EXPECTED)
@@ -154,7 +152,7 @@ class _Session:
             side = min(first.camera.width, first.camera.height)
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
             notes = [*self.tracker.notes, *([self.no_lpips] if self.no_lpips else [])]
-            self._say(*notes, *([self.visit.note] if self.visit is not None else []))
+            self._say(*notes, *self.earlier.notes)
             self._make_mapper(first.camera)
             self.mapper.pipeline.stopwatch.seconds["track"] = prepared
             self._open_keeper(resumed, arriving)
@@ -169,7 +167,7 @@ class _Session:
             except BlockError as error:
                 raise self.unfinished.damaged(error) from None
             scoring = self.mapper.pipeline.stopwatch.seconds.get("evaluate", 0.0)
-            self.clock.end_mapping(self.observer.waited + scoring)
+            self.clock.end_mapping(self.observer.waited + scoring - self.earlier.seconds)
         self._say(*(note for note in self.tracker.notes if note not in notes))  # a live tracker adds some at its end
 
     def _make_mapper(self, camera: PinholeCamera) -> None:
@@ -196,9 +194,8 @@ class _Session:
             return
         if checkpointer.path.exists():
             self._say(f"{checkpointer.path} is of an earlier run: the first one of this run takes its place")
-        if self.visit is not None:
-            with self.line.working(f"going on with {self.config.onto}"):
-                self.visit.go_on(self.mapper, arriving, checkpointer.digest)
+        with self.line.working(self.earlier.working):
+            self.earlier.go_on(self.mapper, arriving, checkpointer.digest)
 
     def _map(self, arriving: FramesAhead[Event]) -> None:
         """Process all frames and corrections in order, and finish the map. Raises RunStopped between two of them."""
@@ -235,7 +232,8 @@ class _Session:
         status = self.conductor.status()
         self.line.frame(report, self.tracker.frame_count, status)
         # A realtime run has no time for the PSNR of new keyframes.
-        psnr = mapped_psnr(self.mapper.pipeline, report) if isinstance(self.conductor.pace, CompletePace) else None
+        scores = self.config.evaluation.scores and isinstance(self.conductor.pace, CompletePace)
+        psnr = mapped_psnr(self.mapper.pipeline, report) if scores else None
         self.record.frame(frame.index, report, psnr, **self.conductor.note())
         self.observer.on_frame(frame, report, status)
 
@@ -324,6 +322,8 @@ class _Session:
 
     def _score(self, versions: dict[str, MapVersion], results: Results) -> list[FrameScore]:
         """Score all frames and write the pictures of the last version. Raises RunStopped between two frames."""
+        if not self.config.evaluation.scores:
+            return []
         last = list(versions)[-1]
 
         def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
@@ -361,7 +361,7 @@ class _Session:
             "snapshots": {name: getattr(checkpointer, name) for name in ("written", "failed", "resumed")},
             "guards": caught.counts(),
             "frames_left_out": {"unreadable": len(self.tracker.unreadable), **pipeline.refused},
-            "onto": None if self.visit is None else self.visit.metrics,
+            **self.earlier.metrics,
             "lpips_note": self.no_lpips,
             "breakdown_percent": self.breakdown,
             "further_maps": self.tracker.further_maps,

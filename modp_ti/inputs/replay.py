@@ -71,9 +71,23 @@ class ReplayedTracker(Tracker):
         self._unreadable = Unreadable()
         self._noted = False
         self._reader = reader
+        self._part = range(len(self.frames))
+
+    def within(self, first: int, end: int) -> ReplayedTracker:
+        """Deliver only the frames at the positions from `first` to before `end`, and return this tracker.
+
+        Their indices count from 0. The same frames are held out as in the whole recording.
+
+        Raises:
+            InputError: If the recording has no such frames.
+        """
+        if end > len(self.frames):
+            raise InputError(f"source.part ends at {end}, and the tracker has {len(self.frames)} frames: lower it")
+        self._part = range(first, end)
+        return self
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self._part)
 
     @property
     def notes(self) -> list[str]:
@@ -81,7 +95,7 @@ class ReplayedTracker(Tracker):
 
     @property
     def frame_count(self) -> int:
-        return len(self.frames)
+        return len(self._part)
 
     @property
     def scale(self) -> float:
@@ -93,7 +107,7 @@ class ReplayedTracker(Tracker):
 
     @property
     def undistorter(self) -> Undistorter | None:
-        return self.frames[0].undistorter if self.frames else None
+        return self.frames[self._part.start].undistorter if self._part else None
 
     def close(self) -> None:
         """Close the image source."""
@@ -101,7 +115,8 @@ class ReplayedTracker(Tracker):
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         index = -1
-        for place, frame in enumerate(self.frames):
+        for place in self._part:
+            frame = self.frames[place]
             try:
                 tracked = tracked_frame(self._reader, index + 1, frame, place)
             except UnreadableImageError as error:

@@ -31,6 +31,17 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         for frame in modp_ti.open_tracker(modp_ti.load_scene("scene.yaml")):
             print(frame.name, len(frame.points))
     """
+    tracker = _opened(config, progress)
+    if config.source.part is None:
+        return tracker
+    from modp_ti.inputs.replay import ReplayedTracker
+
+    assert isinstance(tracker, ReplayedTracker), "SceneConfig refuses parts of other recordings"
+    return tracker.within(*config.source.part)
+
+
+def _opened(config: SceneConfig, progress: Progress | None) -> Tracker:
+    """Open the tracker of the whole recording."""
     source = config.source
     match config.tracker:
         case kinds.ColmapSettings() as tracker:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shlex
@@ -100,9 +101,9 @@ def test_a_map_to_go_on_with_is_relative_to_the_working_folder(scene, session, t
     result = invoke(scene, "--onto", "first: a/map")
     assert result.exit_code == 0, result.output
     assert session[0].onto == (tmp_path / "first: a" / "map").resolve()
-    for option in ("--resume", "--replay"):
-        refused = invoke(option, "out", "--onto", "first")
-        assert refused.exit_code == 2 and refused.stderr.startswith("error: --onto is for a scene")
+    for option, more in itertools.product(("--resume", "--replay"), (("--onto", "first"), ("--parts", "2"))):
+        refused = invoke(option, "out", *more)
+        assert refused.exit_code == 2 and refused.stderr.startswith(f"error: {more[0]} is for a scene")
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -132,6 +133,7 @@ def test_presets_that_do_not_apply_are_refused(session, arguments, said):
         (["--set", "source.path=gone"], "gone: no such folder of images"),
         (["--set", "tracker.path=gone"], "gone: no such folder (tracker.path)"),
         (["--set", "output=scene.yaml"], "output must be a folder, this is a file"),
+        (["--engine", "local"], "--engine and --address are for --parts, whose tasks they carry out"),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_two(scene, session, arguments, part):
@@ -139,12 +141,11 @@ def test_bad_input_gets_one_line_and_exit_code_two(scene, session, arguments, pa
 
 
 def test_faulty_data_set_or_video_gets_one_line(scene, session):
-    folder = scene.parent
-    (folder / "fr1").mkdir()
-    (folder / "fr1" / "rgb.txt").write_text("# time file\n1.0 rgb/1.png\n0.5 rgb/2.png\n")
+    (folder := scene.parent / "fr1").mkdir()
+    (folder / "rgb.txt").write_text("# time file\n1.0 rgb/1.png\n0.5 rgb/2.png\n")
     said = failure(scene, "--set", "source.path=fr1")
     assert "rgb.txt:3: time stamp 0.5 is not later than the one before; sort the listing" in said
-    (folder / "walk.mp4").write_bytes(b"\0\0\0\x10ftypisom\0\0\0\0\0\1\0\0mdat")
+    (scene.parent / "walk.mp4").write_bytes(b"\0\0\0\x10ftypisom\0\0\0\0\0\1\0\0mdat")
     said = failure(scene, "--set", "source.path=walk.mp4")
     assert "walk.mp4: the video is cut off, 65528 bytes are missing: copy it again" in said
 
@@ -154,21 +155,14 @@ def test_missing_scene_file_gets_one_line(tmp_path, session):
 
 
 def test_damaged_image_gets_one_line(scene, session):
-    file = scene.parent / "images" / "view12.png"
-    file.write_bytes(file.read_bytes()[:1000])
+    os.truncate(scene.parent / "images" / "view12.png", 1000)
     assert "view12.png: unreadable image: the file is cut off" in failure(scene)
 
 
 def test_message_of_several_lines_is_put_on_one(scene, monkeypatch):
     from modp_ti.files.errors import InputError
 
-    module = types.ModuleType("modp_ti.engine.session")
-
-    def run_scene(config, console, resumed=None):
-        raise InputError("first\n  second")
-
-    module.run_scene = run_scene
-    monkeypatch.setitem(sys.modules, "modp_ti.engine.session", module)
+    failing_with(InputError("first\n  second"), monkeypatch)
     assert failure(scene) == "error: first second\n"
 
 

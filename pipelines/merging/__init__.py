@@ -1,0 +1,1 @@
+"""Merging: the maps of the parts of a recording become one map."""
