@@ -278,7 +278,7 @@ class GaussianField:
         The values are not checked; they must satisfy the conditions of `append`.
 
         Args:
-            tensors: Values in the order and shapes of `append`, contiguous, of the field's type, on the kernels' device.
+            tensors: Values in the order and shapes of `append`, contiguous, of its type, on the kernels' device.
 
         Raises:
             ValueError: If the pool is too small.
