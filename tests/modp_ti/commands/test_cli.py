@@ -358,7 +358,7 @@ HEAVY_TO_COMPLETE = "('taichi', 'quadrants', 'torch', 'open3d', 'pycolmap', 'mat
         ("modp-ti export out --format sp", ["splat", "spz", "splat-glb"]),
         ("modp-ti render out --path ", ["recorded", "smoothed", "orbit"]),
         ("modp-ti run scene.yaml --set source.sc", ["source.scale=auto"]),
-        ("modp-ti run scene.yaml --set tracker.kind=t", ["tracker.kind=transforms", "tracker.kind=tum"]),
+        ("modp-ti run scene.yaml --set tracker.kind=tu", ["tracker.kind=tum"]),
     ],
 )
 def test_the_shell_is_offered_commands_options_and_values_without_waiting(line, offered):
@@ -379,7 +379,8 @@ def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):
     assert len(defaults) > 100
     of_klt = ("tracker.loops", "tracker.maps")
     of_sfm = [f"tracker.{name}" for name in ("order", "mapper", "overlap", "features")]
-    others = ("source.vrs", "tracker.kind", *of_klt, *of_sfm)  # for other kinds than the scene's
+    of_captures = ("tracker.max_points", "tracker.max_depth", "tracker.depth")
+    others = ("source.vrs", "tracker.kind", *of_klt, *of_sfm, *of_captures)  # for other kinds than the scene's
     loaded = load_scene(scene, [value for value in defaults if not value.startswith(others)])
     assert loaded == load_scene(scene, [])
     klt = load_scene(scene, ["tracker={kind: klt}"])
