@@ -47,6 +47,7 @@ def state_of(mapper: OnlineMap) -> MapState:
         numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
     if len(mapper.paging.away):
         groups["blocks"] = mapper.paging.away.state()
+        numbers["most_missing"] = mapper.keyframes.most_missing
     if mapper.settled:
         groups["settling"] = {"group": mapper.paging.group}
     if mapper.selector.previous is not None:
@@ -81,6 +82,7 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     mapper.gaussians.restore(state.group("gaussians"))
     if blocks:
         mapper.paging.away.restore(blocks)
+        mapper.keyframes.most_missing = int(state.numbers["most_missing"])
     if settling := state.group("settling"):
         mapper.paging.group = settling["group"]
     anchors = state.group("anchors")

@@ -221,9 +221,8 @@ class Paging:
         if views:
             free = free[_by_distance(blocks.boxes[free], views[0])[::-1]]
         pool, memory = self._spare(nbytes, KEPT)
-        if (
-            memory == np.inf
-        ):  # the number of blocks that go is known beforehand, and the viewers of the others do not matter
+        if memory == np.inf:
+            # The number of blocks that go is known beforehand; who sees the others does not matter.
             free = free[: 1 + int(np.searchsorted(pool + np.cumsum(blocks.counts[free]), gaussians))]
         records = self.away.resident_records()
         gone = np.zeros(len(self.gaussians), dtype=bool)
