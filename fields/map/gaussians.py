@@ -47,7 +47,8 @@ class GaussianField:
         capacity: Size of the pool.
 
     Example:
-        modp_ti.GaussianField(sh_degree=1).load(modp_ti.read_splats("out/room/splats.ply"))
+        gaussians = modp_ti.GaussianField(sh_degree=1)
+        gaussians.load(modp_ti.read_splats("out/room/splats.ply"))
     """
 
     def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:
@@ -122,8 +123,8 @@ class GaussianField:
             anchor: Anchor of all new Gaussians.
 
         Raises:
-            ValueError: If a value is NaN or infinite or a quaternion is zero (the message names the first such
-                Gaussian), if the shapes disagree, or if the pool is full.
+            ValueError: If a value is not finite or a quaternion is zero (the message names the first such Gaussian), if
+                the shapes disagree, or if the pool is full.
         """
         arrays = [
             np.ascontiguousarray(a, dtype=self.dtype) for a in (position, log_scale, quaternion, opacity_logit, sh)
@@ -160,12 +161,10 @@ class GaussianField:
             raise ValueError(f"keep has shape {keep.shape}, expected ({self.count},)")
         kept = int(np.count_nonzero(keep))
         removed = self.count - kept
-        if removed:
-            holes = np.flatnonzero(~keep[:kept]).astype(np.int32)
-            movers = (kept + np.flatnonzero(keep[kept:])).astype(np.int32)
-            if len(holes):
-                self._move(movers, holes)
-            self.count = kept
+        holes = np.flatnonzero(~keep[:kept]).astype(np.int32)
+        if len(holes):
+            self._move((kept + np.flatnonzero(keep[kept:])).astype(np.int32), holes)
+        self.count = kept
         return removed
 
     # ---- saving and loading ----------------------------------------------------------------------------------

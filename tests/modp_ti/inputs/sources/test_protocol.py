@@ -10,6 +10,7 @@ import pytest
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs import captures
 from modp_ti.inputs.sources import _OPENERS, ImageFolder, ImageSource, open_source
 
 
@@ -37,7 +38,8 @@ def test_notes_are_added_behind_the_others_or_before_them(images):
 
 def test_every_kind_that_lies_in_files_has_an_opener():
     kinds = get_args(SourceSettings.model_fields["kind"].annotation)
-    assert set(_OPENERS) == set(kinds) - {"auto", "live"}
+    assert set(_OPENERS) | set(captures.KINDS) == set(kinds) - {"auto", "live"}
+    assert not set(_OPENERS) & set(captures.KINDS)
 
 
 def test_a_source_without_a_path_is_asked_for_one():
