@@ -16,7 +16,7 @@ from typing import TextIO
 
 from live_camera import environment
 
-from modp_ti.files.disk_room import KEPT_FREE
+from fields.runtime.disk_room import KEPT_FREE
 from modp_ti.files.errors import InputError
 
 __all__ = ["Faults", "command", "memory_of"]

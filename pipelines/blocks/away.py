@@ -204,10 +204,6 @@ class BlocksOnDisk:
             found += [places[sees] for sees in seen(planes[places], some).T]
         return found
 
-    def close(self) -> None:
-        """Remove all files. The map is not usable any more."""
-        self._files.close()
-
     def look(self, place: int) -> None:
         """Determine which blocks a new keyframe sees.
 

@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.pyramid import ImageLevel
+from fields.runtime.disk_room import has_room
 
 __all__ = ["BlockError", "BlockFiles", "StoredBlock", "records_of", "state_of"]
-
-# Disk space that stays free for the finished map [bytes].
-KEPT_FREE = 1 << 30
 
 
 class BlockError(ValueError):
@@ -187,15 +185,10 @@ class BlockFiles:
             for images in self._images:
                 images.madvise(mmap.MADV_DONTNEED)
 
-    def close(self) -> None:
-        """Remove the folder."""
-        if self._folder is not None:
-            self._folder.cleanup()
-
     def _next(self, kind: str, suffix: str, size: int) -> Path:
         """Return the path of a new file of so many bytes."""
         folder = self.path
-        if shutil.disk_usage(folder).free < KEPT_FREE + size:
+        if not has_room(folder, size):
             raise OSError(28, "No space left on device")
         self._written += 1
         return folder / f"{kind}-{self._written:06d}{suffix}"

@@ -236,7 +236,7 @@ def test_a_small_disk_is_full_after_so_many_megabytes(tmp_path: Path) -> None:
     except InputError as error:
         pytest.skip(str(error))
     code = (
-        "import sys; from pathlib import Path; from modp_ti.files.disk_room import has_room; "
+        "import sys; from pathlib import Path; from fields.runtime.disk_room import has_room; "
         "folder = Path(sys.argv[1]); print(has_room(folder, 900_000), has_room(folder, 1_100_000))"
     )
     command = faults.wrapped([sys.executable, "-c", code, str(tmp_path)], tmp_path)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files.disk_room import has_room
+from fields.runtime.disk_room import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.listed_images import decoded
 from modp_ti.inputs.sources.protocol import ImageSource

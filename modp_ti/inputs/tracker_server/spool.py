@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
+from fields.runtime.disk_room import has_room
 from modp_ti.config.settings import SourceSettings
-from modp_ti.files.disk_room import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.image_header import read_image_header

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fields.frames.pose_correction import PoseCorrection
+from fields.runtime import disk_room
 from fields.runtime.backend import initialise
-from pipelines.blocks import block_files
 from pipelines.blocks.block_files import BlockError
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
@@ -150,7 +151,7 @@ def test_a_damaged_block_is_named_and_the_map_goes_on_without_it(taichi_on_the_c
 def test_a_full_disk_is_told_and_leaves_out_what_has_no_room(
     taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(block_files, "KEPT_FREE", 1 << 60)
+    monkeypatch.setattr(disk_room, "KEPT_FREE", 1 << 60)
     mapper = walk(mapper_of(max_gaussians=2048), end=10)
     assert mapper.paging.problem == "blocks of the map cannot be kept on disk: No space left on device"
     assert len(mapper.paging.away) == 0 and len(mapper.gaussians) <= 2048
@@ -162,5 +163,6 @@ def test_files_go_with_the_map(taichi_on_the_cpu: None, tmp_path: Path) -> None:
     mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
     (folder,) = tmp_path.iterdir()
     assert folder.name != "blocks-left" and list(folder.glob("*.npy"))
-    mapper.paging.away.close()
+    del mapper
+    gc.collect()
     assert not list(tmp_path.iterdir())

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
+from fields.runtime import disk_room
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
-from modp_ti.files import disk_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
 from modp_ti.inputs.sources import live, open_source

@@ -1,4 +1,4 @@
-"""The disk space that a recording leaves free, so that its map can be saved."""
+"""Disk space that stays free while a map is made, so that it can be saved."""
 
 from __future__ import annotations
 
