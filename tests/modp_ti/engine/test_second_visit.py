@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -82,27 +83,38 @@ def centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([inverse_se3(T)[:3, 3] for T in poses])
 
 
-def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, room: Room, tmp_path: Path) -> None:
-    before = content(first)
-    scene = second_scene(room, tmp_path)
-    result = run(scene, "--onto", str(first))
-    assert result.returncode == 0, result.stderr
-    assert content(first) == before, "the first visit is only read"
+@pytest.fixture(scope="module")
+def second(first: Path, made_once: Callable[[str, Callable[[Path], None]], Path], room: Room) -> Path:
+    """The output folder of a second visit, beside its recording and what it said."""
 
-    out = open_run(tmp_path / "out")
+    def fill(folder: Path) -> None:
+        before = content(first)
+        result = run(second_scene(room, folder), "--onto", str(first))
+        assert result.returncode == 0, result.stderr
+        assert content(first) == before, "the first visit is only read"
+        (folder / "said").write_text(result.stderr)
+
+    return made_once("a second visit", fill) / "out"
+
+
+def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, second: Path) -> None:
+    out = open_run(second)
     assert len(out) == FIRST + FRAMES
     away = np.linalg.norm(centres(out.poses[FIRST:]) - centres(np.array(walk(FRAMES, step=STEP))), axis=1)
     assert away.mean() < AWAY
-    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    metrics = json.loads((second / "metrics.json").read_text())
     onto = metrics["onto"]
     assert onto["frames"] == FIRST and 3 <= onto["agreeing"] <= onto["located"]
     assert onto["scale"] == pytest.approx(1 / 0.37, rel=0.02)
-    assert f"joined to {first}: {onto['agreeing']} of {onto['located']} located frames agree" in result.stderr
+    assert (
+        f"joined to {first}: {onto['agreeing']} of {onto['located']} located frames agree"
+        in (second.parent / "said").read_text()
+    )
 
     # Nothing of the two visits collides.
     assert (np.diff(out.timestamps) > 0).all()
     assert out.names == [f"{i:04d}" for i in range(FIRST)] + [f"visit2/{i:04d}.png" for i in range(FRAMES)]
-    scores = read_scores(tmp_path / "out" / "scores.csv")
+    scores = read_scores(second / "scores.csv")
     assert [score.index for score in scores] == list(range(FIRST + FRAMES))
     assert out.record.held_out == [FIRST, FIRST + 5, FIRST + 10]
     assert set(range(FIRST)) < set(out.record.keyframes), "the first visit's keyframes, and new ones"
@@ -112,21 +124,20 @@ def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, room: Ro
     psnr = np.array([score.psnr for score in scores])
     assert psnr[:FIRST].min() > 25 and psnr[FIRST:-3].min() > 25
 
-    # It can be visited again, and later commands find its images.
-    third = run(scene, "--onto", str(tmp_path / "out"), "--set", "output=third")
-    assert third.returncode == 0, third.stderr
-    again = open_run(tmp_path / "third")
-    assert again.names[: len(out)] == out.names and again.names[-1] == f"visit3/{FRAMES - 1:04d}.png"
 
-
-def test_a_second_visit_that_is_killed_goes_on_as_one_in_peace(first: Path, room: Room, tmp_path: Path) -> None:
-    """It locates the recording again, and comes to the same place."""
-    scene = second_scene(room, tmp_path)
-    options = ["--onto", str(first), "--set", "snapshot_every=2"]
+def test_a_third_visit_that_is_killed_goes_on_as_one_in_peace(second: Path, tmp_path: Path) -> None:
+    """It finds the images of both earlier visits, locates the recording again, and comes to the same place."""
+    scene = Path(shutil.copy(second.parent / "scene.yaml", tmp_path))
+    for name in ("images", "sparse"):
+        (tmp_path / name).symlink_to(second.parent / name)
+    options = ["--onto", str(second), "--set", "snapshot_every=2"]
     assert run(scene, *options).returncode == 0
     peace = (tmp_path / "out").rename(tmp_path / "peace")
+    names = open_run(second).names
+    assert open_run(peace).names == names + [f"visit3/{name.removeprefix('visit2/')}" for name in names[FIRST:]]
+
     out = tmp_path / "out"
-    stop_midway([str(scene), *options], out, lambda: position(out / FILE)[0] > FIRST, signal.SIGKILL)
+    stop_midway([str(scene), *options], out, lambda: position(out / FILE)[0] > len(names), signal.SIGKILL)
     result = subprocess.run([sys.executable, "-m", "modp_ti.run", "--resume", str(out)], check=False)
     assert result.returncode == 0
     for name in ("splats.ply", "trajectory.txt", "scores.csv"):
