@@ -20,6 +20,7 @@ from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.formats.colmap_model import image_names
 from modp_ti.outputs.formats.map_folder import appearing, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
+from pipelines.blocks.block_files import BlockError
 from pipelines.finished_map import FinishedMap
 from pipelines.merging.merge import MappedPart, merge
 from pipelines.offline import OfflineMapper
@@ -89,6 +90,7 @@ class Mapper:
 
         Raises:
             ValueError: If the frame is out of order or larger than the mapper's images.
+            BlockError: If a part of the map that lies on disk is damaged. The map is left without it.
         """
         size, images = frame.camera, self.pipeline.renderer.images
         if not self.takes(size.width, size.height):
@@ -98,7 +100,11 @@ class Mapper:
             )
         if self.frames.index and frame.index <= self.frames.index[-1]:
             raise ValueError(f"{frame.name} has index {frame.index}, the frame before it {self.frames.index[-1]}")
-        report = None if frame.held_out else self.pipeline.process(frame)
+        try:
+            report = None if frame.held_out else self.pipeline.process(frame)
+        except BlockError:
+            self._note(frame)  # the map that is left has it
+            raise
         self._note(frame)
         self.finished = False
         return report
