@@ -374,7 +374,7 @@ class KeyframeStore:
         """Apply the refinement of the surrounding keyframes to a tracked pose (Section 3.3.3).
 
         The correction is interpolated by frame index between the keyframes of the same view before and after the frame.
-        Outside the range of the keyframes, that of the nearest one is used.
+        Outside the range of the keyframes, that of the nearest one is used. A view without keyframes stays as tracked.
 
         Args:
             index: Index of the frame.
@@ -386,6 +386,8 @@ class KeyframeStore:
         if not self._keyframes:
             return np.array(T_tracked, dtype=np.float64)
         a, b, t = self._around(index)
+        if not self._of_one_view(a.index, index):  # its correction has other axes
+            return np.array(T_tracked, dtype=np.float64)
         if a is b:
             return a.correction @ T_tracked
         return interpolate_se3(a.correction, b.correction, t) @ T_tracked

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.config.camera_settings import PanoramaSettings
-from modp_ti.files.errors import InputError
+from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.panorama import Face, faces_of, projection_of
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -31,13 +31,14 @@ class PanoramaFaces(ImageSource):
         settings: Settings of the projection and of the faces.
 
     Raises:
-        InputError: If the first image is not twice as wide as high, or unreadable.
+        InputError: If the first readable image is not twice as wide as high, or none is readable.
     """
 
     def __init__(self, whole: ImageSource, settings: PanoramaSettings) -> None:
         super().__init__(whole.path)
         self._whole = whole
-        self._projection = projection_of(settings, *whole.frame_size, f"{whole.path / whole.names[0]}")
+        first, size = _first_readable(whole)
+        self._projection = projection_of(settings, *size, f"{whole.path / first}")
         self._faces = faces_of(settings, self._projection)
         camera = self._faces[0].camera
         self.intrinsics = Intrinsics(camera)
@@ -116,6 +117,18 @@ class PanoramaFaces(ImageSource):
         lookup = np.where(seen[..., None], pixels - 0.5 + MARGIN, 0.0).astype(np.float32)
         x, y = np.ascontiguousarray(lookup[..., 0]), np.ascontiguousarray(lookup[..., 1])
         return x, y, None if seen.all() else seen
+
+
+def _first_readable(images: ImageSource) -> tuple[str, tuple[int, int]]:
+    """Name and size (width, height) of the first readable image. Raises the first one's error if there is none."""
+    error: UnreadableImageError | None = None
+    for name in images.names:
+        try:
+            return name, images.size(name)
+        except UnreadableImageError as found:
+            error = error or found
+    assert error is not None, "sources have images"
+    raise error
 
 
 def _face_name(name: str, number: int) -> str:

@@ -129,6 +129,8 @@ def test_panoramas_have_their_shape_and_one_size(folder: Path) -> None:
     images = open_source(source)
     with pytest.raises(InputError, match=r"b.png is 128x64, the first panorama 256x128: all panoramas .* one size"):
         images.read("b-face0.png")
+    (folder / "a.png").write_bytes(b"no image")
+    assert open_source(source).size("a-face0.png") == (48, 48)
     cv2.imwrite(str(folder / "a.png"), np.zeros((64, 96, 3), np.uint8))
     with pytest.raises(InputError, match=r"a.png is 96x64: a panorama is twice as wide as high"):
         open_source(source)

@@ -301,7 +301,7 @@ def test_images_of_several_sizes_are_delivered_at_that_of_the_first(with_cloud):
     whole = list(open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings()))
     with_another_camera(with_cloud, 160, 120)
     tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
-    assert "1 of 7 images have another size than the first: they are scaled to its size" in tracker.notes
+    assert "the images have 2 sizes: they are mapped at 320x240" in tracker.notes
     for frame, before in zip(tracker, whole, strict=True):
         assert frame.image.shape == before.image.shape
         np.testing.assert_allclose(frame.camera.matrix(), before.camera.matrix())
@@ -309,7 +309,12 @@ def test_images_of_several_sizes_are_delivered_at_that_of_the_first(with_cloud):
         assert np.abs(frame.image - before.image).mean() < 0.05
 
 
-def test_an_image_of_another_shape_is_refused(with_cloud):
+def test_an_image_of_another_shape_keeps_it_and_gets_the_longer_side_of_the_first(with_cloud):
+    whole = list(open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings()))
     with_another_camera(with_cloud, 160, 160)
-    with pytest.raises(InputError, match=r"view9.png is 160x160, which has another shape than the first image"):
-        open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    assert "the images have 2 sizes: they are mapped at 320x240, 320x320" in tracker.notes
+    assert tracker.largest == (320, 320)
+    frames = list(tracker)
+    assert [frame.image.shape[:2] for frame in frames] == [(240, 320), (320, 320), *[(240, 320)] * 5]
+    np.testing.assert_allclose(frames[1].points.pixels, whole[1].points.pixels * (1, 320 / 240), atol=1e-9)
