@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fields.geometry.se3 import exp_se3
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files.errors import InputError
@@ -318,3 +319,26 @@ def test_an_image_of_another_shape_keeps_it_and_gets_the_longer_side_of_the_firs
     frames = list(tracker)
     assert [frame.image.shape[:2] for frame in frames] == [(240, 320), (320, 320), *[(240, 320)] * 5]
     np.testing.assert_allclose(frames[1].points.pixels, whole[1].points.pixels * (1, 320 / 240), atol=1e-9)
+
+
+def test_the_faces_of_a_panorama_lie_at_its_pose(tmp_path):
+    (tmp_path / "images").mkdir()
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = [exp_se3([0.1 * i, 0.2, 0.3, 0.3, -0.2 * i, 0.1]) for i in range(4)]
+    frames = []
+    for i, T in enumerate(poses):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((32, 64, 3), 90, np.uint8))
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": (np.linalg.inv(T) @ flip).tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_model": "EQUIRECTANGULAR", "frames": frames}))
+    panorama = {"projection": "equirectangular", "faces": 3}
+    source = SourceSettings.model_validate(
+        {"path": tmp_path / "images", "holdout": 2, "start": 1, "panorama": panorama}
+    )
+    tracker = open_transforms(source, TransformsSettings())
+    assert [frame.name for frame in tracker.frames] == [f"{i}-face{n}.png" for i in (1, 2, 3) for n in range(3)]
+    for place, frame in enumerate(tracker):
+        T = poses[1 + place // 3]
+        turned = 2 * np.pi / 3 * (place % 3)
+        np.testing.assert_allclose(frame.T_camera_world[:3, :3].T @ frame.T_camera_world[:3, 3], T[:3, :3].T @ T[:3, 3])
+        np.testing.assert_allclose(frame.T_camera_world[2, :3], [np.sin(turned), 0, np.cos(turned)] @ T[:3, :3])
+        assert (frame.views, frame.held_out) == (3, place // 3 != 1)
