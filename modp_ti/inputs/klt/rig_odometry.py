@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.initialisation import BETWEEN, LEAST_ANGLE, LEAST_SHIFT
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, triangulated
@@ -157,7 +158,7 @@ class RigOdometry:
         for i in np.unique(np.linspace(first, last, BETWEEN + 2).round().astype(int)[1:-1]).tolist():
             located = None if i in poses else localised_rig(landmarks, self._times[i], np.eye(4), self._seed)
             if located is not None:
-                poses[i] = np.linalg.inv(self._mounts[0]) @ located[0].T_camera_world
+                poses[i] = inverse_se3(self._mounts[0]) @ located[0].T_camera_world
         for i in sorted(poses):
             for frame, mount in zip(self._times[i], self._mounts, strict=True):
                 rays = self._lens.rays(frame.pixels)
@@ -186,12 +187,12 @@ class RigOdometry:
 
     def _views_before(self, tracking: RigTracking, times: Sequence[list[Frame]]) -> list[View]:
         """Localise the times before the last one by their features, from the first keyframe back and on."""
-        landmarks, count = tracking.map, len(self._mounts)
+        landmarks, T_rig_face = tracking.map, inverse_se3(self._mounts[0])
         places = {each.number: each for each in landmarks.keyframes}
         start = next(i for i, frames in enumerate(times) if frames[0].number in places)
         found: dict[int, list[LocalisedFrame]] = {}
         for order in (range(start - 1, -1, -1), range(start, len(times))):
-            T = np.linalg.inv(self._mounts[0]) @ landmarks.keyframes[0].T_camera_world
+            T = T_rig_face @ landmarks.keyframes[0].T_camera_world
             for i in order:
                 frames = times[i]
                 if frames[0].number in places:
@@ -202,8 +203,7 @@ class RigOdometry:
                 else:
                     located = localised_rig(landmarks, frames, T, self._seed)
                 if located is not None:
-                    T, found[i] = np.linalg.inv(self._mounts[0]) @ located[0].T_camera_world, located
-        assert count == len(times[-1])
+                    T, found[i] = T_rig_face @ located[0].T_camera_world, located
         return [view for i in sorted(found) for view in tracking.views(found[i])]
 
 

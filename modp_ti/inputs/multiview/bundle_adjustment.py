@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import inverse_se3
+
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -123,7 +125,7 @@ def _add_rig(
         if number == 0:
             rig.add_ref_sensor(sensor)
         else:
-            rig.add_sensor(sensor, pycolmap.Rigid3d((mounts[number] @ np.linalg.inv(mounts[0]))[:3]))
+            rig.add_sensor(sensor, pycolmap.Rigid3d((mounts[number] @ inverse_se3(mounts[0]))[:3]))
     model.add_rig(rig)
     for place in dict.fromkeys(k // count for k in poses):
         frame = pycolmap.Frame(frame_id=place + 1, rig_id=1)
@@ -131,7 +133,7 @@ def _add_rig(
         for k in views:
             frame.add_data_id(pycolmap.data_t(sensors[k % count], k + 1))
         model.add_frame(frame)
-        T_rig_world = np.linalg.inv(mounts[views[0] % count] @ np.linalg.inv(mounts[0])) @ poses[views[0]]
+        T_rig_world = inverse_se3(mounts[views[0] % count] @ inverse_se3(mounts[0])) @ poses[views[0]]
         model.frame(place + 1).rig_from_world = pycolmap.Rigid3d(T_rig_world[:3])
         if views[0] not in free:
             config.set_constant_rig_from_world_pose(place + 1)
