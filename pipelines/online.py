@@ -83,7 +83,7 @@ class OnlineMapper(OnlineMap):
         if self.frame_count % self.settings.densify.prune_every == 0:
             self.prune()
         with self.stopwatch.measure("select"):
-            last = self.keyframes.selected[-1] if len(self.keyframes) else None
+            last = next(iter(self.keyframes.before(frame.index, 1)), None)
             if self.gate.refuses(frame, last, self.renderer, self.near):
                 return FrameReport(frame.index, False, len(self.keyframes.selected), self.gaussian_count, None)
             is_wanted = self.selector.is_keyframe(frame, last) and self.pace.takes_keyframe()

@@ -101,12 +101,15 @@ class Room:
         x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
         pixels = np.stack([x.ravel(), y.ravel()], axis=1)
         rays = fine.unproject(pixels, np.ones(len(pixels))) @ T_camera_world[:3, :3]
-        eye = inverse_se3(T_camera_world)[:3, 3]
-        t, which, normal = self.cast(eye, rays)
-        colour = self._base[which] + 0.28 * self._texture(eye + t[:, None] * rays + 7.3 * which[:, None])
-        colour *= (0.75 + 0.25 * np.abs(normal @ LIGHT))[:, None]
+        colour = self.colours(inverse_se3(T_camera_world)[:3, 3], rays)
         colour = colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
         return np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+
+    def colours(self, eye: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the colours (N, 3) that rays (N, 3) from `eye` see, about 0 to 1."""
+        t, which, normal = self.cast(eye, rays)
+        colour = self._base[which] + 0.28 * self._texture(eye + t[:, None] * rays + 7.3 * which[:, None])
+        return colour * (0.75 + 0.25 * np.abs(normal @ LIGHT))[:, None]
 
     def _texture(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return smooth noise (N, 3) at points (N, 3), interpolated from lattice values."""

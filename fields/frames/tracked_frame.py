@@ -80,6 +80,8 @@ class TrackedFrame:
             of a camera; None for no vignetting. The image is the scene times the vignette.
         held_out: Whether the frame is for evaluation only. Such a frame never touches the map.
         arrived: `time.monotonic()` when the image was received [s]; None for files that are not paced.
+        views: Number of views that are taken at one time, such as the faces of a panorama. They follow one another, so
+            that frames belong to one view if their indices are equal modulo `views`.
 
     Raises:
         ValueError: If the shapes or dtypes do not fit, or the pose is not finite.
@@ -102,6 +104,7 @@ class TrackedFrame:
     vignette: NDArray[np.float32] | None = None
     held_out: bool = False
     arrived: float | None = None
+    views: int = 1
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width)

@@ -222,6 +222,7 @@ class KeyframeStore:
         trajectory: The tracked poses of all frames, those of the keyframes included.
         selected: The keyframes without the frames between them.
         latest: Place of the last of these in the store; -1 without keyframes.
+        views: Number of views that are taken at one time, as in `TrackedFrame`.
         nbytes: Bytes of the keyframes' images and points.
         most_missing: Number of Gaussians on disk that a keyframe may see and still be drawn as a view.
     """
@@ -240,6 +241,7 @@ class KeyframeStore:
         self._keyframes: list[Keyframe] = []
         self.selected: list[Keyframe] = []
         self.latest = -1
+        self.views = 1
         self._depths = RunningMedian()
         self.nbytes = 0
         self.most_missing = 0
@@ -262,6 +264,20 @@ class KeyframeStore:
         """Return the number of bytes that a frame would take as a keyframe."""
         return _nbytes(self._kept(frame, self.levels), frame.points)
 
+    def before(self, index: int, count: int) -> list[Keyframe]:
+        """Return up to `count` keyframes of the same view before frame `index`, in order, without those between."""
+        found: list[Keyframe] = []
+        for keyframe in reversed(self.selected):
+            if len(found) == count:
+                break
+            if keyframe.index < index and self._of_one_view(keyframe.index, index):
+                found.append(keyframe)
+        return found[::-1]
+
+    def _of_one_view(self, a: int, b: int) -> bool:
+        """Whether frames a and b show one of the views that are taken at one time."""
+        return (a - b) % self.views == 0
+
     def errors(self) -> NDArray[np.float64]:
         """Return the errors (N,) of all keyframes."""
         return np.fromiter((k.error for k in self._keyframes), np.float64, len(self._keyframes))
@@ -279,6 +295,7 @@ class KeyframeStore:
             is_between: Whether it is a frame between keyframes.
         """
         self.trajectory.add(frame)
+        self.views = frame.views
         keyframe = self.view(frame, self.levels)
         keyframe.is_between = is_between
         self._keyframes.append(keyframe)
@@ -356,8 +373,8 @@ class KeyframeStore:
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:
         """Apply the refinement of the surrounding keyframes to a tracked pose (Section 3.3.3).
 
-        The correction is interpolated by frame index between the keyframes before and after the frame. Outside the
-        range of the keyframes, that of the nearest one is used.
+        The correction is interpolated by frame index between the keyframes of the same view before and after the frame.
+        Outside the range of the keyframes, that of the nearest one is used. A view without keyframes stays as tracked.
 
         Args:
             index: Index of the frame.
@@ -369,6 +386,8 @@ class KeyframeStore:
         if not self._keyframes:
             return np.array(T_tracked, dtype=np.float64)
         a, b, t = self._around(index)
+        if not self._of_one_view(a.index, index):  # its correction has other axes
+            return np.array(T_tracked, dtype=np.float64)
         if a is b:
             return a.correction @ T_tracked
         return interpolate_se3(a.correction, b.correction, t) @ T_tracked
@@ -386,10 +405,16 @@ class KeyframeStore:
         return (1.0 - t) * a.exposure + t * b.exposure
 
     def _around(self, index: int) -> tuple[Keyframe, Keyframe, float]:
-        """Keyframes before and after frame `index`, and its position between them; outside, twice the nearest."""
-        after = bisect_left(self._keyframes, index, key=lambda keyframe: keyframe.index)
-        if after == 0 or after == len(self._keyframes):
-            nearest = self._keyframes[min(after, len(self._keyframes) - 1)]
+        """Keyframes of its view before and after frame `index`, and its position between; outside, twice the nearest.
+
+        A view without keyframes takes those of any.
+        """
+        every = self._keyframes
+        if self.views > 1:
+            every = [each for each in every if self._of_one_view(each.index, index)] or every
+        after = bisect_left(every, index, key=lambda keyframe: keyframe.index)
+        if after == 0 or after == len(every):
+            nearest = every[min(after, len(every) - 1)]
             return nearest, nearest, 0.0
-        a, b = self._keyframes[after - 1], self._keyframes[after]
+        a, b = every[after - 1], every[after]
         return a, b, (index - a.index) / (b.index - a.index)

@@ -1,12 +1,14 @@
-"""The settings of cameras: intrinsics with lens distortion, and the pinhole camera of Aria recordings."""
+"""The settings of cameras: intrinsics with lens distortion, Aria recordings, and panoramas."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 from pydantic import Field, model_validator
 
 from pipelines.settings import StrictModel
 
-__all__ = ["IntrinsicsSettings", "VrsSettings"]
+__all__ = ["IntrinsicsSettings", "PanoramaSettings", "VrsSettings"]
 
 
 class IntrinsicsSettings(StrictModel):
@@ -67,3 +69,41 @@ class VrsSettings(StrictModel):
         gt=0,
         description="focal length of the undistorted image in pixels; 400 at 800x800 is a field of view of 90 degrees",
     )
+
+
+class PanoramaSettings(StrictModel):
+    """Images that see all round, which are cut into square pinhole images, called faces."""
+
+    projection: Literal["none", "equirectangular", "dual_fisheye"] = Field(
+        default="none",
+        description="`equirectangular`: images twice as wide as high; `dual_fisheye`: two circles side by side, the "
+        "left one of the lens that looks forward; `none`: the images are not panoramas",
+    )
+    faces: int = Field(default=4, ge=1, le=12, description="number of faces around the horizon, the first one forward")
+    up_down: bool = Field(default=False, description="two more faces, which look up and down")
+    fov: float = Field(
+        default=100.0,
+        ge=30,
+        le=120,
+        description="field of view of a face in degrees. Neighbours overlap by `fov - 360 / faces`",
+    )
+    lens_fov: float = Field(
+        default=190.0, ge=120, le=280, description="`dual_fisheye`: field of view of each circle in degrees"
+    )
+
+    @property
+    def given(self) -> bool:
+        """Whether the images are panoramas."""
+        return self.projection != "none"
+
+    @property
+    def count(self) -> int:
+        """Number of frames that an image gives."""
+        return self.faces + 2 * self.up_down if self.given else 1
+
+    @model_validator(mode="after")
+    def _projection_is_named(self) -> PanoramaSettings:
+        changed = (getattr(self, name) != field.default for name, field in PanoramaSettings.model_fields.items())
+        if not self.given and any(changed):
+            raise ValueError("source.panorama.projection is missing: set it to equirectangular or dual_fisheye")
+        return self

@@ -13,9 +13,9 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from fields.runtime.parallel import available_cores
-from modp_ti.config.camera_settings import IntrinsicsSettings, VrsSettings
+from modp_ti.config.camera_settings import IntrinsicsSettings, PanoramaSettings, VrsSettings
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
-from modp_ti.config.tracker_settings import AnyTrackerSettings
+from modp_ti.config.tracker_settings import AnyTrackerSettings, GivenPosesSettings
 from modp_ti.files.errors import InputError
 from pipelines.offline_settings import OfflineSettings
 from pipelines.settings import MappingSettings, RefineSettings, StrictModel
@@ -25,6 +25,7 @@ __all__ = [
     "EvaluationSettings",
     "ExportSettings",
     "IntrinsicsSettings",
+    "PanoramaSettings",
     "SceneConfig",
     "SourceSettings",
     "ViewSettings",
@@ -78,13 +79,16 @@ class SourceSettings(StrictModel):
     )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
+    panorama: PanoramaSettings = PanoramaSettings()
     scale: Literal["auto"] | Annotated[float, Field(gt=0, le=1)] = Field(
         default="auto",
         description=f"factor on the width and height of every frame. `auto` makes the longer side {LONGER_SIDE} pixels "
         "if it is longer; images of the tracker `socket` keep their size",
     )
     holdout: int | None = Field(
-        default=None, ge=2, description="n: frames 0, n, 2n, ... are used only for evaluation; empty: none"
+        default=None,
+        ge=2,
+        description="n: frames 0, n, 2n, ... are used only for evaluation, of panoramas all their faces; empty: none",
     )
     fps: float = Field(
         default=30.0,
@@ -172,6 +176,21 @@ class SourceSettings(StrictModel):
             raise ValueError("source.path and source.stream cannot both be set; remove one of them")
         if self.stream is not None and self.realtime:
             raise ValueError("source.realtime is for source.path, a stream always sets the pace; remove it")
+        return self
+
+    @model_validator(mode="after")
+    def _panoramas_are_plain(self) -> SourceSettings:
+        if not self.panorama.given:
+            return self
+        for key, wanted in (
+            ("stream", self.stream is not None),
+            ("realtime", self.realtime),
+            ("intrinsics", self.intrinsics.given),
+            ("masks", self.masks is not None),
+            ("vignette", self.vignette is not None),
+        ):
+            if wanted:
+                raise ValueError(f"source.{key} is not for panoramas (source.panorama); remove one of them")
         return self
 
     @model_validator(mode="after")
@@ -287,6 +306,29 @@ class SceneConfig(StrictModel):
         mapping = self.mapping.model_copy(update={"pace": "complete"})
         source = self.source.model_copy(update={"realtime": False})
         return self.model_copy(update={"source": source, "mapping": mapping})
+
+    @model_validator(mode="after")
+    def _tracker_places_panoramas(self) -> SceneConfig:
+        if not self.source.panorama.given:
+            return self
+        if not self.tracker.places_panoramas:
+            raise ValueError(
+                f"source.panorama: tracker.kind: {self.tracker.kind} has no poses of panoramas; take klt, transforms, "
+                "tum, orbslam3, matrices or tanksandtemples"
+            )
+        if self.tracker.kind == "klt" and (self.tracker.loops or self.tracker.maps != "first"):
+            raise ValueError("source.panorama: klt follows panoramas in one map, without loops; remove loops and maps")
+        if isinstance(self.tracker, GivenPosesSettings) and self.tracker.adjusts:
+            raise ValueError("source.panorama: tracker.adjust would move the faces apart; set it to false")
+        for key, wanted in (
+            ("onto", self.onto is not None),
+            ("parts", self.parts is not None),
+            ("source.part", self.source.part is not None),
+            ("mapping.pace: realtime", self.is_realtime),
+        ):
+            if wanted:
+                raise ValueError(f"{key} is not for panoramas (source.panorama); remove one of them")
+        return self
 
     @model_validator(mode="after")
     def _snapshots_are_of_use(self) -> SceneConfig:

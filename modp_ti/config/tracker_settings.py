@@ -61,6 +61,8 @@ class TrackerSettings(StrictModel):
     """Whether the tracker works on a live `source.stream`, whose images are not known in advance."""
     is_live: ClassVar[bool] = False
     """Whether the frames arrive from another program and cannot be read again after the run."""
+    places_panoramas: ClassVar[bool] = False
+    """Whether the tracker has poses of images that see all round, which `source.panorama` cuts into faces."""
 
 
 class RecordedSettings(TrackerSettings):
@@ -129,6 +131,7 @@ class TransformsSettings(RecordedSettings):
     """A transforms.json of instant-ngp or nerfstudio."""
 
     brings_cameras: ClassVar[bool] = True
+    places_panoramas: ClassVar[bool] = True
 
     kind: Literal["transforms"] = Field(
         default="transforms", description="a transforms.json of instant-ngp or nerfstudio"
@@ -142,6 +145,7 @@ class KltSettings(TrackerSettings):
     """The built-in tracker, which needs only the images."""
 
     follows_streams: ClassVar[bool] = True
+    places_panoramas: ClassVar[bool] = True
 
     kind: Literal["klt"] = Field(default="klt", description="the built-in tracker, which uses only the images")
     loops: bool = Field(
@@ -191,6 +195,8 @@ class SfmSettings(TrackerSettings):
 class TumSettings(TimedPosesSettings, GivenPosesSettings):
     """A trajectory in TUM's format."""
 
+    places_panoramas: ClassVar[bool] = True
+
     kind: Literal["tum"] = Field(default="tum", description="a trajectory in TUM format")
     path: Path | None = Field(
         default=None,
@@ -201,6 +207,8 @@ class TumSettings(TimedPosesSettings, GivenPosesSettings):
 
 class OrbSlam3Settings(TimedPosesSettings, GivenPosesSettings):
     """A trajectory that ORB-SLAM2 or ORB-SLAM3 wrote."""
+
+    places_panoramas: ClassVar[bool] = True
 
     kind: Literal["orbslam3"] = Field(
         default="orbslam3", description="a trajectory of ORB-SLAM2 or ORB-SLAM3, in TUM or EuRoC format"
@@ -265,6 +273,8 @@ class ReplicaSettings(GivenPosesSettings):
 class MatricesSettings(GivenPosesSettings):
     """Matrices, one per line."""
 
+    places_panoramas: ClassVar[bool] = True
+
     kind: Literal["matrices"] = Field(
         default="matrices", description="text with a 3x4 or 4x4 matrix, camera to world, per line"
     )
@@ -276,6 +286,8 @@ class MatricesSettings(GivenPosesSettings):
 
 class TanksAndTemplesSettings(GivenPosesSettings):
     """The poses of Tanks and Temples."""
+
+    places_panoramas: ClassVar[bool] = True
 
     kind: Literal["tanksandtemples"] = Field(
         default="tanksandtemples", description="a `.log` of Tanks and Temples or Redwood"

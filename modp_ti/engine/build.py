@@ -74,8 +74,8 @@ def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Co
     if isinstance(tracker, RecordedSession):
         return ReplayedRun(config.mapping, tracker)
     if not config.is_realtime:
-        frames, every = tracker.frame_count, config.source.holdout
-        held_out = 0 if frames is None or every is None else -(-frames // every)
+        frames, every, views = tracker.frame_count, config.source.holdout, config.source.panorama.count
+        held_out = 0 if frames is None or every is None else -(-frames // (every * views)) * views
         return Conductor(CompletePace(config.mapping, None if frames is None else frames - held_out))
     recorder = None
     if config.export.session:

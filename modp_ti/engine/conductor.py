@@ -19,7 +19,7 @@ from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, in_seconds
 from pipelines.settings import RefineSettings
 
-__all__ = ["Conductor", "Event", "first_frame", "of_one_size"]
+__all__ = ["Conductor", "Event", "first_frame", "fitting"]
 
 Event = TrackedFrame | PoseCorrection
 
@@ -39,17 +39,15 @@ def first_frame(arriving: FramesAhead[Event]) -> TrackedFrame:
     return first
 
 
-def of_one_size(events: Iterator[Event]) -> Iterator[Event]:
-    """Yield the frames and corrections. Raises InputError at the first frame whose image has another size."""
-    size = None
+def fitting(events: Iterator[Event], mapper: Mapper) -> Iterator[Event]:
+    """Yield the frames and corrections. Raises InputError at the first frame that is too large for the mapper."""
     for event in events:
-        if isinstance(event, TrackedFrame):
-            this = f"{event.camera.width}x{event.camera.height}"
-            size = size or this
-            if this != size:
-                raise InputError(
-                    f"{event.name} is {this}, the first frame {size}: all images of a scene must have one size"
-                )
+        if isinstance(event, TrackedFrame) and not mapper.takes(event.camera.width, event.camera.height):
+            images = mapper.pipeline.renderer.images
+            raise InputError(
+                f"{event.name} is {event.camera.width}x{event.camera.height}, and frames of up to {images.max_width}x"
+                f"{images.max_height} were expected from the first ones: send the largest images first, or one size"
+            )
         yield event
 
 

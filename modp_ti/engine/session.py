@@ -17,7 +17,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import EXPECTED, build_mapper, open_conductor, open_earlier_map, open_observer
-from modp_ti.engine.conductor import Conductor, Event, first_frame, of_one_size
+from modp_ti.engine.conductor import Conductor, Event, first_frame, fitting
 from modp_ti.engine.earlier_map import EarlierMap
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
@@ -172,8 +172,8 @@ class _Session:
 
     def _make_mapper(self, camera: PinholeCamera) -> None:
         """Make the mapper for images of this camera, and for those of an earlier map, unless the present one does."""
-        before = self.tracker.before
-        width, height = max(camera.width, before.width), max(camera.height, before.height)
+        before, largest = self.tracker.before, self.tracker.largest
+        width, height = max(camera.width, before.width, largest[0]), max(camera.height, before.height, largest[1])
         if self.compiling > 0.0:
             if self.mapper.takes(width, height):
                 return
@@ -210,7 +210,7 @@ class _Session:
         self.record.begin()
         try:
             events = self.conductor.events(arriving, mapper, self.stop, self.observer.on_further_step)
-            for frame in of_one_size(events):
+            for frame in fitting(events, mapper):
                 self.checkpointer.digest.add(frame)
                 if isinstance(frame, PoseCorrection):
                     self.conductor.correct(mapper, frame)

@@ -144,6 +144,10 @@ class JoinedTracker(Tracker):
         return self._tracker.scale
 
     @property
+    def largest(self) -> tuple[int, int]:
+        return self._tracker.largest
+
+    @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
         return self._tracker.unreadable
 

@@ -96,6 +96,11 @@ class Tracker(ABC):
         return None
 
     @property
+    def largest(self) -> tuple[int, int]:
+        """Largest width and height of the delivered images, as far as they are known; 0 otherwise."""
+        return 0, 0
+
+    @property
     def further_maps(self) -> int:
         """Number of other maps that the tracker made of the images, which are mapped in runs of their own."""
         return 0

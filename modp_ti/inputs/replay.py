@@ -109,6 +109,11 @@ class ReplayedTracker(Tracker):
     def undistorter(self) -> Undistorter | None:
         return self.frames[self._part.start].undistorter if self._part else None
 
+    @property
+    def largest(self) -> tuple[int, int]:
+        cameras = {frame.undistorter.camera for frame in self.frames}
+        return max(camera.width for camera in cameras), max(camera.height for camera in cameras)
+
     def close(self) -> None:
         """Close the image source."""
         self._reader.images.close()
@@ -192,12 +197,18 @@ def tracked_frame(
         vignette=picture.vignette,
         held_out=is_held_out(index if place is None else place, reader.source),
         arrived=reader.images.arrived(frame.name),
+        views=reader.source.panorama.count,
     )
 
 
 def is_held_out(index: int, source: SourceSettings) -> bool:
-    """Return whether the frame at position `index` is only for evaluation."""
-    return source.holdout is not None and index % source.holdout == 0
+    """Return whether the frame at position `index` is only for evaluation. A panorama's faces are held out together.
+
+    Args:
+        index: Position among all frames, faces included.
+        source: Settings of the images.
+    """
+    return source.holdout is not None and index // source.panorama.count % source.holdout == 0
 
 
 def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:

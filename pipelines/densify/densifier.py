@@ -100,7 +100,7 @@ class Densifier:
             column, row = np.floor(pixels).astype(int).T
             depth = self.settings.depth
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
-            neighbours = self.keyframes.selected[:-1][-depth.neighbours :] if depth.neighbours else []
+            neighbours = self.keyframes.before(view.index, depth.neighbours)
             seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit, depth.max_misplacement)
         self._grow(seeds, view)
 

@@ -37,13 +37,18 @@ class KeyframeSelector:
         self.previous: int | None = None
 
     def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
-        """Whether `frame` becomes a keyframe, given the latest keyframe `last`. Call it once per frame, in order."""
+        """Whether `frame` becomes a keyframe. Call it once per frame, in order.
+
+        Args:
+            frame: The frame.
+            last: The latest keyframe of the same view; None if there is none.
+        """
         previous, self.previous = self.previous, frame.index
         if len(frame.points) < self.settings.min_points:
             return False
         if last is None or previous is None:
             return True
-        if frame.index - last.index > self.settings.max_gap:
+        if frame.index - last.index > self.settings.max_gap * frame.views:
             return True
         if rotation_per_frame(
             previous, self.trajectory[previous], frame

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import wraps
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.inspection.finding import Finding, note, unusable, warning
+from modp_ti.inputs.inspection.finding import Finding, note, warning
 from modp_ti.inputs.inspection.survey import FrameRecord
 
 __all__ = ["blurred", "duplicates", "judge_sequence", "time_gaps"]
@@ -25,6 +26,18 @@ MANY_BLURRED, MANY_DUPLICATES = 0.2, 0.1
 NAMED = 5  # frames that a finding names, at most
 
 
+def each_view(check: Callable[[Sequence[FrameRecord]], list[int]]) -> Callable[[Sequence[FrameRecord]], list[int]]:
+    """Apply a check to the frames of each view of a rig by themselves, and return the indices of all frames found."""
+
+    @wraps(check)
+    def checked(frames: Sequence[FrameRecord]) -> list[int]:
+        views = frames[0].views if frames else 1
+        return sorted(view + views * i for view in range(views) for i in check(frames[view::views]))
+
+    return checked
+
+
+@each_view
 def blurred(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames that are less sharp than their neighbours."""
     sharp = np.array([frame.sharpness for frame in frames])
@@ -36,11 +49,13 @@ def blurred(frames: Sequence[FrameRecord]) -> list[int]:
     return result
 
 
+@each_view
 def duplicates(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames whose image repeats the one before."""
     return [i for i, frame in enumerate(frames) if frame.change < SAME]
 
 
+@each_view
 def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames that follow a gap in time."""
     steps = np.diff([frame.timestamp for frame in frames])
@@ -49,13 +64,18 @@ def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
     return (np.flatnonzero(steps > GAP * np.median(steps)) + 1).tolist()
 
 
+@each_view
+def steps_back(frames: Sequence[FrameRecord]) -> list[int]:
+    """Indices of frames that are not later than the one before."""
+    return (np.flatnonzero(np.diff([frame.timestamp for frame in frames]) <= 0) + 1).tolist()
+
+
 def judge_sequence(frames: Sequence[FrameRecord]) -> Iterator[Finding]:
     """Judge image sizes, time stamps and image quality."""
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
-        text = ", ".join(f"{w}x{h}" for w, h in sizes)
-        yield unusable("sizes", f"images of several sizes: {text}", "all of a scene must have one size")
-    back = np.flatnonzero(np.diff([frame.timestamp for frame in frames]) <= 0) + 1
+        yield note("sizes", f"images of several sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}")
+    back = steps_back(frames)
     if len(back):
         text = f"time does not go on at {len(back)} frames: {_names(frames, back)}"
         yield warning("time_order", text, "sort the frames by time, or mend the times")

@@ -46,7 +46,7 @@ def measure_scale(frames: Sequence[FrameRecord]) -> Scale:
     """Measure depth and camera motion. There must be at least one frame."""
     depths = np.array([frame.depth for frame in frames])
     depth = float(np.nanmedian(depths)) if np.isfinite(depths).any() else float("nan")
-    places = camera_centres([frame.T_camera_world for frame in frames])
+    places = camera_centres([frame.T_camera_world for frame in frames[:: frames[0].views]])
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1) / depth
     extent = float(np.linalg.norm(np.ptp(places, axis=0)) / depth)
     if len(steps) == 0:

@@ -18,7 +18,7 @@ from pipelines.select.sharpness import sharpness
 
 __all__ = ["FrameRecord", "Survey", "survey"]
 
-# At PLACES frames of the sequence, features are matched with the frames GAPS further on.
+# At PLACES frames of the sequence, features are matched with the frames of the same view GAPS times further on.
 GAPS = (1, 2, 4)
 PLACES = 8
 # Distance between these places if the number of frames is unknown.
@@ -40,8 +40,10 @@ class FrameRecord:
         points: Number of tracked points.
         depth: Their median depth [scene units]; NaN without points.
         sharpness: Sharpness as in `pipelines.select.sharpness`.
-        change: Mean difference to the frame before [grey levels of 255] at thumbnail size; NaN for the first frame.
+        change: Mean difference to the frame before of the same view [grey levels of 255] at thumbnail size; NaN for the
+            first frame.
         masked: Share of masked pixels.
+        views: Number of views that are taken at one time.
     """
 
     index: int
@@ -55,6 +57,7 @@ class FrameRecord:
     sharpness: float
     change: float
     masked: float
+    views: int = 1
 
 
 @dataclass
@@ -86,24 +89,25 @@ def survey(frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[in
     anchors = range(0, PLACES * LIVE_SPACING, LIVE_SPACING)
     if total is not None:
         anchors = set(np.linspace(0, max(total - 1 - GAPS[-1], 0), PLACES).astype(int).tolist())
-    before: NDArray[np.float32] | None = None
+    before: dict[int, NDArray[np.float32]] = {}  # by view
     for place, frame in enumerate(frames):
+        view, gaps = place % frame.views, [gap * frame.views for gap in GAPS]
         rgb = np.ascontiguousarray(frame.rgba[..., :3])
         thumbnail = _thumbnail(rgb)
-        result.frames.append(_record(frame, rgb, thumbnail, before))
-        before = thumbnail
+        result.frames.append(_record(frame, rgb, thumbnail, before.get(view)))
+        before[view] = thumbnail
         for convention in CONVENTIONS:
             errors[convention].append(_reprojection_errors(frame, convention))
 
-        wanted = [a for a in range(max(place - GAPS[-1], 0), place + 1) if a in anchors]
-        if any(place - a in (0, *GAPS) for a in wanted):
+        wanted = [a for a in range(max(place - gaps[-1], 0), place + 1) if a in anchors]
+        if any(place - a in (0, *gaps) for a in wanted):
             features[place] = detect_features(rgb)
         for a in wanted:
-            if place - a in GAPS and a in features:
+            if place - a in gaps and a in features:
                 pair = matched_pair(a, features[a], place, features[place])
                 if pair is not None:
                     result.pairs.append(pair)
-        features.pop(place - GAPS[-1], None)
+        features.pop(place - gaps[-1], None)
         seen(place + 1)
     result.reprojection = {c: np.concatenate([np.zeros(0, np.float32), *each]) for c, each in errors.items()}
     return result
@@ -129,6 +133,7 @@ def _record(
         sharpness=sharpness(rgb),
         change=change,
         masked=0.0 if frame.mask is None else float(1.0 - frame.mask.mean()),
+        views=frame.views,
     )
 
 

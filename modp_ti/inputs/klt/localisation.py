@@ -11,7 +11,7 @@ from modp_ti.inputs.klt.optical_flow import BORDER
 from modp_ti.inputs.klt.patch_alignment import align_landmarks, reference_views
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 
-__all__ = ["FEWEST", "MAX_ERROR", "SIGMA", "localised", "realigned", "searched"]
+__all__ = ["FEWEST", "MAX_ERROR", "SIGMA", "localised", "predicted_pixels", "realigned", "searched"]
 
 MAX_ERROR = 3.0  # landmarks with a larger reprojection error [px] are no longer tracked
 SIGMA = 1.0  # px, scale of the robust loss
@@ -51,8 +51,35 @@ def localised(landmarks: LandmarkMap, frame: Frame, T_guess: NDArray[np.float64]
     return LocalisedFrame(frame.number, frame.grey, frame.valid, frame.ids[kept], frame.pixels[kept], T_camera_world=T)
 
 
-def searched(landmarks: LandmarkMap, frame: LocalisedFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def predicted_pixels(
+    landmarks: LandmarkMap, last: LocalisedFrame, T_camera_world: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Predict the pixels (N, 2) of a frame's features at another pose (4, 4).
+
+    Untriangulated features are given the median depth.
+    """
+    lens, T, T_last = landmarks.lens, T_camera_world, last.T_camera_world
+    known = landmarks.known[last.ids]
+    world = landmarks.xyz[last.ids].copy()
+    depth = world[known] @ T_last[2, :3] + T_last[2, 3]
+    typical = float(np.median(depth)) if len(depth) else 1.0
+    rays = lens.rays(last.pixels[~known])
+    world[~known] = (np.c_[rays, np.ones(len(rays))] * typical - T_last[:3, 3]) @ T_last[:3, :3]
+    guess = lens.pixels(world @ T[:3, :3].T + T[:3, 3])
+    # The reprojection error of each feature is assumed to persist.
+    guess = guess + (last.pixels - lens.pixels(world @ T_last[:3, :3].T + T_last[:3, 3]))
+    return np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, last.pixels)
+
+
+def searched(
+    landmarks: LandmarkMap, frame: LocalisedFrame, elsewhere: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Search a frame for landmarks of the map that should be visible but are not tracked.
+
+    Args:
+        landmarks: The map.
+        frame: The frame.
+        elsewhere: (K,) ids that are not searched for, because other views of the same time have them.
 
     Returns:
         Ids (M,) of the landmarks that were found, and their pixels (M, 2).
@@ -61,6 +88,8 @@ def searched(landmarks: LandmarkMap, frame: LocalisedFrame) -> tuple[NDArray[np.
     height, width = frame.grey.shape
     candidate = landmarks.known.copy()
     candidate[frame.ids] = False
+    if elsewhere is not None:
+        candidate[elsewhere] = False
     candidate &= (landmarks.looked < 4) | (landmarks.found > 0.25 * landmarks.looked)
     candidate = np.flatnonzero(candidate)
     at = landmarks.lens.pixels(landmarks.xyz[candidate] @ T[:3, :3].T + T[:3, 3])

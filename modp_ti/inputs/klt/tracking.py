@@ -14,7 +14,7 @@ from fields.geometry.similarity import moved_pose, scale_of
 from modp_ti.inputs.klt.camera_refinement import CameraRefinement, is_plausible
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, realigned, searched
+from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, predicted_pixels, realigned, searched
 from modp_ti.inputs.klt.map_revision import carry_over
 from modp_ti.inputs.klt.relocalisation import alike_keyframes, inherited, place_by_features, thumbnail
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
@@ -156,7 +156,7 @@ class Tracking:
 
     def _follow(self, last: LocalisedFrame, frame: Frame) -> View | None:
         predicted = orthonormalised(self.motion @ last.T_camera_world)
-        frame.track(last, self._predicted(last, predicted))
+        frame.track(last, predicted_pixels(self.map, last, predicted))
         located = self.localised(frame, predicted)
         if located is None:  # retry without the constant-velocity prediction
             frame.track(last)
@@ -173,20 +173,6 @@ class Tracking:
             self._adjust_last(WIDE_WINDOW)
             located.T_camera_world = self.pose(view)
         return view
-
-    def _predicted(self, last: LocalisedFrame, T: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predict the pixels of the tracked features at pose T. Untriangulated ones are given the median depth."""
-        lens, T_last = self.map.lens, last.T_camera_world
-        known = self.map.known[last.ids]
-        world = self.map.xyz[last.ids].copy()
-        depth = world[known] @ T_last[2, :3] + T_last[2, 3]
-        typical = float(np.median(depth)) if len(depth) else 1.0
-        rays = lens.rays(last.pixels[~known])
-        world[~known] = (np.c_[rays, np.ones(len(rays))] * typical - T_last[:3, 3]) @ T_last[:3, :3]
-        guess = lens.pixels(world @ T[:3, :3].T + T[:3, 3])
-        # The reprojection error of each feature is assumed to persist.
-        guess = guess + (last.pixels - lens.pixels(world @ T_last[:3, :3].T + T_last[:3, 3]))
-        return np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, last.pixels)
 
     # ------------------------------------------------------------------------------------------------- keyframes
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import inverse_se3
+
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -49,8 +51,12 @@ def adjusted_bundle(
     steps: int,
     loss_width: float = 1.0,
     refined: Collection[Refinable] = (),
+    mounts: NDArray[np.float64] | None = None,
 ) -> Bundle | None:
     """Minimise the reprojection error under a Cauchy loss over poses and points.
+
+    With `mounts`, the views are those of a rig of C cameras: view k is of camera k % C at place k // C of the rig. The
+    views of a place keep their poses relative to each other, and are free or fixed together.
 
     Args:
         camera: Camera of all views, with camera_id 1.
@@ -64,6 +70,7 @@ def adjusted_bundle(
         steps: Levenberg-Marquardt steps at most.
         loss_width: Scale of the Cauchy loss [px].
         refined: Parts of the camera that are optimised too.
+        mounts: (C, 4, 4) T_camera_rig of the cameras of a rig, which are not optimised; None for single cameras.
 
     Returns:
         The optimised poses, camera and points, without those that only one view observes; None if Ceres finds no usable
@@ -72,14 +79,18 @@ def adjusted_bundle(
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
-    model.add_camera_with_trivial_rig(camera)
-    tracks = _add_views(model, config, poses, view, point, pixels, free)
+    if mounts is None:
+        model.add_camera_with_trivial_rig(camera)
+    else:
+        _add_rig(model, config, camera, mounts, poses, free)
+    tracks = _add_views(model, config, poses, view, point, pixels, free, 1 if mounts is None else len(mounts))
     # One ray constrains nothing, and COLMAP refuses it.
     names = {number: model.add_point3D(xyz[number], track) for number, track in tracks if track.length() > 1}
     if len(free) == len(poses):
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     if not refined:
-        config.set_constant_cam_intrinsics(1)
+        for number in model.cameras:
+            config.set_constant_cam_intrinsics(number)
 
     options = _options(steps, loss_width, refined)
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -94,6 +105,40 @@ def adjusted_bundle(
     return Bundle(_adjusted_poses(model, free), numbers[finite], places[finite], model.camera(1), float(cost))
 
 
+def _add_rig(
+    model: pycolmap.Reconstruction,
+    config: pycolmap.BundleAdjustmentConfig,
+    camera: pycolmap.Camera,
+    mounts: NDArray[np.float64],
+    poses: Mapping[int, NDArray[np.float64]],
+    free: Collection[int],
+) -> None:
+    """Add a rig of equal cameras, and the places where it was. Place n becomes frame n + 1."""
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    count = len(mounts)
+    rig = pycolmap.Rig(rig_id=1)
+    sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number + 1) for number in range(count)]
+    for number, sensor in enumerate(sensors):
+        size = {"width": camera.width, "height": camera.height}
+        model.add_camera(pycolmap.Camera(camera_id=number + 1, model=camera.model, params=camera.params, **size))
+        if number == 0:
+            rig.add_ref_sensor(sensor)
+        else:
+            rig.add_sensor(sensor, pycolmap.Rigid3d((mounts[number] @ inverse_se3(mounts[0]))[:3]))
+    model.add_rig(rig)
+    for place in dict.fromkeys(k // count for k in poses):
+        frame = pycolmap.Frame(frame_id=place + 1, rig_id=1)
+        views = [k for k in poses if k // count == place]
+        for k in views:
+            frame.add_data_id(pycolmap.data_t(sensors[k % count], k + 1))
+        model.add_frame(frame)
+        T_rig_world = inverse_se3(mounts[views[0] % count] @ inverse_se3(mounts[0])) @ poses[views[0]]
+        model.frame(place + 1).rig_from_world = pycolmap.Rigid3d(T_rig_world[:3])
+        if views[0] not in free:
+            config.set_constant_rig_from_world_pose(place + 1)
+
+
 def _add_views(
     model: pycolmap.Reconstruction,
     config: pycolmap.BundleAdjustmentConfig,
@@ -102,8 +147,9 @@ def _add_views(
     point: NDArray[np.int64],
     pixels: NDArray[np.float64],
     free: Collection[int],
+    cameras: int,
 ) -> Iterator[tuple[int, pycolmap.Track]]:
-    """Add the views with their observations. View k becomes image k + 1.
+    """Add the views with their observations. View k becomes image k + 1, of the only camera or of one of a rig.
 
     Returns:
         Every observed point, in the order of their first observations, with its track.
@@ -112,10 +158,15 @@ def _add_views(
 
     mine = {k: np.flatnonzero(view == k) for k in poses}
     for k, T in poses.items():
-        image = pycolmap.Image(name=str(k), keypoints=pixels[mine[k]], camera_id=1, image_id=k + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
+        number = k % cameras + 1
+        image = pycolmap.Image(name=str(k), keypoints=pixels[mine[k]], camera_id=number, image_id=k + 1)
+        if cameras == 1:
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
+        else:
+            image.frame_id = k // cameras + 1
+            model.add_image(image)
         config.add_image(k + 1)
-        if k not in free:
+        if cameras == 1 and k not in free:
             config.set_constant_rig_from_world_pose(k + 1)
     images = np.repeat([k + 1 for k in mine], [len(rows) for rows in mine.values()])
     places = np.concatenate([np.arange(len(rows)) for rows in mine.values()])

@@ -14,6 +14,7 @@ from modp_ti.inputs.sources.data_sets import (
     open_sevenscenes,
 )
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.inputs.sources.faces import PanoramaFaces
 from modp_ti.inputs.sources.frame_reader import FrameReader, Picture
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.intrinsics import Intrinsics, given_intrinsics
@@ -71,6 +72,8 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
     images = _OPENERS[kind](path, source) if kind in _OPENERS else _open_capture(path, kind, source)
     if source.kind == "auto" and kind not in ("images", "video", "vrs"):
         images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
+    if source.panorama.given:
+        return _scaled(PanoramaFaces(images, source.panorama), source)
     images = _scaled(_with_camera(images, source), source)
     return PacedSource(images) if source.realtime else images
 
@@ -182,14 +185,14 @@ def _scaled(images: ImageSource, source: SourceSettings) -> ImageSource:
 
 def _first_size(images: ImageSource, source: SourceSettings) -> tuple[int, int] | None:
     """Return the size (width, height) of the first readable image of those selected, or None."""
-    names = images.names[source.start : source.stop : source.step]
+    names = images.whole.names[source.start : source.stop : source.step]
     if not names and images.names:
         return None
     if not names:  # a live source
         return images.frame_size
     for name in names:
         try:
-            return images.size(name)
+            return images.size(images.views(name)[0])
         except UnreadableImageError:
             continue
     return None

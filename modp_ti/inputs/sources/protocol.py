@@ -85,6 +85,20 @@ class ImageSource(ABC):
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def whole(self) -> ImageSource:
+        """The source of the images that poses are of: this one, but that of the panoramas for faces cut from them."""
+        return self
+
+    @property
+    def mounts(self) -> Sequence[NDArray[np.float64]]:
+        """Poses T_view_rig (4, 4) of the views that each image of `whole` gives."""
+        return [np.eye(4)]
+
+    def views(self, name: str) -> Sequence[str]:
+        """Return the names of the views that the image `name` of `whole` gives."""
+        return [name]
+
     def position(self, name: str) -> int:
         """Return the position of an image in `names`, from 0."""
         return self._position[name]

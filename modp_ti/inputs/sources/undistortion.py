@@ -11,7 +11,7 @@ from fields.frames.camera_revision import CameraRevision
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 
-__all__ = ["Undistorter", "both_valid"]
+__all__ = ["Undistorter", "both_valid", "undistorter_beside"]
 
 # The inverse of the lens model is searched up to this multiple of the image corner's radius.
 SEARCH_MARGIN = 1.5
@@ -170,6 +170,24 @@ class Undistorter:
         inside = np.linalg.norm(ideal, axis=-1) <= self.distortion.valid_radius(self._limit)
         inside &= camera.contains(source.reshape(-1, 2)).reshape(inside.shape)
         return source, inside
+
+
+def undistorter_beside(
+    first: Undistorter | None, raw: PinholeCamera, distortion: Distortion, scale: float
+) -> Undistorter:
+    """Return the undistorter of an image of a scene.
+
+    Images of another size than the first one are scaled so that their longer side becomes that of the first one.
+
+    Args:
+        first: The undistorter of the scene's first image; None for that image itself.
+        raw: Intrinsics and size of the stored image.
+        distortion: Its lens distortion.
+        scale: Factor on width and height of the first image, and of others of its size.
+    """
+    if first is not None and (raw.width, raw.height) != (first.raw.width, first.raw.height):
+        scale = max(first.camera.width, first.camera.height) / max(raw.width, raw.height)
+    return Undistorter(raw, distortion, scale)
 
 
 def both_valid(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:

@@ -18,8 +18,9 @@ from modp_ti.inputs.sources import Distortion, Undistorter, open_source
 from modp_ti.inputs.sources.distortion import colmap_intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
+from modp_ti.inputs.sources.undistortion import undistorter_beside
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
-from modp_ti.inputs.trackers.given_poses import checked_reader, matched_entries
+from modp_ti.inputs.trackers.given_poses import checked_reader, matched_entries, sizes_note
 from modp_ti.inputs.trackers.stored_cameras import turn_of_camera, turned_note
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ def open_colmap(source: SourceSettings, tracker: ColmapSettings, upright: bool =
             turns[name] = turn_of_camera(images, name, camera.width, camera.height, str(folder))
         key = image.camera_id, turns[name]
         if key not in undistorters:
-            undistorters[key] = Undistorter(*turns[name].camera(camera, lens), images.scale)
+            first = next(iter(undistorters.values()), None)
+            undistorters[key] = undistorter_beside(first, *turns[name].camera(camera, lens), images.scale)
         cameras[name] = undistorters[key]
     notes += turned_note(turns.values(), str(folder))
     reader = checked_reader(images, source, cameras, str(folder))
@@ -73,7 +75,7 @@ def open_colmap(source: SourceSettings, tracker: ColmapSettings, upright: bool =
         T_camera_world = turns[name].T_turned_stored @ checked_pose(matrix, f"{folder}: image {image.name}")
         points = _observed_points(image, positions, cameras[name], turns[name], T_camera_world, folder)
         frames.append(PosedImage(name, cameras[name], T_camera_world, points))
-    return ReplayedTracker(reader, frames, notes)
+    return ReplayedTracker(reader, frames, [*notes, *sizes_note(frames)])
 
 
 def _model_folder(images: Path, given: Path | None) -> Path:

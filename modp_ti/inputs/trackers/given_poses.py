@@ -33,16 +33,19 @@ __all__ = [
     "read_entries",
     "replay_poses",
     "selected_frames",
+    "sizes_note",
     "solving",
     "spread_points",
+    "triangulated_views",
+    "views_at",
 ]
 
 T = TypeVar("T")
 
 
 def selected_frames(images: ImageSource, source: SourceSettings) -> Sequence[str]:
-    """Return the images selected by source.start/stop/step, in order."""
-    return images.selected(source.start, source.stop, source.step)
+    """Return the images selected by source.start/stop/step, in order; of panoramas, the whole images."""
+    return images.whole.selected(source.start, source.stop, source.step)
 
 
 def read_entries(
@@ -95,7 +98,7 @@ def matched_entries(
     absent = []
     for number, (stated, content) in enumerate(entries):
         label = f"{number} ({stated})"
-        name = images.find(stated)
+        name = images.whole.find(stated)
         if name is None:
             absent.append(stated)
         elif name in found:
@@ -105,7 +108,7 @@ def matched_entries(
     if not found:
         raise InputError(
             f"{origin}: none of its {len(absent)} {what} is in {images.path}: the first is {absent[0]}, there is "
-            f"{images.names[0]}; check source.path"
+            f"{images.whole.names[0]}; check source.path"
         )
     selected = selected_frames(images, source)
     matched = {name: found[name][1] for name in selected if name in found}
@@ -193,6 +196,8 @@ def posed_images(
 ) -> tuple[FrameReader, list[PosedImage]]:
     """Create the reader and the frames of images that one camera took; see `checked_reader`.
 
+    Each image of a rig gives a frame of each of its views.
+
     Args:
         images: The image source.
         source: Settings of the images.
@@ -204,8 +209,26 @@ def posed_images(
         InputError: As for `checked_reader`, or if the camera is unknown.
     """
     undistorter = (intrinsics or require_intrinsics(images)).undistorter(images.scale)
-    reader = checked_reader(images, source, dict.fromkeys(poses, undistorter), origin)
-    return reader, [PosedImage(name, undistorter, T) for name, T in poses.items()]
+    frames = [frame for name, T in poses.items() for frame in views_at(images, name, undistorter, T)]
+    return checked_reader(images, source, {frame.name: undistorter for frame in frames}, origin), frames
+
+
+def views_at(
+    images: ImageSource, name: str, undistorter: Undistorter, T_rig_world: NDArray[np.float64]
+) -> list[PosedImage]:
+    """Return the views of an image of `images.whole` at its pose (4, 4): one, or the faces of a panorama."""
+    views = zip(images.views(name), images.mounts, strict=True)
+    return [PosedImage(view, undistorter, T_view_rig @ T_rig_world) for view, T_view_rig in views]
+
+
+def sizes_note(frames: Sequence[PosedImage]) -> list[str]:
+    """Return a remark on the sizes at which images are mapped, or an empty list if there is one."""
+    cameras = [frame.undistorter.camera for frame in frames]
+    sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)
+    raw = {(frame.undistorter.raw.width, frame.undistorter.raw.height) for frame in frames}
+    if len(raw) < 2:
+        return []
+    return [f"the images have {len(raw)} sizes: they are mapped at {', '.join(sizes)}"]
 
 
 def missing_frames_note(selected: Sequence[str], posed: Mapping[str, object], origin: str) -> list[str]:
@@ -257,8 +280,17 @@ def replay_poses(
             frames, note = adjusted_frames(images, frames, solves, progress)
             notes = [*notes, note]
         else:
-            frames = triangulated_frames(images, frames, solves, progress)
+            frames = triangulated_views(images, frames, solves, progress)
     return ReplayedTracker(reader, frames, notes)
+
+
+def triangulated_views(
+    images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_], progress: Progress | None
+) -> list[PosedImage]:
+    """Triangulate points as `triangulated_frames` does, view by view of a rig: the frames of one view are a video."""
+    order = np.argsort(np.arange(len(frames)) % len(images.mounts), kind="stable")
+    found = triangulated_frames(images, [frames[i] for i in order], solves[order], progress)
+    return [found[i] for i in np.argsort(order)]
 
 
 def solving(frames: Sequence[PosedImage], source: SourceSettings) -> NDArray[np.bool_]:

@@ -90,13 +90,15 @@ def _replayed(
     """Replay the images by their positions in the source."""
     images = open_source(source)
     selected = selected_frames(images, source)
-    posed = {name: poses[images.position(name)] for name in selected if images.position(name) in poses}
+    position = images.whole.position
+    posed = {name: poses[position(name)] for name in selected if position(name) in poses}
     if not posed:
         raise InputError(f"{file}: has no pose for any of the {len(selected)} frames that are selected")
     notes = missing_frames_note(selected, posed, file.name)
     most = max(poses)
-    if most >= len(images):
-        notes.append(f"{file.name} has poses of {most + 1} images, there are {len(images)}: do they belong together?")
+    if most >= len(images.whole):
+        there = len(images.whole)
+        notes.append(f"{file.name} has poses of {most + 1} images, there are {there}: do they belong together?")
     return replay_poses(images, source, tracker, posed, notes, progress)
 
 

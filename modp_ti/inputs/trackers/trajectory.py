@@ -118,7 +118,7 @@ def rows_at_frames(
         InputError: If no image has a pose.
     """
     names = selected_frames(images, source)
-    of_frames = np.array([images.timestamp(name) for name in names])
+    of_frames = np.array([images.whole.timestamp(name) for name in names])
     shifted = times + tracker.time_offset
     pairs = associate(of_frames, shifted, tracker.max_difference)
     if len(pairs) == 0:

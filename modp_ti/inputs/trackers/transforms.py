@@ -18,12 +18,22 @@ from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files import is_file
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.captures.capture import OPENCV_OPENGL
-from modp_ti.inputs.multiview.triangulation import triangulated_frames
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
 from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter, open_source
 from modp_ti.inputs.sources.intrinsics import require_plausible
-from modp_ti.inputs.trackers.given_poses import checked_reader, found_file, matched_entries, read_entries, solving
+from modp_ti.inputs.sources.protocol import require_intrinsics
+from modp_ti.inputs.sources.undistortion import undistorter_beside
+from modp_ti.inputs.trackers.given_poses import (
+    checked_reader,
+    found_file,
+    matched_entries,
+    read_entries,
+    sizes_note,
+    solving,
+    triangulated_views,
+    views_at,
+)
 from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
 from modp_ti.inputs.trackers.stored_cameras import turn_of_camera, turned_note
 
@@ -53,23 +63,24 @@ def open_transforms(
     data, stated = read_entries(file, "frames", "file_path", f"a {NAME}")
     entries, notes = matched_entries(images, source, stated, file, file.name, "frames")
 
+    face = None if images.whole is images else require_intrinsics(images).undistorter(images.scale)
     undistorters: dict[tuple[PinholeCamera, Distortion], Undistorter] = {}
     frames, turns = [], []
     for name, entry in entries.items():
+        if face is not None:  # the source knows the camera of a panorama's faces
+            frames += views_at(images, name, face, _pose(entry, file))
+            continue
         raw, distortion = _intrinsics({**data, **entry}, images, name, file)
         turn = turn_of_camera(images, name, raw.width, raw.height, str(file))
         turns.append(turn)
         raw, distortion = turn.camera(raw, distortion)
         undistorter = undistorters.get((raw, distortion))
         if undistorter is None:
-            like = frames[0].undistorter.camera if frames else None
-            undistorter = undistorters[raw, distortion] = _undistorter(raw, distortion, images.scale, like, name)
+            first = frames[0].undistorter if frames else None
+            undistorter = undistorters[raw, distortion] = undistorter_beside(first, raw, distortion, images.scale)
         frames.append(PosedImage(name, undistorter, turn.T_turned_stored @ _pose(entry, file)))
     notes += turned_note(turns, str(file))
-    size = frames[0].undistorter.raw.width, frames[0].undistorter.raw.height
-    others = sum((frame.undistorter.raw.width, frame.undistorter.raw.height) != size for frame in frames)
-    if others:
-        notes.append(f"{others} of {len(frames)} images have another size than the first: they are scaled to its size")
+    notes += sizes_note(frames)
     reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(file))
 
     cloud = data.get("ply_file_path")
@@ -80,28 +91,8 @@ def open_transforms(
     else:
         if cloud is not None:
             notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
-        frames = triangulated_frames(images, frames, solving(frames, source), progress)
+        frames = triangulated_views(images, frames, solving(frames, source), progress)
     return ReplayedTracker(reader, frames, notes)
-
-
-def _undistorter(
-    raw: PinholeCamera, lens: Distortion, scale: float, like: PinholeCamera | None, name: str
-) -> Undistorter:
-    """Return the undistorter to the working size, which is that of the camera `like` if there is one.
-
-    Raises:
-        InputError: If the image has another shape, so that it cannot be scaled to that size.
-    """
-    found = Undistorter(raw, lens, scale)
-    if like is None or (found.camera.width, found.camera.height) == (like.width, like.height):
-        return found
-    found = Undistorter(raw, lens, like.width / raw.width)
-    if (found.camera.width, found.camera.height) != (like.width, like.height):
-        raise InputError(
-            f"{name} is {raw.width}x{raw.height}, which has another shape than the first image, mapped at "
-            f"{like.width}x{like.height}: all images of a scene must have one shape; map those of each camera alone"
-        )
-    return found
 
 
 def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:

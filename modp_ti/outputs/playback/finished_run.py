@@ -58,6 +58,11 @@ class FinishedRun:
             raise InputError(f"{self.folder / 'splats.ply'}: the map holds no Gaussian")
         return state
 
+    @cached_property
+    def way(self) -> NDArray[np.int64]:
+        """Positions (M,) of the frames along the camera's way: all, but of the frames of one time only the first."""
+        return np.flatnonzero(np.diff(self.timestamps, prepend=np.nan) != 0)
+
     @property
     def mapped(self) -> list[int]:
         """Positions of the frames that were not held out."""

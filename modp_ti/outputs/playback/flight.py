@@ -82,21 +82,23 @@ def plan_flight(
     exposures = _exposures(run, path) if exposure else None
     times = None
     if path == "smoothed":
-        poses = smoothed(run.poses, frames or max(DEFAULT_FRAMES, len(run)), deviation)
+        poses = smoothed(run.poses[run.way], frames or max(DEFAULT_FRAMES, len(run.way)), deviation)
     elif path == "orbit":
         poses = orbit(run.poses[run.record.keyframes], run.record.scene_depth, frames or DEFAULT_FRAMES)
     else:
         if frames is not None:
             raise InputError("--frames is for the paths `smoothed` and `orbit`: the others have poses of their own")
         if path == "recorded":
-            times, poses = run.timestamps, run.poses
+            times, poses = run.timestamps[run.way], run.poses[run.way]
         elif Path(path).expanduser().is_file():
             times, poses = read_trajectory(Path(path).expanduser())
         else:
             raise InputError(f"--path {path}: no such file, and none of {', '.join(PATHS)}")
     if len(poses) == 0:
         raise InputError(f"--path {path}: holds no pose")
-    own = run.cameras if path == "recorded" else [run.cameras[run.record.keyframes[0]]] * len(poses)
+    own = (
+        [run.cameras[i] for i in run.way] if path == "recorded" else [run.cameras[run.record.keyframes[0]]] * len(poses)
+    )
     cameras = [_lens(camera, size, fov) for camera in own]
     return Flight(poses, cameras, fps or _rate(times), exposures)
 
@@ -147,7 +149,7 @@ def _exposures(run: FinishedRun, path: str) -> list[NDArray[np.float64]]:
         raise InputError(f"{run.folder}: no exposures were estimated (mapping.exposure.enabled): leave out --exposure")
     if missing := [index for index in range(len(run)) if index not in known]:
         raise InputError(f"{run.folder / 'exposure.json'}: frame {missing[0]} is missing")
-    return [known[index] for index in range(len(run))]
+    return [known[index] for index in run.way.tolist()]
 
 
 def _lens(camera: PinholeCamera, size: tuple[int, int] | None, fov: float | None) -> PinholeCamera:

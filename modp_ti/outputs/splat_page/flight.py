@@ -93,7 +93,7 @@ def viewer_settings(run: FinishedRun, levelled: Levelled) -> dict[str, Any]:
     span = float(np.ptp(run.timestamps))
     duration = round(float(np.clip(span, SHORTEST, LONGEST)), DIGITS)
     count = round(duration * KEYS_PER_SECOND) + 1
-    poses = smoothed(run.poses, count, DEVIATION)
+    poses = smoothed(run.poses[run.way], count, DEVIATION)
     eyes = camera_centres(poses)
     targets = eyes + run.record.scene_depth * poses[:, 2, :3]
     position, target = ((TO_VIEWER * levelled.points(points)).round(DIGITS) for points in (eyes, targets))

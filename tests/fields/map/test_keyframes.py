@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,21 @@ def test_frames_between_keyframes_share_their_corrections() -> None:
     b.T_camera_world = exp_se3(3 * twist) @ b.T_tracked
     for index, share in ((0, 1.0), (10, 1.0), (15, 2.0), (20, 3.0), (99, 3.0)):
         np.testing.assert_allclose(store.corrected(index, T), exp_se3(share * twist) @ T, atol=1e-12)
+
+
+def test_the_views_of_a_rig_share_corrections_with_their_own_keyframes_only() -> None:
+    store = KeyframeStore()
+    T = exp_se3([1, 0, 0, 0, 0.3, 0])
+    twists = {0: [0.2, 0, 0, 0, 0, 0], 1: [0, 0.1, 0, 0, 0, 0.1], 6: [0.4, 0, 0, 0, 0, 0]}
+    for index, twist in twists.items():
+        keyframe = store.append(replace(frame(index), views=3))
+        keyframe.T_camera_world = exp_se3(twist) @ keyframe.T_tracked
+    for index, motion in ((3, exp_se3([0.3, 0, 0, 0, 0, 0])), (4, exp_se3(twists[1])), (5, np.eye(4))):
+        np.testing.assert_allclose(store.corrected(index, T), motion @ T, atol=1e-12)
+    assert [keyframe.index for keyframe in store.before(9, 5)] == [0, 6]
+    assert [keyframe.index for keyframe in store.before(6, 5)] == [0]
+    assert [keyframe.index for keyframe in store.before(7, 1)] == [1]
+    assert store.before(8, 1) == []
 
 
 def test_a_new_keyframe_begins_with_the_correction_of_the_last() -> None:

@@ -398,6 +398,25 @@ def test_a_run_that_goes_on_with_another_map_waits_for_no_clock(scene, override:
     assert said in failure(scene(MINIMAL), "onto=first", override)
 
 
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("tracker={kind: colmap}", "tracker.kind: colmap has no poses of panoramas; take klt, transforms"),
+        ("tracker={kind: klt, loops: true}", "klt follows panoramas in one map, without loops"),
+        ("tracker={kind: klt, maps: largest}", "klt follows panoramas in one map, without loops"),
+        ("tracker={kind: tum, adjust: true}", "tracker.adjust would move the faces apart"),
+        ("onto=out/other", "onto is not for panoramas"),
+        ("mapping.pace=realtime", "mapping.pace: realtime is not for panoramas"),
+        ("source.panorama.projection=none", "source.panorama.projection is missing"),
+    ],
+)
+def test_what_panoramas_cannot_be_combined_with_is_named(scene, override: str, said: str) -> None:
+    panorama = "panorama: {projection: equirectangular, faces: 6}"
+    file = scene(f"source: {{path: images, {panorama}}}\ntracker: {{kind: klt}}\noutput: out/here\n")
+    assert load_scene(file).source.panorama.count == 6
+    assert said in failure(file, override)
+
+
 def test_the_run_to_go_on_with_is_relative_to_the_scene_file(scene) -> None:
     file = scene(MINIMAL + "onto: first\n")
     assert load_scene(file).onto == (file.parent / "first").resolve()

@@ -44,7 +44,7 @@ def decisions(frames: list[TrackedFrame], **settings: Any) -> list[bool]:
     result = []
     for f in frames:
         trajectory.add(f)
-        result.append(selector.is_keyframe(f, store[len(store) - 1] if len(store) else None))
+        result.append(selector.is_keyframe(f, next(iter(store.before(f.index, 1)), None)))
         if result[-1]:
             store.append(f)
     return result
@@ -52,6 +52,17 @@ def decisions(frames: list[TrackedFrame], **settings: Any) -> list[bool]:
 
 def test_the_first_frame_with_points_is_a_keyframe() -> None:
     assert decisions([frame(0, points=3), frame(1), frame(2)]) == [False, True, False]
+
+
+def test_each_view_of_a_rig_is_compared_with_its_own_last_keyframe() -> None:
+    at = [0.0, 0.0, 0.001, 0.002, 0.5, 0.5]  # median depth 1
+    frames = [replace(frame(2 * i + view, x, yaw=90 * view), views=2) for i, x in enumerate(at) for view in (0, 1)]
+    made = decisions(frames, max_gap=9, covisibility=0.5)
+    assert made == [True, True, *[False] * 6, True, True, False, False]
+    standing = [
+        replace(each, T_camera_world=frame(0, yaw=90 * (i % 2)).T_camera_world) for i, each in enumerate(frames)
+    ]
+    assert decisions(standing, max_gap=3) == [i // 2 in (0, 4) for i in range(12)]
 
 
 def test_a_standing_camera_gives_a_keyframe_after_the_largest_gap() -> None:

@@ -30,12 +30,15 @@ class BoxRoom:
         c = self.camera
         x, y = np.meshgrid(np.arange(c.width) + 0.5, np.arange(c.height) + 0.5)
         rays = np.stack([(x - c.cx) / c.fx, (y - c.cy) / c.fy, np.ones_like(x)], axis=-1) @ T[:3, :3]
-        eye = -T[:3, :3].T @ T[:3, 3]
+        return self.colours(-T[:3, :3].T @ T[:3, 3], rays)
+
+    def colours(self, eye: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """RGB (H, W, 3) that rays (H, W, 3) from `eye` see."""
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.where(rays > 0, (HIGH - eye) / rays, (LOW - eye) / rays)
         wall = reach.argmin(axis=-1)
         hit = eye + rays * reach.min(axis=-1)[..., None]
-        image = np.zeros((c.height, c.width, 3), np.uint8)
+        image = np.zeros(rays.shape, np.uint8)
         for (axis, side), texture in self.textures.items():
             mine = (wall == axis) & ((np.take(rays, axis, axis=-1) > 0) == bool(side))
             u, v = ((np.take(hit, i, axis=-1) - LOW[i]) * FINENESS for i in range(3) if i != axis)

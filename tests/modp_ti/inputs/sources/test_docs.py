@@ -41,6 +41,11 @@ DATA = {
     "A folder of images": (lambda at: image(at / "images/frame2.jpg", 64, 48), "frame2.jpg", (64, 48)),
     "A video": (lambda at: video(at / "room.mp4"), "room_000012", (64, 48)),
     "A recording at its own pace": (lambda at: video(at / "room.mp4"), "room_000012", (64, 48)),
+    "Panoramas: images that see all round": (
+        lambda at: image(at / "panoramas/0001.png", 512, 256),
+        "0001-face3.png",
+        (194, 194),
+    ),
     "TUM RGB-D": (lambda at: listing(at / "rgbd_dataset_freiburg1_desk"), "rgb/1.png", (640, 480)),
     "Replica": (lambda at: image(at / "room0/results/frame000000.jpg", 1200, 680), "frame000000.jpg", (1200, 680)),
     "7-Scenes": (
@@ -57,7 +62,14 @@ DATA = {
 }
 WITHOUT_DATA = {"A camera or a stream", "Project Aria recordings"}
 # Sections whose source tells the camera; the others leave it to the tracker.
-WITH_CAMERA = {"TUM RGB-D", "Replica", "7-Scenes", "The paper's Aria sequences", "Your own intrinsics"}
+WITH_CAMERA = {
+    "Panoramas: images that see all round",
+    "TUM RGB-D",
+    "Replica",
+    "7-Scenes",
+    "The paper's Aria sequences",
+    "Your own intrinsics",
+}
 
 
 def settings(example: str, folder: Path) -> SourceSettings:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fields.geometry.se3 import exp_se3
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files.errors import InputError
@@ -301,7 +302,7 @@ def test_images_of_several_sizes_are_delivered_at_that_of_the_first(with_cloud):
     whole = list(open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings()))
     with_another_camera(with_cloud, 160, 120)
     tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
-    assert "1 of 7 images have another size than the first: they are scaled to its size" in tracker.notes
+    assert "the images have 2 sizes: they are mapped at 320x240" in tracker.notes
     for frame, before in zip(tracker, whole, strict=True):
         assert frame.image.shape == before.image.shape
         np.testing.assert_allclose(frame.camera.matrix(), before.camera.matrix())
@@ -309,7 +310,35 @@ def test_images_of_several_sizes_are_delivered_at_that_of_the_first(with_cloud):
         assert np.abs(frame.image - before.image).mean() < 0.05
 
 
-def test_an_image_of_another_shape_is_refused(with_cloud):
+def test_an_image_of_another_shape_keeps_it_and_gets_the_longer_side_of_the_first(with_cloud):
+    whole = list(open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings()))
     with_another_camera(with_cloud, 160, 160)
-    with pytest.raises(InputError, match=r"view9.png is 160x160, which has another shape than the first image"):
-        open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    assert "the images have 2 sizes: they are mapped at 320x240, 320x320" in tracker.notes
+    assert tracker.largest == (320, 320)
+    frames = list(tracker)
+    assert [frame.image.shape[:2] for frame in frames] == [(240, 320), (320, 320), *[(240, 320)] * 5]
+    np.testing.assert_allclose(frames[1].points.pixels, whole[1].points.pixels * (1, 320 / 240), atol=1e-9)
+
+
+def test_the_faces_of_a_panorama_lie_at_its_pose(tmp_path):
+    (tmp_path / "images").mkdir()
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = [exp_se3([0.1 * i, 0.2, 0.3, 0.3, -0.2 * i, 0.1]) for i in range(4)]
+    frames = []
+    for i, T in enumerate(poses):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((32, 64, 3), 90, np.uint8))
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": (np.linalg.inv(T) @ flip).tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_model": "EQUIRECTANGULAR", "frames": frames}))
+    panorama = {"projection": "equirectangular", "faces": 3}
+    source = SourceSettings.model_validate(
+        {"path": tmp_path / "images", "holdout": 2, "start": 1, "panorama": panorama}
+    )
+    tracker = open_transforms(source, TransformsSettings())
+    assert [frame.name for frame in tracker.frames] == [f"{i}-face{n}.png" for i in (1, 2, 3) for n in range(3)]
+    for place, frame in enumerate(tracker):
+        T = poses[1 + place // 3]
+        turned = 2 * np.pi / 3 * (place % 3)
+        np.testing.assert_allclose(frame.T_camera_world[:3, :3].T @ frame.T_camera_world[:3, 3], T[:3, :3].T @ T[:3, 3])
+        np.testing.assert_allclose(frame.T_camera_world[2, :3], [np.sin(turned), 0, np.cos(turned)] @ T[:3, :3])
+        assert (frame.views, frame.held_out) == (3, place // 3 != 1)

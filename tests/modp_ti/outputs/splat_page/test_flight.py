@@ -56,6 +56,16 @@ def test_a_camera_that_only_goes_ahead_is_taken_to_look_ahead() -> None:
     np.testing.assert_allclose(level(poses, 1.0).R, np.eye(3), atol=1e-9)
 
 
+def test_the_flight_along_panoramas_looks_where_their_first_faces_do() -> None:
+    poses, times = walk(np.eye(3)), np.arange(12.0)
+    faces = [Rotation.from_euler("y", 90 * number, degrees=True).as_matrix() for number in range(4)]
+    turned = np.repeat(poses, 4, axis=0)
+    turned[:, :3] = np.concatenate([faces] * 12) @ turned[:, :3]
+    alone, around = finished(poses, times), finished(turned, np.repeat(times, 4))
+    upright = level(poses, DEPTH_HERE)
+    assert viewer_settings(around, upright) == viewer_settings(alone, upright)
+
+
 def test_a_moved_map_has_its_shapes_and_colours_turned() -> None:
     state, R, scale = splats(50, degree=3), Rotation.random(random_state=3).as_matrix(), 2.5
     there = moved(state, R, scale)
