@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
+from fields.map.trajectory import Trajectory
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import build_mapper
@@ -124,14 +125,17 @@ def write_refined(
 
 
 def _delivered(run: FinishedRun) -> DeliveredFrames:
-    """Return the metadata of the frames, without points."""
+    """Return the metadata of the frames, without points. Their poses count as tracked."""
     held_out = set(run.record.held_out)
+    trajectory = Trajectory()
+    trajectory.restore({"index": np.arange(len(run)), "T": run.poses, "held_out": np.zeros(len(run), dtype=bool)})
     return DeliveredFrames(
         index=list(range(len(run))),
         name=run.names,
         timestamp=run.timestamps.tolist(),
         camera=run.cameras,
         held_out=[place in held_out for place in range(len(run))],
+        trajectory=trajectory,
     )
 
 

@@ -92,7 +92,6 @@ def refine_region_of(job: RegionJob, report: Report) -> RegionResult:
         raise InputError(str(error)) from None
     mapper = build_mapper(config.model_copy(update={"seed": seed}), run.cameras[0].resized(*run.size)).pipeline
     assert isinstance(mapper, OnlineMapper), "`refine` refuses other maps"
-    mapper.compile()
     finished = FinishedMap(
         job.gaussians, frames_of(run, job.views), set(run.record.keyframes), job.exposures, run.record.scene_depth
     )
