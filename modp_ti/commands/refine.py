@@ -12,7 +12,7 @@ from modp_ti.commands.shared import Address, AsJson, Quiet, Where, examples, out
 __all__ = ["EXAMPLES", "refine"]
 
 EXAMPLES = examples(
-    "modp-ti refine out/room   (two regions or more, two rounds, refine.steps of the run)",
+    "modp-ti refine out/room   (two regions or more, in two rounds)",
     "modp-ti refine out/street --regions 16 --rounds 3 --steps 20000",
     "modp-ti refine out/street --engine ray --address FIRST:6379 --cpus 4",
 )

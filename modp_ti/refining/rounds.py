@@ -122,7 +122,8 @@ class _Refinement:
         if count is None:
             count = max(2, -(-len(self._gaussians["position"]) // GAUSSIANS_EACH))
         began = time.perf_counter()
-        self._line.start(f"refining {count} regions", self._config.refine.steps)
+        self._line.note(f"refining in {count} regions, {self._plan.rounds} rounds")
+        self._line.start("refining", self._config.refine.steps, prepares=True)
         try:
             for number in range(self._plan.rounds):
                 self._round(number, count)
