@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fields.runtime.engine import EngineError, engine
-from modp_ti.commands import batch, cameras, check, convert, export, locate, render, run, view, warmup
+from modp_ti.commands import batch, cameras, check, convert, export, locate, refine, render, run, view, warmup
 from modp_ti.commands.shared import examples
 from modp_ti.version import __version__
 
@@ -18,6 +18,7 @@ OVERVIEW = examples(
     "modp-ti run scene.yaml   (the map, its poses, figures and report.html)",
     "modp-ti run room.mp4   (the same without a scene file)",
     "modp-ti batch */scene.yaml   (many recordings)",
+    "modp-ti refine OUT   (a finished map, by several processes)",
     "modp-ti render OUT --path orbit   (OUT: the output folder of a run)",
     "modp-ti export OUT --format html",
     "modp-ti convert scene.spz scene.ply",
@@ -58,6 +59,7 @@ def _options(
 
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("batch", epilog=batch.EXAMPLES)(batch.batch)
+app.command("refine", epilog=refine.EXAMPLES)(refine.refine)
 app.command("cameras", epilog=cameras.EXAMPLES)(cameras.cameras)
 app.command("check", epilog=check.EXAMPLES)(check.check)
 app.command("render", epilog=render.EXAMPLES)(render.render)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from modp_ti.outputs.report.page import ReportedRun, write_report
 from modp_ti.outputs.report.pictures import Album
 from modp_ti.outputs.report.record import RunRecord
 
-__all__ = ["Results", "metrics_of"]
+__all__ = ["Results", "metrics_of", "summary_of"]
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
@@ -127,7 +127,8 @@ class Results:
         metrics: dict,
         scores: list[FrameScore],
         versions: dict[str, MapVersion],
-        keyframes: KeyframeStore,
+        keyframes: Collection[int],
+        scene_depth: float,
         truth: list[NDArray[np.float64]],
     ) -> str | None:
         """Write `report.html` from the parts of a `ReportedRun`.
@@ -135,7 +136,6 @@ class Results:
         Returns:
             None, or one line that says why there is no report.
         """
-        mapped = {keyframe.index for keyframe in keyframes.selected}
         try:
             last = [score for score in scores if score.stage == list(versions)[-1]]
             run = ReportedRun(
@@ -146,8 +146,8 @@ class Results:
                 versions=versions,
                 tracked=self.frames.T_tracked,
                 truth=truth,
-                keyframes=[place for place, index in enumerate(self.frames.index) if index in mapped],
-                scene_depth=keyframes.scene_depth,
+                keyframes=[place for place, index in enumerate(self.frames.index) if index in keyframes],
+                scene_depth=scene_depth,
                 comparisons=self._album.comparisons(last, self.folder / "renders"),
             )
             write_report(self.folder / "report.html", run)
@@ -178,13 +178,13 @@ def metrics_of(
         "engine": str(engine()),
         "frames": len(frames),
         "corrections": frames.corrections,
-        **{stage: _summary(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
+        **{stage: summary_of(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
         **{f"reprojection_error{name}": None if error is None else round(error, 4) for name, error in errors.items()},
         "seconds": {name: round(time, 3) for name, time in taken.items()},
     }
 
 
-def _summary(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
+def summary_of(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
     """Mean scores of one version over all frames and over the held-out ones, with its size and cost."""
     of = [score for score in scores if score.stage == stage]
     return {

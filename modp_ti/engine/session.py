@@ -373,7 +373,9 @@ class _Session:
         results.write_scores(scores, metrics)
         if self.config.export.report:
             with self.line.working("writing the report"):
-                problem = results.write_report(self.record, metrics, scores, versions, pipeline.keyframes, truth)
+                store = pipeline.keyframes
+                mapped = {keyframe.index for keyframe in store.selected}
+                problem = results.write_report(self.record, metrics, scores, versions, mapped, store.scene_depth, truth)
             if problem:
                 self._say(problem)
         return metrics

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from modp_ti.inputs.trackers.colmap_files import read_colmap_model
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.run_pictures import Preparing, pictures
 
-__all__ = ["FinishedFrames"]
+__all__ = ["FinishedFrames", "frames_of"]
 
 
 class FinishedFrames:
@@ -48,8 +49,7 @@ class FinishedFrames:
     @property
     def size(self) -> tuple[int, int]:
         """Largest width and height of the images [px]."""
-        cameras = self._run.cameras
-        return max(camera.width for camera in cameras), max(camera.height for camera in cameras)
+        return self._run.size
 
     @property
     def end(self) -> float:
@@ -57,18 +57,32 @@ class FinishedFrames:
         return float(self._run.timestamps.max())
 
     def __iter__(self) -> Iterator[TrackedFrame]:
-        run, held_out = self._run, set(self._run.record.held_out)
-        with closing(pictures(run, self._preparing)) as images:
-            for index, picture in enumerate(images):
-                yield TrackedFrame(
-                    index=index,
-                    timestamp=float(run.timestamps[index]),
-                    name=run.names[index],
-                    image=picture.image,
-                    camera=run.cameras[index],
-                    T_camera_world=run.poses[index],
-                    points=self._points[index],
-                    mask=picture.mask,
-                    vignette=picture.vignette,
-                    held_out=index in held_out,
-                )
+        for frame in frames_of(self._run, range(len(self._run)), self._preparing):
+            yield replace(frame, points=self._points[frame.index])
+
+
+def frames_of(run: FinishedRun, places: Sequence[int], preparing: Preparing | None = None) -> Generator[TrackedFrame]:
+    """Yield frames of a finished run with their refined poses, without points.
+
+    Args:
+        run: The finished run.
+        places: Ascending positions of the frames.
+        preparing: Called while a tracker prepares, where the images have to be read through it.
+
+    Raises:
+        InputError: As `pictures`.
+    """
+    held_out = set(run.record.held_out)
+    with closing(pictures(run, preparing, places)) as images:
+        for place, picture in zip(places, images, strict=True):
+            yield TrackedFrame(
+                index=place,
+                timestamp=float(run.timestamps[place]),
+                name=run.names[place],
+                image=picture.image,
+                camera=run.cameras[place],
+                T_camera_world=run.poses[place],
+                mask=picture.mask,
+                vignette=picture.vignette,
+                held_out=place in held_out,
+            )

@@ -64,6 +64,11 @@ class FinishedRun:
         return np.flatnonzero(np.diff(self.timestamps, prepend=np.nan) != 0)
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Largest width and height of the images [px]."""
+        return max(camera.width for camera in self.cameras), max(camera.height for camera in self.cameras)
+
+    @property
     def mapped(self) -> list[int]:
         """Positions of the frames that were not held out."""
         held_out = set(self.record.held_out)

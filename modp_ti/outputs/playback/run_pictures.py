@@ -35,19 +35,22 @@ def run_settings(run: FinishedRun) -> SceneConfig:
     return load_scene(run.folder / "config.yaml")
 
 
-def pictures(run: FinishedRun, preparing: Preparing | None = None) -> Generator[Picture]:
+def pictures(
+    run: FinishedRun, preparing: Preparing | None = None, wanted: Sequence[int] | None = None
+) -> Generator[Picture]:
     """Yield the undistorted picture of every frame. Kept images have no vignette.
 
     Args:
         run: The finished run.
         preparing: Called while a tracker prepares, where the images have to be read through it.
+        wanted: Ascending positions of the frames whose pictures to yield; None for all.
 
     Raises:
         InputError: If the images are gone, were live and not kept, or are others than those that were mapped.
     """
-    folder = kept_images(run)
+    folder, wanted = kept_images(run), range(len(run)) if wanted is None else wanted
     if folder is not None:
-        yield from (_kept(folder, name) for name in run.names)
+        yield from (_kept(folder, run.names[place]) for place in wanted)
         return
     config = run_settings(run)
     if config.is_live or config.source.realtime:
@@ -59,10 +62,11 @@ def pictures(run: FinishedRun, preparing: Preparing | None = None) -> Generator[
         first = open_run(config.onto)
         if len(first) >= len(run) or first.cameras != run.cameras[: len(first)]:
             raise InputError(f"{config.onto}: it is no longer the run that {run.folder} goes on with; map both again")
-        yield from pictures(first, preparing)
+        yield from pictures(first, preparing, [place for place in wanted if place < len(first)])
         names = [name.partition("/")[2] for name in run.names[len(first) :]]
         own = _Frames(names, run.cameras[len(first) :])
-    yield from _read_again(config, own, run.record.stored_camera, preparing)
+        wanted = [place - len(first) for place in wanted if place >= len(first)]
+    yield from _read_again(config, own, wanted, run.record.stored_camera, preparing)
 
 
 @dataclass(frozen=True)
@@ -89,23 +93,28 @@ def _kept(folder: Path, name: str) -> Picture:
 
 
 def _read_again(
-    config: SceneConfig, frames: _Frames, stored: Intrinsics | None, preparing: Preparing | None
+    config: SceneConfig,
+    frames: _Frames,
+    wanted: Sequence[int],
+    stored: Intrinsics | None,
+    preparing: Preparing | None,
 ) -> Generator[Picture]:
-    """Read the frames from the source: by the camera that the run recorded, or through the tracker if it has several.
+    """Read frames from the source: by the camera that the run recorded, or through the tracker if it has several.
 
     The tracker brings the cameras of the frames; `klt` has to track again for that, but it has one camera.
     """
     scale = config.source.scale
     undistorter = None if stored is None or scale == "auto" else stored.undistorter(scale)
     if undistorter is not None and set(frames.cameras) == {undistorter.camera}:
-        yield from _through_source(config, frames.names, undistorter)
+        yield from _through_source(config, [frames.names[place] for place in wanted], undistorter)
         return
     with closing(open_tracker(config.without_clock(), preparing)) as tracker:
-        count = 0
+        count, chosen = 0, set(wanted)
         for frame, name, camera in zip(tracker, frames.names, frames.cameras, strict=False):
             if (frame.name, frame.camera) != (name, camera):
                 raise _changed(config)
-            yield Picture(frame.image, frame.mask, frame.vignette)
+            if count in chosen:
+                yield Picture(frame.image, frame.mask, frame.vignette)
             count += 1
     if count < len(frames.names):
         raise _changed(config)

@@ -284,7 +284,7 @@ def test_wrong_options_end_with_two(arguments):
     assert "Usage:" in result.stderr
 
 
-COMMANDS = ["run", "batch", "cameras", "check", "render", "export", "convert", "locate", "view", "warmup"]
+COMMANDS = ["run", "batch", "refine", "cameras", "check", "render", "export", "convert", "locate", "view", "warmup"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -13,7 +13,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.formats.colmap_model import write_image
-from modp_ti.outputs.playback.finished_frames import FinishedFrames
+from modp_ti.outputs.playback.finished_frames import FinishedFrames, frames_of
 from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.playback.run_pictures import pictures
 
@@ -66,6 +66,22 @@ def test_kept_pictures_come_first_with_their_masks(copied: Path) -> None:
     (copied / "colmap" / "images" / name).unlink()
     with pytest.raises(InputError, match="the run's image is missing"):
         list(pictures(open_run(copied)))
+
+
+@pytest.mark.parametrize("way", ["source", "tracker", "kept"])
+def test_some_frames_are_read_without_the_others(copied: Path, way: str) -> None:
+    every = list(FinishedFrames(open_run(copied)))
+    if way == "tracker":
+        text = (copied / "frames.json").read_text()
+        (copied / "frames.json").write_text(text[: text.index(',\n "stored_camera"')] + "}\n")
+    elif way == "kept":
+        keep_images(copied)
+    found = list(frames_of(open_run(copied), [2, 4, 7]))
+    for frame, place in zip(found, [2, 4, 7], strict=True):
+        assert (frame.index, frame.name, frame.held_out) == (place, every[place].name, place == 4)
+        np.testing.assert_array_equal(frame.rgba, every[place].rgba)
+        np.testing.assert_array_equal(frame.T_camera_world, every[place].T_camera_world)
+        assert len(frame.points) == 0
 
 
 @pytest.mark.parametrize(("old", "new"), [("  stop: null", "  stop: 8"), ("  start: 0", "  start: 1")])

@@ -235,13 +235,6 @@ def test_a_long_run_of_large_pictures_stays_small(tmp_path) -> None:
     assert len(html) < 3_000_000
 
 
-class Keyframes(list):
-    """Of a `KeyframeStore` what a report needs."""
-
-    scene_depth = 2.0
-    selected = ()
-
-
 @pytest.mark.parametrize("stages", ["all", "none"])
 def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path, stages) -> None:
     run = made_up_run(tmp_path, frames=6, refine=0, holdout=0)
@@ -252,7 +245,7 @@ def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path, stages) -> N
             image, render = picture(i, (16, 16)), picture(i + 1, (16, 16))
             results.write_frame(dataclasses.replace(black_frame(i), image=image), render)
         versions = dict(run.versions) if stages == "all" else {}
-        said = results.write_report(run.record, dict(run.metrics), scores, versions, Keyframes(), [])
+        said = results.write_report(run.record, dict(run.metrics), scores, versions, (), 2.0, [])
     assert (run.config.output / "renders").is_dir()
     if stages == "all":
         assert said is None
