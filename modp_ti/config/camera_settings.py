@@ -1,4 +1,4 @@
-"""The settings of cameras: intrinsics with lens distortion, and the pinhole camera of Aria recordings."""
+"""The settings of cameras: intrinsics with lens distortion, Aria's pinhole camera, and the topics of ROS bags."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from pipelines.settings import StrictModel
 
-__all__ = ["IntrinsicsSettings", "VrsSettings"]
+__all__ = ["BagImagesSettings", "IntrinsicsSettings", "VrsSettings"]
 
 
 class IntrinsicsSettings(StrictModel):
@@ -66,4 +66,15 @@ class VrsSettings(StrictModel):
         default=400.0,
         gt=0,
         description="focal length of the undistorted image in pixels; 400 at 800x800 is a field of view of 90 degrees",
+    )
+
+
+class BagImagesSettings(StrictModel):
+    """The topics of the images of a ROS bag."""
+
+    image: str | None = Field(
+        default=None, description="topic of the images; empty: the first one in colour, or else the first (bags only)"
+    )
+    camera_info: str | None = Field(
+        default=None, description="topic of the camera's CameraInfo; empty: that beside the images (bags only)"
     )

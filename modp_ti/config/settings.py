@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from fields.runtime.parallel import available_cores
-from modp_ti.config.camera_settings import IntrinsicsSettings, VrsSettings
+from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, VrsSettings
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
 from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
@@ -59,11 +59,12 @@ class SourceSettings(StrictModel):
         "kitti",
         "scannet",
         "arkitscenes",
+        "bag",
     ] = Field(
         default="auto",
         description="type of `path` or `stream`; `auto` detects it. `images`: a folder of images; `release`: the "
-        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; the others: data sets, "
-        "and captures of phones (docs/trackers.md)",
+        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; `bag`: a ROS bag; the "
+        "others: data sets, and captures of phones (docs/trackers.md)",
     )
     path: Path | None = Field(
         default=None,
@@ -78,6 +79,7 @@ class SourceSettings(StrictModel):
     )
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
+    bag: BagImagesSettings = BagImagesSettings()
     scale: Literal["auto"] | Annotated[float, Field(gt=0, le=1)] = Field(
         default="auto",
         description=f"factor on the width and height of every frame. `auto` makes the longer side {LONGER_SIDE} pixels "
