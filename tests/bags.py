@@ -117,10 +117,13 @@ class Messages:
         return self.make("sensor_msgs/PointCloud2", header, 1, len(xyz), fields, big, step, len(data), data, True)
 
 
-def write_bag(path: Path, form: str, messages: Iterable[tuple[str, int, Any]], packed: str = "") -> Path:
+def write_bag(
+    path: Path, form: str, messages: Iterable[tuple[str, int, Any]], packed: str = "", defined: bool = True
+) -> Path:
     """Write topic, time of recording [ns] and content of messages, and return the path of the bag.
 
     form: `ros1` (a file), `sqlite3` or `mcap` (folders). packed: how chunks are packed by ROS 1, or what by ROS 2.
+    defined: whether the bag has the definitions of the messages.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     store = Messages(form).store
@@ -128,16 +131,18 @@ def write_bag(path: Path, form: str, messages: Iterable[tuple[str, int, Any]], p
         writer: Any = Writer1(path)
         if packed:
             writer.set_compression(Writer1.CompressionFormat[packed.upper()])
+        definition = {} if defined else {"msgdef": "", "md5sum": "*"}
     else:
         writer = Writer2(path, version=9, storage_plugin=StoragePlugin[form.upper()])
         if packed:
             writer.set_compression(CompressionMode[packed.upper()], CompressionFormat.ZSTD)
+        definition = {} if defined else {"msgdef": "", "rihs01": "RIHS01_0"}
     connections: dict[str, Any] = {}
     with writer:
         for topic, time, message in messages:
             kind = message.__msgtype__
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+                connections[topic] = writer.add_connection(topic, kind, typestore=store, **definition)
             serialize = store.serialize_ros1 if form == "ros1" else store.serialize_cdr
             writer.write(connections[topic], time, serialize(message, kind))
     return path

@@ -68,7 +68,7 @@ def world_points(bag: Bag, topic: str, tree: FrameTree, world: str, max_gap: flo
         try:
             xyz = cloud_points(message)
         except ValueError as error:
-            raise InputError(f"{bag.path}: a cloud of {topic} is damaged: {error}; set tracker.points: none") from None
+            raise InputError(f"{bag.path}: a cloud of {topic} is damaged: {error} (tracker.points)") from None
         if frame != world:
             xyz = xyz @ T[0, :3, :3].T + T[0, :3, 3]
         clouds.append(xyz[::stride])
@@ -78,8 +78,8 @@ def world_points(bag: Bag, topic: str, tree: FrameTree, world: str, max_gap: flo
             count = sum(map(len, clouds))
     if not count:
         raise InputError(
-            f"{bag.path}: no cloud of {topic} can be moved from {frame!r} to {world!r} at its time: set "
-            "tracker.points: none, or tracker.world"
+            f"{bag.path}: no cloud of {topic} has points that can be moved from {frame!r} to {world!r} at its time "
+            "(tracker.points)"
         )
     points = np.concatenate(clouds)
     if len(clouds) > 1:

@@ -55,6 +55,11 @@ class FrameTree:
         """The names of all frames."""
         return sorted({frame for pair in self._motions for frame in pair})
 
+    @property
+    def moves(self) -> bool:
+        """Whether any transform changes."""
+        return not all(motion.fixed for motion in self._motions.values())
+
     def root(self, frame: str) -> str:
         """Return the frame that has no parent, of those above a frame."""
         parent_of = {child: parent for parent, child in self._motions}

@@ -9,7 +9,7 @@ from typing import Any
 __all__ = ["is_packed", "limit_unpacking", "unpacked"]
 
 # A chunk may unpack to this many bytes, or to this many times its packed size.
-SMALL, MAX_RATIO = 1 << 25, 100
+SMALL, MAX_RATIO = 6 << 20, 100
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 

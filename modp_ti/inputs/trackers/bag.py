@@ -98,7 +98,7 @@ def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree) -> tup
     camera = clean(tracker.camera or images.frame_id)
     if tracker.pose == "tf" or not topics:
         world = clean(tracker.world or tree.root(camera))
-        if not tree.frames:
+        if not tree.moves:
             raise InputError(f"{bag.path}: holds no poses: set tracker.kind: klt to track the images alone")
         return world, [f"{bag.path}: poses of {camera} in {world} by the tf tree"]
     topic, *others = topics
@@ -124,7 +124,13 @@ def _points(
     if not topics:
         return None
     topic, *others = topics
-    xyz = world_points(images.bag, topic, tree, world, tracker.max_gap)
+    try:
+        xyz = world_points(images.bag, topic, tree, world, tracker.max_gap)
+    except InputError as error:
+        if tracker.points is not None:
+            raise
+        notes.append(f"{error}: points are triangulated instead")
+        return None
     choice = f"; there are also {', '.join(others)} (tracker.points)" if others else ""
     notes.append(f"{images.path}: {len(xyz)} points of {topic}{choice}")
     return xyz
