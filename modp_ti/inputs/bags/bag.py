@@ -81,7 +81,7 @@ class Bag:
     """A bag of ROS 1 or ROS 2, in one file or in a folder of them.
 
     Message types are those that ROS ships. Definitions in the bag are not used: `rosbags` would turn them into code.
-    Messages may be read from several threads.
+    `read` may be called from several threads.
 
     Args:
         path: The file or folder.

@@ -54,7 +54,9 @@ class BagImages(ImageSource):
         InputError: If the bag is damaged, or has no image.
     """
 
-    def __init__(self, path: Path, settings: BagImagesSettings, stop: int | None = None, calibrated: bool = True):
+    def __init__(
+        self, path: Path, settings: BagImagesSettings, stop: int | None = None, calibrated: bool = True
+    ) -> None:
         self.bag = Bag(path)
         try:
             self.topic, others = _chosen_topic(self.bag, settings.image)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fields.runtime.backend import initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.inputs.protocol import Tracker
@@ -31,6 +32,7 @@ def tracker(source: dict, **settings: object) -> Tracker:
 
 def digest(frames: Tracker, folder: Path) -> str:
     """Map the frames, and return the digest of the splats."""
+    initialise("cpu")
     mapper = Mapper(80, 60, SETTINGS, seed=3)
     for frame in frames:
         mapper.add(frame)
@@ -41,7 +43,7 @@ def digest(frames: Tracker, folder: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def of_files(views, tmp_path_factory) -> str:
+def of_files(views, tmp_path_factory, taichi_on_the_cpu) -> str:
     """The digest of the map of images, a trajectory and points in files."""
     folder = tmp_path_factory.mktemp("files")
     (folder / "images").mkdir()
@@ -56,9 +58,8 @@ def of_files(views, tmp_path_factory) -> str:
     K = views[0].K
     camera = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     source = {"path": folder / "images", "intrinsics": camera}
-    return digest(
-        tracker(source, kind="tum", path=folder / "trajectory.txt", points=folder / "points.txt"), folder / "out"
-    )
+    given = {"path": folder / "trajectory.txt", "points": folder / "points.txt"}
+    return digest(tracker(source, kind="tum", **given), folder / "out")
 
 
 @pytest.mark.parametrize("form", FORMS)
