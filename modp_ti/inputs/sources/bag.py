@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +68,6 @@ class BagImages(ImageSource):
             super().__init__(path, names, [image.time for image in images])
             self._size = size
             self._place = {name: image.place for name, image in zip(names, images, strict=True)}
-            self._deep = is_deep(first)
             stated = getattr(first, "encoding", None) or getattr(first, "format", "")
             choice = f"; there are also {', '.join(others)} (source.bag.image)" if others else ""
             self.add_note(f"{path}: images of {self.topic} ({stated}){choice}")
@@ -77,6 +75,7 @@ class BagImages(ImageSource):
                 self.add_note(f"{left_out} images of {self.topic} have another size than the first: left out")
             if len(images) < len(found):
                 self.add_note(f"{len(found) - len(images)} images of {self.topic} have the time of another: left out")
+            self._bits = self._used_bits() if is_deep(first) else DEPTHS[-1]
             if calibrated:
                 self.intrinsics = self._camera(settings.camera_info)
         except InputError:
@@ -101,11 +100,8 @@ class BagImages(ImageSource):
     def close(self) -> None:
         self.bag.close()
 
-    @cached_property
-    def _bits(self) -> int:
-        """How many bits the images of 16 bits per channel use, by some of them; 16 where there are none."""
-        if not self._deep:
-            return DEPTHS[-1]
+    def _used_bits(self) -> int:
+        """Return how many bits the images of 16 bits per channel use, by some of them, with a note."""
         some = self.names[:: max(1, len(self) // SAMPLED)]
         bits = used_bits(self._deep_values(self.bag.read(self.topic, self._place[name])) for name in some)
         if bits < DEPTHS[-1]:

@@ -62,8 +62,8 @@ def _opened(
     known = np.isfinite(T_world_camera[:, 0, 3])
     if not known.any():
         raise InputError(
-            f"{images.path}: none of the {len(names)} images lies within the times of the poses, {times.min():.6f} to "
-            f"{times.max():.6f} s, or these have gaps of more than {tracker.max_gap:g} s (tracker.max_gap)"
+            f"{images.path}: the images, of {times.min():.6f} to {times.max():.6f} s, were all taken before or after "
+            f"the poses, or in gaps of more than {tracker.max_gap:g} s between them (tracker.max_gap)"
         )
     if not known.all():
         first = names[int(np.argmin(known))]

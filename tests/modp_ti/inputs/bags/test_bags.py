@@ -190,3 +190,37 @@ def test_a_wrong_convention_is_found_by_check(wrong, views, tmp_path, opened, un
 def test_the_optical_frame_is_the_body_turned():
     np.testing.assert_allclose(OPTICAL[:3, 2], [1, 0, 0])  # it looks ahead
     np.testing.assert_allclose(OPTICAL[:3, 1], [0, 0, -1])  # y down
+
+
+def test_images_of_12_bits_in_16_are_as_bright_as_those_of_8(views, tmp_path, opened, untriangulated):
+    deep = [each for each in recording(views[:2]) if each[0] != "/camera/image_raw"]
+    for n, view in enumerate(views[:2]):
+        values = np.maximum(view.image[..., 1].astype("<u2") * 16, 15)
+        values[0, 0] = 4095
+        deep.append(("/camera/image_raw", START + n * STEP, Messages().image(START + n * STEP, values, "mono16")))
+    tracker = opened(write_bag(tmp_path / "room", "mcap", deep), {"scale": 1})
+    assert any("the images have 16 bits and use 12: 4095 is taken as white" in note for note in tracker.notes)
+    frame = next(iter(tracker))
+    np.testing.assert_array_equal(frame.image[1:, :, 0], views[0].image[1:, :, 1] / np.float32(255))
+
+
+def test_images_of_another_time_or_size_are_told(views, tmp_path, opened, untriangulated):
+    make, messages = Messages(), recording(views[:3])
+    odd = make.image(START + 1000, views[0].image[:100], "rgb8")
+    again = make.image(START, views[0].image, "rgb8")
+    more = [("/camera/image_raw", START + 9 * STEP, message) for message in (odd, again)]  # recorded late, at one time
+    path = write_bag(tmp_path / "room", "mcap", [*messages, *more])
+    tracker = opened(path)
+    assert_poses(tracker.frames, views[:3])
+    for said in ("1 images of /camera/image_raw have another size", "1 images of /camera/image_raw have the time of"):
+        assert any(said in note for note in tracker.notes)
+
+
+def test_a_cloud_that_leads_nowhere_is_told_and_points_are_triangulated(views, tmp_path, opened):
+    lost = ("/scan", START, Messages().cloud(START, PLANE.astype("<f4"), "velodyne"))
+    path = write_bag(tmp_path / "room", "mcap", [*recording(views[:4]), lost])
+    tracker = opened(path)
+    assert any("'velodyne' to 'odom' at its time (tracker.points): points are triang" in note for note in tracker.notes)
+    assert np.median(np.abs(np.concatenate([frame.points.xyz[:, 2] for frame in tracker.frames]))) < 0.02
+    with pytest.raises(InputError, match="no cloud of /scan has points"):
+        opened(path, points="/scan")
