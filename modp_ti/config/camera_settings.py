@@ -1,4 +1,4 @@
-"""The settings of cameras: intrinsics with lens distortion, Aria recordings, and panoramas."""
+"""The settings of cameras: intrinsics with lens distortion, Aria recordings, panoramas, and the topics of ROS bags."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from pipelines.settings import StrictModel
 
-__all__ = ["IntrinsicsSettings", "PanoramaSettings", "VrsSettings"]
+__all__ = ["BagImagesSettings", "IntrinsicsSettings", "PanoramaSettings", "VrsSettings"]
 
 
 class IntrinsicsSettings(StrictModel):
@@ -107,3 +107,14 @@ class PanoramaSettings(StrictModel):
         if not self.given and any(changed):
             raise ValueError("source.panorama.projection is missing: set it to equirectangular or dual_fisheye")
         return self
+
+
+class BagImagesSettings(StrictModel):
+    """The topics of the images of a ROS bag."""
+
+    image: str | None = Field(
+        default=None, description="topic of the images; empty: the first one in colour, or else the first (bags only)"
+    )
+    camera_info: str | None = Field(
+        default=None, description="topic of the camera's CameraInfo; empty: that beside the images (bags only)"
+    )

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from fields.runtime.parallel import available_cores
-from modp_ti.config.camera_settings import IntrinsicsSettings, PanoramaSettings, VrsSettings
+from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
 from modp_ti.config.tracker_settings import AnyTrackerSettings, GivenPosesSettings
 from modp_ti.files.errors import InputError
@@ -60,11 +60,12 @@ class SourceSettings(StrictModel):
         "kitti",
         "scannet",
         "arkitscenes",
+        "bag",
     ] = Field(
         default="auto",
         description="type of `path` or `stream`; `auto` detects it. `images`: a folder of images; `release`: the "
-        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; the others: data sets, "
-        "and captures of phones (docs/trackers.md)",
+        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; `bag`: a ROS bag; the "
+        "others: data sets, and captures of phones (docs/trackers.md)",
     )
     path: Path | None = Field(
         default=None,
@@ -80,6 +81,7 @@ class SourceSettings(StrictModel):
     intrinsics: IntrinsicsSettings = IntrinsicsSettings()
     vrs: VrsSettings = VrsSettings()
     panorama: PanoramaSettings = PanoramaSettings()
+    bag: BagImagesSettings = BagImagesSettings()
     scale: Literal["auto"] | Annotated[float, Field(gt=0, le=1)] = Field(
         default="auto",
         description=f"factor on the width and height of every frame. `auto` makes the longer side {LONGER_SIDE} pixels "

@@ -17,6 +17,7 @@ __all__ = [
     "AnyTrackerSettings",
     "AriaSettings",
     "ArkitScenesSettings",
+    "BagSettings",
     "CaptureSettings",
     "ColmapSettings",
     "DepthCaptureSettings",
@@ -397,6 +398,46 @@ class ArkitScenesSettings(DepthCaptureSettings):
     kind: Literal["arkitscenes"] = Field(default="arkitscenes", description="the poses of a scene of ARKitScenes")
 
 
+class BagSettings(TrackerSettings):
+    """Poses and points of a ROS bag."""
+
+    kind: Literal["bag"] = Field(default="bag", description="the poses of a ROS bag")
+    pose: str | None = Field(
+        default=None,
+        description="topic of the poses (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped), or `tf` "
+        "for the transforms alone; empty: the first topic of these types, or else `tf`",
+    )
+    world: str | None = Field(
+        default=None, description="frame of the map; empty: that of the poses, or the root of the transforms"
+    )
+    body: str | None = Field(
+        default=None,
+        description="frame that the poses are of; empty: the messages' child_frame_id, or else that of the camera",
+    )
+    camera: str | None = Field(
+        default=None,
+        description="frame of the camera, with z forward and y down (the optical frame); empty: that of the images",
+    )
+    max_gap: float = Field(
+        default=0.5,
+        gt=0,
+        description="largest time [s] between two poses, or two transforms, between which an image may lie",
+    )
+    points: str | None = Field(
+        default=None,
+        description="topic of the points (PointCloud2), or `none` to triangulate them; empty: the first such topic, if "
+        "there is one",
+    )
+    max_points: int = Field(
+        default=2000, ge=10, description="largest number of points of a frame that are taken from the clouds"
+    )
+    adjust: bool = Field(
+        default=False,
+        description="bundle adjust the poses with triangulated points before the first frame: for poses with errors of "
+        "more than a pixel",
+    )
+
+
 class SocketSettings(TrackerSettings):
     """Another program that sends frames and poses through a socket."""
 
@@ -447,6 +488,7 @@ AnyTrackerSettings = Annotated[
     | KittiSettings
     | ScanNetSettings
     | ArkitScenesSettings
+    | BagSettings
     | SocketSettings,
     Field(discriminator="kind"),
 ]

@@ -1,6 +1,6 @@
 """The scene of `modp-ti run` on a recording or a stream: defaults, output `out/NAME`.
 
-The tracker is `klt`, or that of the capture if its poses come with the images.
+The tracker is `klt`, or that of the capture or bag if its poses come with the images.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.bags import SUFFIXES, has_poses
 from modp_ti.inputs.captures import ARCHIVES, KINDS
 from modp_ti.inputs.sources import recognised_kind
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES
@@ -23,20 +24,20 @@ __all__ = ["is_recording", "recorded_scene", "streamed_scene"]
 
 OUTPUTS = Path("out")
 SCENE = "scene.yaml"
-RECORDING_SUFFIXES = (*VIDEO_SUFFIXES, ".vrs", *ARCHIVES)
+RECORDING_SUFFIXES = (*VIDEO_SUFFIXES, ".vrs", *ARCHIVES, *SUFFIXES)
 # Longest name of an output folder [characters]. File systems take 255 bytes, and a run adds a suffix for a time.
 MAX_NAME = 60
 
 
 def is_recording(path: Path) -> bool:
-    """Whether the argument of `modp-ti run` is a recording and not a scene file: a folder, a video or an archive."""
+    """Whether the argument of `modp-ti run` is a recording and not a scene file: a folder, video, archive or bag."""
     return path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES
 
 
 def recorded_scene(
     path: Path, overrides: Iterable[str] = (), preset: str | None = None, taken: Collection[Path] = ()
 ) -> SceneConfig:
-    """Return the settings for a video, a VRS recording, a capture or a folder that has no scene file.
+    """Return the settings for a video, a VRS recording, a capture, a ROS bag or a folder that has no scene file.
 
     The output folder is `out/NAME`, where NAME is that of the file without its suffix or of the folder. If it holds
     the map of another recording, it is `out/NAME-2` and so on.
@@ -56,7 +57,7 @@ def recorded_scene(
     name = path.resolve().name if path.is_dir() else path.stem
     source = {"path": str(path)}
     kind = recognised_kind(path)
-    tracker = kind if kind in KINDS else "klt"
+    tracker = kind if kind in KINDS or (kind == "bag" and has_poses(path)) else "klt"
     return scene_from_data(_scene(source, _free(name, path, taken), tracker), str(path), overrides, preset)
 
 

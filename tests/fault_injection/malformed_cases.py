@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tests.fault_injection.corrupted_bags import CORRUPTED_BAGS
 from tests.fault_injection.corrupted_captures import CAPTURES
 from tests.fault_injection.corrupted_media import IMAGES, MASK, PATH, RUN, VIDEO
 from tests.fault_injection.corrupted_trackers import (
@@ -25,6 +26,7 @@ from tests.fault_injection.corrupted_trackers import (
 )
 from tests.fault_injection.corruptions import ANYWHERE, TEXT, Corruption
 from tests.fault_injection.samples import SAMPLES
+from tests.fault_injection.small_bag import BAGS
 
 __all__ = ["CASES", "Case"]
 
@@ -99,6 +101,8 @@ def _cases() -> list[Case]:
     for kind, files in CAPTURES.items():
         for file, corruptions in files.items():
             add(kind, file, anything(*_harmless(file)) | corruptions)
+    for form, corruptions in CORRUPTED_BAGS.items():
+        add(f"bag_{form}", BAGS[form], anything() | corruptions)
     return cases
 
 

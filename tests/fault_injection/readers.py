@@ -257,6 +257,8 @@ READERS: dict[str, Reader] = {
         Reader("run", "run", RUN_FILES, _run),
         Reader("weights", "weights", ("older.pth", "weights.pth"), _weights),
         *(Reader(kind, kind, SAMPLES[kind][0].files, _open) for kind in CAPTURES),
+        # Those of sqlite3 are larger than what the fuzzer tries.
+        *(Reader(f"bag_{form}", f"bag_{form}", SAMPLES[f"bag_{form}"][0].files, _open) for form in ("ros1", "mcap")),
         Reader("tracker_server", "tracker_server", ("wire",), _tracker_server),
     )
 }
@@ -264,7 +266,7 @@ READERS: dict[str, Reader] = {
 
 def import_readers() -> None:
     """Import every module that the readers use, once for all forked processes."""
-    kinds = ("aria", "captures", "colmap", "data_sets", "matrices", "modp", "stella_vslam", "transforms", "tum")
+    kinds = ("aria", "bag", "captures", "colmap", "data_sets", "matrices", "modp", "stella_vslam", "transforms", "tum")
     for name in (
         *(
             "config.scene_file",

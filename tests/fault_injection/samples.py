@@ -16,7 +16,9 @@ import cv2
 import msgpack
 import numpy as np
 
+from tests.bags import FORMS
 from tests.captures import WRITERS, View, zipped
+from tests.fault_injection.small_bag import BAGS, write_small_bag
 from tests.fault_injection.small_recording import (
     FOCAL,
     FRAMES,
@@ -374,6 +376,11 @@ def _write_capture(kind: str, folder: Path) -> None:
     scene_file(folder, f"kind: {kind}", f"path: {place}")
 
 
+def _write_bag(form: str, folder: Path) -> None:
+    write_small_bag(folder / BAGS[form], form)
+    scene_file(folder, "kind: bag, points: /map", f"path: {BAGS[form]}")
+
+
 CAPTURES = {
     "record3d": ("room.r3d",),
     "scanner_app": ("app/frame_00003.json", "app/depth_00003.png"),
@@ -444,6 +451,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("weights", ("weights.pth", "older.pth")), _write_weights),
         (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
         *((Sample(kind, files), partial(_write_capture, kind)) for kind, files in CAPTURES.items()),
+        *((Sample(f"bag_{form}", (BAGS[form],)), partial(_write_bag, form)) for form in FORMS),
     )
 }
 

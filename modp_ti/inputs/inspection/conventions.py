@@ -13,6 +13,8 @@ from fields.geometry.se3 import inverse_se3
 __all__ = ["CONVENTIONS", "STATED", "Convention"]
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+# From the axes of a body in ROS (x forward, y left, z up) to those of its camera.
+BODY = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class Convention:
         name: Its name in reports.
         inverse: The poses are inverted (camera to world and world to camera are exchanged).
         opengl: The camera axes are OpenGL's (y up, z back).
+        body: The camera axes are those of a body in ROS (x forward, y left, z up).
         intrinsics: Factor that corrects the focal lengths and the principal point.
         focal: Additional factor that corrects the focal lengths.
         fault: What is wrong with the input if this interpretation fits.
@@ -32,6 +35,7 @@ class Convention:
     name: str
     inverse: bool = False
     opengl: bool = False
+    body: bool = False
     intrinsics: float = 1.0
     focal: float = 1.0
     fault: str = ""
@@ -40,6 +44,8 @@ class Convention:
     def pose(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """The correct T_camera_world (4, 4) under this interpretation, up to a rotation of the world."""
         T = inverse_se3(T_camera_world) if self.inverse else T_camera_world
+        if self.body:
+            return BODY @ T
         return OPENGL @ T if self.opengl else T
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
@@ -69,6 +75,13 @@ CONVENTIONS = (
         opengl=True,
         fault="the poses are inverted, and their axes are OpenGL's (y up, z back) where OpenCV's are expected",
         mend="invert every pose, and negate the second and third row of the world-to-camera matrix",
+    ),
+    Convention(
+        "body axes",
+        body=True,
+        fault="the poses have the axes of a body in ROS (x forward, z up) where those of a camera are expected",
+        mend="give the poses of the camera's optical frame (of a bag: set tracker.camera), or turn every pose from "
+        "body to optical axes",
     ),
     Convention(
         "intrinsics of half the size",

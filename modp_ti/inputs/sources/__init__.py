@@ -70,7 +70,7 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
     path = source.require_path()
     kind = recognised_kind(path) if source.kind == "auto" else source.kind
     images = _OPENERS[kind](path, source) if kind in _OPENERS else _open_capture(path, kind, source)
-    if source.kind == "auto" and kind not in ("images", "video", "vrs"):
+    if source.kind == "auto" and kind not in ("images", "video", "vrs", "bag"):
         images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
     if source.panorama.given:
         return _scaled(PanoramaFaces(images, source.panorama), source)
@@ -89,9 +89,12 @@ def recognised_kind(path: Path) -> str:
     Raises:
         InputError: If the path is a file of an unknown type.
     """
-    # Imported here: captures are built on sources.
+    # Imported here: bags and captures are built on sources.
+    from modp_ti.inputs.bags import is_bag
     from modp_ti.inputs.captures import ARCHIVES, recognised_capture
 
+    if is_bag(path):
+        return "bag"
     suffix = path.suffix.lower()
     if not path.is_dir():
         if suffix in ARCHIVES and path.exists():
@@ -129,6 +132,13 @@ def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:
     return AriaRecording(path, source.vrs, source.vignette)
 
 
+def _open_bag(path: Path, source: SourceSettings) -> ImageSource:
+    # Imported here: bags are built on sources, and need libraries of their own.
+    from modp_ti.inputs.sources.bag import BagImages
+
+    return BagImages(path, source.bag, source.stop, calibrated=not source.intrinsics.given)
+
+
 def _open_capture(path: Path, kind: str, source: SourceSettings) -> ImageSource:
     from modp_ti.inputs.captures.images import open_capture_images
 
@@ -143,6 +153,7 @@ _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
     "sevenscenes": lambda path, source: open_sevenscenes(path, source.fps),
     "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
     "vrs": _open_vrs,
+    "bag": _open_bag,
 }
 """Functions that open a path, by `source.kind`; the other kinds are captures."""
 

@@ -104,6 +104,10 @@ def _opened(config: SceneConfig, progress: Progress | None) -> Tracker:
             from modp_ti.inputs.trackers.captures import open_capture
 
             return open_capture(source, tracker, progress)
+        case kinds.BagSettings() as tracker:
+            from modp_ti.inputs.trackers.bag import open_bag
+
+            return open_bag(source, tracker, progress)
         case kinds.SocketSettings() as tracker:
             from modp_ti.inputs.tracker_server import open_tracker_server
 

@@ -380,7 +380,8 @@ def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):
     of_klt = ("tracker.loops", "tracker.maps")
     of_sfm = [f"tracker.{name}" for name in ("order", "mapper", "overlap", "features")]
     of_captures = ("tracker.adjust", "tracker.max_points", "tracker.max_depth", "tracker.depth")
-    others = ("source.vrs", "tracker.kind", *of_klt, *of_sfm, *of_captures)  # for other kinds than the scene's
+    of_others = (*of_klt, *of_sfm, *of_captures, "tracker.max_gap")
+    others = ("source.vrs", "tracker.kind", *of_others)  # for other kinds than the scene's
     loaded = load_scene(scene, [value for value in defaults if not value.startswith(others)])
     assert loaded == load_scene(scene, [])
     klt = load_scene(scene, ["tracker={kind: klt}"])

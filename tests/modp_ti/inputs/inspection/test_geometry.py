@@ -16,6 +16,8 @@ from modp_ti.inputs.inspection.survey import survey
 
 CAMERA = PinholeCamera(300.0, 305.0, 161.0, 118.0, 320, 240)
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+# T_body_camera: the camera looks along x of the body, whose z is up.
+BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 def poses(count: int = 6) -> list[np.ndarray]:
@@ -42,6 +44,7 @@ def pixels(T: np.ndarray, noise: float) -> np.ndarray:
 def wrongly(convention: Convention, T: np.ndarray) -> np.ndarray:
     """The pose that has to be read after the convention to be T."""
     T = OPENGL @ T if convention.opengl else T
+    T = BODY @ T if convention.body else T
     return np.linalg.inv(T) if convention.inverse else T
 
 

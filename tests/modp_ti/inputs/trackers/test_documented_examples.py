@@ -20,6 +20,8 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.inputs.captures import KINDS
 from modp_ti.inputs.trackers import open_tracker
+from tests.bags import recording as bag_messages
+from tests.bags import write_bag
 from tests.captures import WRITERS, View, zipped
 
 PAGE = Path(__file__).resolve().parents[4] / "docs" / "trackers.md"
@@ -45,7 +47,7 @@ def test_every_block_is_a_valid_scene_of_its_section(kind, number, text, tmp_pat
 def test_every_reader_has_its_page():
     given = ["tum", "orbslam3", "stella_vslam", "aria", "modp", "replica", "sevenscenes", "matrices", "tanksandtemples"]
     sections = {name: texts for name, texts in blocks().items() if not name.startswith("Captures")}
-    assert list(sections) == [*given, *KINDS]
+    assert list(sections) == [*given, *KINDS, "bag"]
     assert all(texts for texts in sections.values())
 
 
@@ -182,6 +184,16 @@ def test_captures(recording, kind):
         (recording.root / "unpacked").rename(path)
     frames = delivered(recording.root, kind, 0, "source.step=1")
     np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-6)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_bag(recording, number):
+    poses = zip(recording.names[:2], recording.poses_in_world, strict=False)
+    pictures = ((np.asarray(cv2.imread(str(recording.root / "images" / name)), np.uint8), T) for name, T in poses)
+    views = [View(picture, recording.K, T, lambda _, size: np.zeros(size[::-1])) for picture, T in pictures]
+    write_bag(recording.root / "corridor.bag", "ros1", bag_messages(views, "ros1"))
+    frames = delivered(recording.root, "bag", number)
+    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
 
 
 def load_example(root: Path, kind: str) -> SceneConfig:

@@ -1,0 +1,221 @@
+"""Messages of a bag by topic, in order or at random. The containers are read by `rosbags`."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+from modp_ti.files import is_file, open_file, readable
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.bags.unpacking import is_packed, limit_unpacking, unpacked
+
+if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+
+__all__ = ["CLOUD", "IMAGES", "INFO", "POSES", "SUFFIXES", "TREES", "Bag", "Place", "has_poses", "is_bag"]
+
+SUFFIXES = (".bag", ".db3", ".mcap")
+"""Suffixes of bags: ROS 1, and ROS 2 by sqlite3 and MCAP."""
+
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO = "sensor_msgs/msg/CameraInfo"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+# In the order in which they are preferred.
+POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+STATIC = "tf_static"  # last part of the topic of transforms that hold for all times
+
+LARGE = 1 << 16  # reads of more bytes are checked against the size of the file
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the bag holds a message.
+
+    Attributes:
+        file: Number of the file.
+        written: Time at which the message was recorded [ns].
+        number: Number of the message among those of its topic that were recorded at that time.
+    """
+
+    file: int
+    written: int
+    number: int
+
+
+def is_bag(path: Path) -> bool:
+    """Whether the path is a file with a bag's suffix, or a folder that ROS 2 has recorded."""
+    if path.is_dir():
+        return is_file(path / "metadata.yaml") and bool(_files(path))
+    return path.suffix in SUFFIXES
+
+
+def has_poses(path: Path) -> bool:
+    """Whether a bag holds poses or transforms that change. Raises InputError if it cannot be read."""
+    bag = Bag(path)
+    moving = any(topic.rpartition("/")[2] != STATIC for topic in bag.of_types(*POSES, *TREES))
+    bag.close()
+    return moving
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the files of a bag, in the order of their numbers."""
+    if not path.is_dir():
+        return [path]
+    found = [file for file in path.iterdir() if file.suffix in SUFFIXES and is_file(file)]
+    return sorted(found, key=lambda file: (len(file.name), file.name))
+
+
+class Bag:
+    """A bag of ROS 1 or ROS 2, in one file or in a folder of them.
+
+    Message types are those that ROS ships. Definitions in the bag are not used: `rosbags` would turn them into code.
+    `read` may be called from several threads.
+
+    Args:
+        path: The file or folder.
+
+    Attributes:
+        path: The file or folder.
+        topics: Message type of each topic that has messages.
+
+    Raises:
+        InputError: If it is no bag, or is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.exists():
+            raise InputError(f"{path}: no such bag (source.path)")
+        files = _files(path)
+        if not files:
+            raise InputError(f"{path}: holds no bag: no file with the suffix {', '.join(SUFFIXES)} (source.path)")
+        if len({file.suffix for file in files}) > 1:
+            raise InputError(f"{path}: holds bags of several kinds: name one of the files in source.path")
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        limit_unpacking()
+        self._lock = Lock()
+        self._first = files[0].suffix == ".bag"
+        self._types = get_typestore(Stores.ROS1_NOETIC if self._first else Stores.ROS2_HUMBLE)
+        if self._first:  # the types that ROS 1 ships separately
+            for kind in TREES:
+                self._types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+        self._readers: list[Reader1 | Reader2] = []
+        try:
+            for file in files:
+                with readable(file, " (source.path)"), open_file(file):
+                    pass
+                if file.suffix == ".db3" and set(str(file)) & set("?#%"):
+                    raise InputError(f"{file}: SQLite cannot open a path with ?, # or %: rename it (source.path)")
+                with self._damaged(file):
+                    reader = (Reader1 if self._first else Reader2)(_SafePath(file))
+                    reader.open()
+                    self._readers.append(reader)
+            with self._damaged(path):
+                self.topics = {c.topic: c.msgtype for r in self._readers for c in r.connections if c.msgcount > 0}
+        except InputError:
+            self.close()
+            raise
+
+    def of_types(self, *types: str) -> list[str]:
+        """Return the topics of these message types, by type and then by name."""
+        return [topic for kind in types for topic, its in sorted(self.topics.items()) if its == kind]
+
+    def chosen(self, topic: str, types: tuple[str, ...], setting: str) -> str:
+        """Return a topic that the user has named. Raises InputError if there is none of these types."""
+        if self.topics.get(topic) not in types:
+            there = ", ".join(self.of_types(*types)) or "none"
+            raise InputError(f"{self.path}: has no {types[0]} or the like at {topic}; there is {there} ({setting})")
+        return topic
+
+    def messages(self, topic: str) -> Iterator[tuple[Place, Any]]:
+        """Yield the messages of a topic with their places, in the order in which they were recorded.
+
+        Raises:
+            InputError: If the bag is damaged.
+        """
+        with self._damaged(self.path):
+            for n, reader in enumerate(self._readers):
+                before, number = -1, 0
+                for written, raw in self._raw(reader, topic):
+                    number = number + 1 if written == before else 0
+                    before = written
+                    yield Place(n, written, number), self._message(raw, topic)
+
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic. Raises InputError if the bag is damaged."""
+        messages = self.messages(topic)
+        try:
+            return next(messages)[1]
+        except StopIteration:
+            raise InputError(f"{self.path}: has no message of {topic}; it is damaged") from None
+        finally:
+            messages.close()  # pyright: ignore[reportAttributeAccessIssue]  # a generator
+
+    def read(self, topic: str, place: Place) -> Any:
+        """Return the message of a topic at a place. Raises InputError if the bag is damaged."""
+        with self._lock, self._damaged(self.path):
+            found = self._raw(self._readers[place.file], topic, place.written)
+            raw = [raw for _, raw in found][place.number]
+            return self._message(raw, topic)
+
+    def close(self) -> None:
+        """Close the files."""
+        for reader in self._readers:
+            reader.close()
+        self._readers.clear()
+
+    def _raw(self, reader: Reader1 | Reader2, topic: str, written: int | None = None) -> Iterator[tuple[int, bytes]]:
+        """Yield time of recording [ns] and content of the messages of a topic, of those of one time if it is given."""
+        mine = [c for c in reader.connections if c.topic == topic and c.msgtype == self.topics[topic]]
+        if mine:
+            for _, time, raw in reader.messages(mine, written, None if written is None else written + 1):
+                yield time, raw
+
+    def _message(self, raw: bytes, topic: str) -> Any:
+        kind = self.topics[topic]
+        if self._first:
+            return self._types.deserialize_ros1(raw, kind)
+        return self._types.deserialize_cdr(unpacked(raw) if is_packed(raw) else raw, kind)
+
+    @contextmanager
+    def _damaged(self, file: Path) -> Iterator[None]:
+        """Report what `rosbags` raises as an InputError. It checks little, so that damaged files can raise anything."""
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split())[:150] or type(error).__name__
+            raise InputError(f"{file}: is no bag of ROS, or is damaged: {reason} (source.path)") from None
+
+
+class _SafePath(type(Path())):
+    """A path that opens as a file of which no more is asked for than it holds."""
+
+    def open(self, *_: Any, **__: Any) -> Any:
+        return _SafeFile(open_file(self).detach())  # pyright: ignore[reportAttributeAccessIssue]  # it is buffered
+
+
+class _SafeFile(io.BufferedReader):
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or size < 0 or size > LARGE:
+            here = self.tell()
+            left = max(0, self.seek(0, io.SEEK_END) - here)
+            self.seek(here)
+            size = left if size is None or size < 0 else min(size, left)
+        return super().read(size)

@@ -1,0 +1,52 @@
+"""CameraInfo messages as cameras."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.captures.capture import checked_numbers, plausible_camera
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.inputs.sources.intrinsics import Intrinsics
+
+__all__ = ["camera_of_info"]
+
+
+def camera_of_info(message: Any, rectified: bool, where: str) -> Intrinsics | None:
+    """Return the camera of a CameraInfo message; None if it says that it is not calibrated.
+
+    Args:
+        message: The message, of ROS 1 or ROS 2.
+        rectified: Whether the images are rectified, so that the camera is that of `P`.
+        where: Start of the error message.
+
+    Raises:
+        InputError: If it is no possible camera, or its lens model is not supported.
+    """
+    values = {name.lower(): list(map(float, getattr(message, name))) for name in "DKPdkp" if hasattr(message, name)}
+    K, P = checked_numbers(values["k"], 9, f"{where}: K"), checked_numbers(values["p"], 12, f"{where}: P")
+    fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if rectified else (K[0], K[4], K[2], K[5])
+    if fx == 0.0:
+        return None
+    D = checked_numbers(values["d"], len(values["d"]), f"{where}: D")
+    lens = NO_DISTORTION if rectified else _lens(message.distortion_model, D, where)
+    # The calibration has pixel centres at whole numbers.
+    camera = plausible_camera(fx, fy, cx + 0.5, cy + 0.5, (message.width, message.height), where, lens)
+    return Intrinsics(camera, lens)
+
+
+def _lens(model: str, D: list[float], where: str) -> Distortion:
+    if not np.any(D):
+        return Distortion(fisheye=True) if model in ("equidistant", "fisheye") else NO_DISTORTION
+    if model == "plumb_bob" and len(D) in (4, 5):
+        return Distortion((D[0], D[1], *D[4:]), tangential=(D[2], D[3]))
+    if model in ("rational_polynomial", "plumb_bob") and len(D) >= 8 and not np.any(D[8:]):
+        return Distortion((D[0], D[1], D[4]), (D[5], D[6], D[7]), (D[2], D[3]))
+    if model in ("equidistant", "fisheye") and len(D) == 4:
+        return Distortion((D[0], D[1], D[2], D[3]), fisheye=True)
+    raise InputError(
+        f"{where}: the lens model {model[:40]!r} of {len(D)} coefficients is not supported (plumb_bob, "
+        "rational_polynomial, equidistant): give source.intrinsics, or the topic of rectified images"
+    )

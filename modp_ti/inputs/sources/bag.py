@@ -1,0 +1,180 @@
+"""Source `bag`: the images of a topic of a ROS bag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modp_ti.config.camera_settings import BagImagesSettings
+from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.inputs.bags.bag import IMAGES, INFO, Bag, Place
+from modp_ti.inputs.bags.camera_info import camera_of_info
+from modp_ti.inputs.bags.frame_tree import clean, seconds
+from modp_ti.inputs.bags.pictures import is_deep, is_depth, is_grey, picture, picture_size, stored_values
+from modp_ti.inputs.sources.bit_depth import DEPTHS, used_bits
+from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.protocol import ImageSource
+
+__all__ = ["BagImages"]
+
+SAMPLED = 16  # images of 16 bits per channel by which their depth is found
+
+
+@dataclass(frozen=True)
+class _Image:
+    """An image in the bag: its time [s], and where it is."""
+
+    time: float
+    place: Place
+
+
+class BagImages(ImageSource):
+    """An `ImageSource` of a topic of images, raw or compressed. Image n, from 0, is called `<bag>_<n, six digits>`.
+
+    All messages of the topic are read once when the bag is opened, for their times and sizes. Times are those in the
+    headers; if all of them are zero, those of the recording.
+
+    Args:
+        path: The bag.
+        settings: The topics.
+        stop: Number of images to use; all if None.
+        calibrated: Whether the camera is taken from the bag.
+
+    Attributes:
+        bag: The bag.
+        topic: The topic of the images.
+        frame_id: Name of the camera's frame, as the images state it.
+
+    Raises:
+        InputError: If the bag is damaged, or has no image.
+    """
+
+    def __init__(
+        self, path: Path, settings: BagImagesSettings, stop: int | None = None, calibrated: bool = True
+    ) -> None:
+        self.bag = Bag(path)
+        try:
+            self.topic, others = _chosen_topic(self.bag, settings.image)
+            first = self.bag.first(self.topic)
+            self.frame_id = clean(first.header.frame_id)
+            found, size, left_out = self._listed(stop)
+            found.sort(key=lambda image: image.time)
+            images = [image for n, image in enumerate(found) if n == 0 or image.time > found[n - 1].time]
+            names = [f"{path.stem}_{n:06d}" for n in range(len(images))]
+            super().__init__(path, names, [image.time for image in images])
+            self._size = size
+            self._place = {name: image.place for name, image in zip(names, images, strict=True)}
+            stated = getattr(first, "encoding", None) or getattr(first, "format", "")
+            choice = f"; there are also {', '.join(others)} (source.bag.image)" if others else ""
+            self.add_note(f"{path}: images of {self.topic} ({stated}){choice}")
+            if left_out:
+                self.add_note(f"{left_out} images of {self.topic} have another size than the first: left out")
+            if len(images) < len(found):
+                self.add_note(f"{len(found) - len(images)} images of {self.topic} have the time of another: left out")
+            self._bits = self._used_bits() if is_deep(first) else DEPTHS[-1]
+            if calibrated:
+                self.intrinsics = self._camera(settings.camera_info)
+        except InputError:
+            self.bag.close()
+            raise
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Decode an image (H, W, 3) uint8 RGB.
+
+        Raises:
+            UnreadableImageError: If it is damaged.
+        """
+        message = self.bag.read(self.topic, self._place[name])
+        try:
+            image = picture(message, self._bits)
+        except ValueError as error:
+            raise UnreadableImageError(f"{self.path}: unreadable image {name} of {self.topic}: {error}") from None
+        if image.shape[1::-1] != self._size:
+            raise UnreadableImageError(f"{self.path}: image {name} of {self.topic} is of another size than it states")
+        return image
+
+    def close(self) -> None:
+        self.bag.close()
+
+    def _used_bits(self) -> int:
+        """Return how many bits the images of 16 bits per channel use, by some of them, with a note."""
+        some = self.names[:: max(1, len(self) // SAMPLED)]
+        bits = used_bits(self._deep_values(self.bag.read(self.topic, self._place[name])) for name in some)
+        if bits < DEPTHS[-1]:
+            self.add_note(f"{self.path}: the images have 16 bits and use {bits}: {(1 << bits) - 1} is taken as white")
+        return bits
+
+    def _deep_values(self, message: Any) -> NDArray:
+        try:
+            return stored_values(message, "u2", 3 if message.encoding.startswith(("rgb", "bgr")) else 1)
+        except ValueError:  # told when the image is read
+            return np.zeros(1, np.uint16)
+
+    def _listed(self, stop: int | None) -> tuple[list[_Image], tuple[int, int], int]:
+        """Return the images of the first one's size, that size, and how many are of another size."""
+        images: list[_Image] = []
+        size, left_out, stamped = None, 0, False
+        for place, message in self.bag.messages(self.topic):
+            if stop is not None and len(images) >= stop:
+                break
+            its = picture_size(message)
+            size = size or its
+            if its != size:
+                left_out += 1
+                continue
+            time = seconds(message.header.stamp)
+            stamped |= time != 0.0
+            images.append(_Image(time, place))
+        if size is None:
+            raise InputError(f"{self.bag.path}: no image of {self.topic} states its size; it is damaged")
+        if not stamped:
+            images = [_Image(image.place.written * 1e-9, image.place) for image in images]
+        return images, size, left_out
+
+    def _camera(self, given: str | None) -> Intrinsics | None:
+        """Return the camera of the images, with notes on where it comes from; None if the bag does not tell it."""
+        topics = self.bag.of_types(INFO)
+        if given is not None:
+            topic = self.bag.chosen(given, (INFO,), "source.bag.camera_info")
+        else:
+            topic = _info_beside(self.topic, topics)
+        if topic is None:
+            there = f"; there is {', '.join(topics)} (source.bag.camera_info)" if topics else ""
+            self.add_note(f"{self.path}: no CameraInfo belongs to {self.topic}{there}")
+            return None
+        rectified = self.topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
+        camera = camera_of_info(self.bag.first(topic), rectified, f"{self.path}: {topic}")
+        of = "the rectified camera P" if rectified else "the camera K with its lens"
+        self.add_note(f"{self.path}: {f'{topic} is not calibrated' if camera is None else f'{of} of {topic}'}")
+        return camera
+
+
+def _chosen_topic(bag: Bag, given: str | None) -> tuple[str, list[str]]:
+    """Return the topic of the images, the given one or else the first in colour, and the other ones."""
+    if given is not None:
+        return bag.chosen(given, IMAGES, "source.bag.image"), []
+    firsts = {topic: bag.first(topic) for topic in bag.of_types(*IMAGES)}
+    pictures = [topic for topic, first in firsts.items() if not is_depth(first)]
+    if not pictures:
+        there = ", ".join(f"{topic} ({kind})" for topic, kind in list(bag.topics.items())[:8])
+        raise InputError(f"{bag.path}: holds no images; its topics are {there or 'none'} (source.path)")
+    pictures.sort(key=lambda topic: (is_grey(firsts[topic]), topic))
+    return pictures[0], pictures[1:]
+
+
+def _info_beside(topic: str, infos: list[str]) -> str | None:
+    """Return the topic of CameraInfo that belongs to a topic of images, or None.
+
+    It lies beside the images. The topic of compressed images lies below that of the images.
+    """
+    above = topic.rpartition("/")[0]
+    while True:
+        if f"{above}/camera_info" in infos:
+            return f"{above}/camera_info"
+        if not above:
+            return infos[0] if len(infos) == 1 else None
+        above = above.rpartition("/")[0]

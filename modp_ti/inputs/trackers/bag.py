@@ -1,0 +1,136 @@
+"""Tracker `bag`: poses and points of a ROS bag, beside the images of its source."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.geometry.se3 import inverse_poses
+from modp_ti.config.settings import SourceSettings
+from modp_ti.config.tracker_settings import BagSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.bags.bag import CLOUD, POSES
+from modp_ti.inputs.bags.clouds import world_points
+from modp_ti.inputs.bags.frame_tree import FrameTree, clean, read_frame_tree
+from modp_ti.inputs.bags.pose_topics import read_pose_topic
+from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.inputs.sources import open_source
+from modp_ti.inputs.sources.bag import BagImages
+from modp_ti.inputs.trackers.given_poses import posed_images, selected_frames, solving, spread_points
+
+__all__ = ["open_bag"]
+
+
+def open_bag(source: SourceSettings, tracker: BagSettings, progress: Progress | None = None) -> ReplayedTracker:
+    """Open the images that were taken while the poses of a bag are known.
+
+    The poses are those of the topic `tracker.pose`, moved to the camera by the transforms of the bag, or those
+    transforms alone. The points are those of all clouds of `tracker.points`; without, they are triangulated.
+
+    Raises:
+        InputError: If `source.path` is no bag, the camera is not known, or no image has a pose.
+    """
+    images = open_source(source)
+    if not isinstance(images, BagImages):
+        images.close()
+        raise InputError(f"{source.path}: tracker.kind: bag reads the poses of a ROS bag, and this is none")
+    try:
+        return _opened(images, source, tracker, progress)
+    except InputError:
+        images.close()
+        raise
+
+
+def _opened(
+    images: BagImages, source: SourceSettings, tracker: BagSettings, progress: Progress | None
+) -> ReplayedTracker:
+    tree = read_frame_tree(images.bag)
+    world, notes = _with_poses(images, tracker, tree)
+    camera = clean(tracker.camera or images.frame_id)
+    names = selected_frames(images, source)
+    times = np.array([images.timestamp(name) for name in names])
+    T_world_camera = tree.at(world, camera, times, tracker.max_gap)
+    if T_world_camera is None:
+        frames = ", ".join(tree.frames) or "none"
+        raise InputError(
+            f"{images.path}: no transform leads from {camera!r}, the frame of the images, to {world!r}; the frames are "
+            f"{frames}: set tracker.camera to the camera's frame, tracker.body to that of the poses, or tracker.kind: "
+            "klt to track the images alone"
+        )
+    known = np.isfinite(T_world_camera[:, 0, 3])
+    if not known.any():
+        raise InputError(
+            f"{images.path}: the images, of {times.min():.6f} to {times.max():.6f} s, were all taken before or after "
+            f"the poses, or in gaps of more than {tracker.max_gap:g} s between them (tracker.max_gap)"
+        )
+    if not known.all():
+        first = names[int(np.argmin(known))]
+        notes.append(
+            f"{len(names) - known.sum()} of {len(names)} images were taken before or after the poses, or in a gap of "
+            f"more than {tracker.max_gap:g} s between them: skipped (the first: {first})"
+        )
+    T_camera_world = inverse_poses(T_world_camera[known])
+    named = [name for name, its in zip(names, known, strict=True) if its]
+    reader, frames = posed_images(images, source, dict(zip(named, T_camera_world, strict=True)))
+    if tracker.adjust:
+        frames, note = adjusted_frames(images, frames, solving(frames, source), progress)
+        return ReplayedTracker(reader, frames, [*notes, note])
+    xyz = _points(images, tracker, tree, world, notes)
+    if xyz is None:
+        return ReplayedTracker(reader, triangulated_frames(images, frames, solving(frames, source), progress), notes)
+    numbers = np.arange(len(xyz))
+    frames = [frame.with_points(spread_points(xyz, numbers, frame, tracker.max_points)) for frame in frames]
+    if not any(len(frame.points) for frame in frames):
+        raise InputError(
+            f"{images.path}: none of the {len(xyz)} points is seen by any of the {len(frames)} images: set "
+            "tracker.points: none to have points triangulated"
+        )
+    return ReplayedTracker(reader, frames, notes)
+
+
+def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree) -> tuple[str, list[str]]:
+    """Add the poses of the chosen topic to the transforms, and return the world's frame and remarks for the user."""
+    bag, topics = images.bag, images.bag.of_types(*POSES)
+    if tracker.pose is not None and tracker.pose != "tf":
+        topics = [bag.chosen(tracker.pose, POSES, "tracker.pose")]
+    camera = clean(tracker.camera or images.frame_id)
+    if tracker.pose == "tf" or not topics:
+        world = clean(tracker.world or tree.root(camera))
+        if not tree.moves:
+            raise InputError(f"{bag.path}: holds no poses: set tracker.kind: klt to track the images alone")
+        return world, [f"{bag.path}: poses of {camera} in {world} by the tf tree"]
+    topic, *others = topics
+    poses = read_pose_topic(bag, topic)
+    body = clean(tracker.body or poses.body or camera)
+    tree.add(poses.world, body, poses.motion)
+    world = clean(tracker.world or poses.world)
+    choice = f"; there are also {', '.join(others)} (tracker.pose)" if others else ""
+    taken = "" if tracker.body or poses.body else f", which does not say of what: of {camera} (tracker.body)"
+    return world, [f"{bag.path}: poses of {body} in {poses.world} by {topic}{taken}{choice}"]
+
+
+def _points(
+    images: BagImages, tracker: BagSettings, tree: FrameTree, world: str, notes: list[str]
+) -> NDArray[np.float64] | None:
+    """Return the points (N, 3) of the chosen topic of clouds, None if there is none. Adds remarks for the user."""
+    if tracker.points == "none":
+        return None
+    if tracker.points is not None:
+        topics = [images.bag.chosen(tracker.points, (CLOUD,), "tracker.points")]
+    else:
+        topics = images.bag.of_types(CLOUD)
+    if not topics:
+        return None
+    topic, *others = topics
+    try:
+        xyz = world_points(images.bag, topic, tree, world, tracker.max_gap)
+    except InputError as error:
+        if tracker.points is not None:
+            raise
+        notes.append(f"{error}: points are triangulated instead")
+        return None
+    choice = f"; there are also {', '.join(others)} (tracker.points)" if others else ""
+    notes.append(f"{images.path}: {len(xyz)} points of {topic}{choice}")
+    return xyz

@@ -1,0 +1,226 @@
+"""Bags of ROS 1 and ROS 2 deliver the images, cameras, poses and points that they were made with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from modp_ti.config.settings import SourceSettings
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.bags import has_poses, is_bag
+from modp_ti.inputs.bare_recording import recorded_scene
+from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
+from modp_ti.inputs.inspection.survey import survey
+from modp_ti.inputs.sources import open_source
+from modp_ti.inputs.trackers import bag as bag_tracker
+from tests.bags import BODY_CAMERA, FORMS, OPTICAL, START, STEP, Messages, recording, write_bag
+
+PLANE = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40), [0.0]), axis=-1).reshape(-1, 3)
+
+
+@pytest.fixture
+def untriangulated(monkeypatch):
+    """Triangulation would take seconds."""
+    monkeypatch.setattr(bag_tracker, "triangulated_frames", lambda _, frames, *__: frames)
+
+
+def place(form: str) -> str:
+    return "room.bag" if form == "ros1" else "room"
+
+
+def with_cloud(views, form, xyz=PLANE):
+    return [*recording(views, form), ("/map", START, Messages(form).cloud(START, xyz.astype("<f4")))]
+
+
+def assert_poses(frames, views, atol: float = 1e-12) -> None:
+    assert len(frames) == len(views)
+    for frame, view in zip(frames, views, strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, np.linalg.inv(view.T_world_camera), rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_images_cameras_poses_and_points_are_those_that_were_recorded(form, views, tmp_path, opened):
+    path = write_bag(tmp_path / place(form), form, with_cloud(views, form))
+    tracker = opened(path, {"scale": 1, "holdout": 4})
+    assert_poses(tracker.frames, views)
+    for n, (frame, posed, view) in enumerate(zip(tracker, tracker.frames, views, strict=True)):
+        np.testing.assert_array_equal(frame.image, view.image[..., ::-1] / np.float32(255))
+        np.testing.assert_allclose(posed.undistorter.raw.matrix(), view.K, atol=1e-12)
+        assert frame.timestamp == pytest.approx((START + n * STEP) * 1e-9, abs=1e-6)
+        assert frame.held_out == (n % 4 == 0)
+        in_camera = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+        np.testing.assert_allclose(frame.camera.project(in_camera), frame.points.pixels, atol=1e-6)
+        assert len(frame.points) > 50 and np.abs(frame.points.xyz[:, 2]).max() < 1e-6
+    notes = " ".join(tracker.notes)
+    for said in ("/camera/image_raw (rgb8)", "K with its lens of /camera/camera_info", "in odom by /odom", "/map"):
+        assert said in notes
+
+
+PACKED = [("ros1", "bz2"), ("ros1", "lz4"), ("sqlite3", "message"), ("mcap", "storage")]
+
+
+@pytest.mark.parametrize(("form", "packed"), PACKED)
+def test_packed_bags_are_read(form, packed, views, tmp_path, opened, untriangulated):
+    path = write_bag(tmp_path / place(form), form, recording(views[:2], form), packed)
+    tracker = opened(path)
+    assert_poses(tracker.frames, views[:2])
+    assert len(list(tracker)) == 2
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_bag_alone_is_recognised_and_tracked_by_its_own_poses(form, views, tmp_path):
+    path = write_bag(tmp_path / place(form), form, recording(views[:1], form))
+    assert recorded_scene(path).tracker.kind == "bag" and is_bag(path)
+    assert recorded_scene(path, ["tracker.kind=klt"]).tracker.kind == "klt"
+    files = [path] if form == "ros1" else [file for file in path.iterdir() if file.suffix != ".yaml"]
+    assert recorded_scene(files[0]).tracker.kind == "bag"
+
+
+def test_a_bag_without_poses_is_tracked_by_its_images(views, tmp_path, opened):
+    bare = [each for each in recording(views[:2]) if each[0].startswith("/camera") or each[0] == "/tf_static"]
+    path = write_bag(tmp_path / "room", "mcap", bare)
+    assert recorded_scene(path).tracker.kind == "klt" and not has_poses(path)
+    images = open_source(SourceSettings(path=path))
+    np.testing.assert_array_equal(images.read("room_000001"), views[1].image[..., ::-1])
+    np.testing.assert_array_equal(images.read("room_000000"), views[0].image[..., ::-1])
+    with pytest.raises(InputError, match=r"no transform leads from 'optical'"):
+        opened(path, world="odom")
+    images.close()
+
+
+def test_poses_by_the_tf_tree_are_those_by_odometry(views, tmp_path, opened, untriangulated):
+    messages = [each for each in recording(views) if each[0] != "/odom"]
+    path = write_bag(tmp_path / "room", "mcap", messages)
+    tracker = opened(path)
+    assert_poses(tracker.frames, views)
+    assert any("poses of optical in odom by the tf tree" in note for note in tracker.notes)
+    for a, b in zip(opened(path, world="base").frames, opened(path, world="base", pose="tf").frames, strict=True):
+        np.testing.assert_array_equal(a.T_camera_world, b.T_camera_world)
+        np.testing.assert_allclose(a.T_camera_world, np.linalg.inv(BODY_CAMERA), atol=1e-12)
+
+
+def test_images_outside_the_poses_times_are_skipped_and_told_once(views, tmp_path, opened, untriangulated):
+    messages = [each for each in recording(views) if each[0] != "/tf"]
+    kept = [each for each in messages if each[0] != "/odom" or STEP < each[1] - START < 5 * STEP]
+    tracker = opened(write_bag(tmp_path / "room", "mcap", kept))
+    assert_poses(tracker.frames, views[1:5])
+    skipped = [note for note in tracker.notes if "skipped" in note]
+    assert skipped == [
+        "3 of 7 images were taken before or after the poses, or in a gap of more than 0.5 s between them: skipped "
+        "(the first: room_000000)"
+    ]
+
+
+def test_images_between_poses_have_interpolated_ones_unless_the_gap_is_long(views, tmp_path, opened, untriangulated):
+    """Every second pose is there, and the others lie half-way between those beside them."""
+    between = list(views[:5])
+    for n in (1, 3):
+        before, after = (views[n + d].T_world_camera @ np.linalg.inv(BODY_CAMERA) for d in (-1, 1))
+        between[n] = replace(views[n], T_world_camera=halfway(before, after) @ BODY_CAMERA)
+    messages = recording(between)
+    odometry = [each for each in messages if each[0] == "/odom"][::2]
+    rest = [each for each in messages if each[0] not in ("/odom", "/tf")]
+    path = write_bag(tmp_path / "room", "mcap", [*rest, *odometry])
+    assert_poses(opened(path).frames, between, atol=2e-6)  # times since 1970 have steps of 0.24 us in float64
+    assert_poses(opened(path, max_gap=0.15).frames, between[::2])
+
+
+def halfway(a, b):
+    """The pose between two: the mean of the positions, and half of the turn."""
+    T = np.eye(4)
+    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
+    T[:3, :3] = a[:3, :3] @ Rotation.from_rotvec(turn / 2).as_matrix()
+    T[:3, 3] = (a[:3, 3] + b[:3, 3]) / 2
+    return T
+
+
+def test_poses_of_the_camera_itself_need_no_transforms(views, tmp_path, opened, untriangulated):
+    make = Messages()
+    images = [each for each in recording(views[:3]) if each[0].startswith("/camera")]
+    times = [START + n * STEP for n in range(3)]
+    poses = [("/pose", t, make.pose_stamped(t, v.T_world_camera)) for t, v in zip(times, views, strict=False)]
+    tracker = opened(write_bag(tmp_path / "room", "mcap", [*images, *poses]))
+    assert_poses(tracker.frames, views[:3])
+    assert any("/pose, which does not say of what: of optical (tracker.body)" in note for note in tracker.notes)
+
+
+def test_topics_are_chosen_by_name(views, tmp_path, opened, untriangulated):
+    make = Messages()
+    messages = recording(views[:2])
+    for n, view in enumerate(views[:2]):
+        time = START + n * STEP
+        grey = make.image(time, view.image[::2, ::2, 0], "mono8", "other")
+        messages.append(("/alone/image", time, grey))
+        moved = view.T_world_camera.copy()
+        moved[:3, 3] += 1.0
+        messages.append(("/another", time, make.odometry(time, moved, child="other")))
+    path = write_bag(tmp_path / "room", "mcap", messages)
+    tracker = opened(path)
+    assert_poses(opened(path, pose="/odom").frames, views[:2])
+    assert any("there are also /alone/image (source.bag.image)" in note for note in tracker.notes)
+    assert any("there are also /odom (tracker.pose)" in note for note in tracker.notes)
+    other = {"bag": {"image": "/alone/image", "camera_info": "/camera/camera_info"}, "intrinsics": {"fx": 150}}
+    frames = opened(path, other, pose="/another").frames
+    assert (frames[0].undistorter.raw.width, frames[0].undistorter.raw.fx) == (160, 150)
+    np.testing.assert_allclose(np.linalg.inv(frames[0].T_camera_world)[:3, 3], views[0].T_world_camera[:3, 3] + 1.0)
+    for wrong, setting in (({"pose": "/map"}, "tracker.pose"), ({"points": "/odom"}, "tracker.points")):
+        with pytest.raises(InputError, match=rf"at {next(iter(wrong.values()))}; there is .* \({setting}\)"):
+            opened(path, **wrong)
+
+
+@pytest.mark.parametrize("wrong", ["link", "inverse"])
+def test_a_wrong_convention_is_found_by_check(wrong, views, tmp_path, opened, untriangulated):
+    """Poses of the camera's body instead of its optical frame, and poses the wrong way round."""
+    views = views[:4]
+    if wrong == "inverse":
+        inverted = [replace(view, T_world_camera=np.linalg.inv(view.T_world_camera)) for view in views]
+        path, camera = write_bag(tmp_path / "room", "mcap", recording(inverted)), None
+    else:
+        path, camera = write_bag(tmp_path / "room", "mcap", recording(views)), "link"
+    geometry = measure_geometry(survey(opened(path, camera=camera), 4, lambda _: None))
+    finding = next(iter(judge_geometry(geometry)))
+    assert finding.code == ("body_axes" if wrong == "link" else "inverse_poses")
+    right = measure_geometry(survey(opened(write_bag(tmp_path / "right", "mcap", recording(views))), 4, lambda _: None))
+    assert not [finding for finding in judge_geometry(right) if finding.code in ("body_axes", "inverse_poses")]
+
+
+def test_the_optical_frame_is_the_body_turned():
+    np.testing.assert_allclose(OPTICAL[:3, 2], [1, 0, 0])  # it looks ahead
+    np.testing.assert_allclose(OPTICAL[:3, 1], [0, 0, -1])  # y down
+
+
+def test_images_of_12_bits_in_16_are_as_bright_as_those_of_8(views, tmp_path, opened, untriangulated):
+    deep = [each for each in recording(views[:2]) if each[0] != "/camera/image_raw"]
+    for n, view in enumerate(views[:2]):
+        values = np.maximum(view.image[..., 1].astype("<u2") * 16, 15)
+        values[0, 0] = 4095
+        deep.append(("/camera/image_raw", START + n * STEP, Messages().image(START + n * STEP, values, "mono16")))
+    tracker = opened(write_bag(tmp_path / "room", "mcap", deep), {"scale": 1})
+    assert any("the images have 16 bits and use 12: 4095 is taken as white" in note for note in tracker.notes)
+    frame = next(iter(tracker))
+    np.testing.assert_array_equal(frame.image[1:, :, 0], views[0].image[1:, :, 1] / np.float32(255))
+
+
+def test_images_of_another_time_or_size_are_told(views, tmp_path, opened, untriangulated):
+    make, messages = Messages(), recording(views[:3])
+    odd = make.image(START + 1000, views[0].image[:100], "rgb8")
+    again = make.image(START, views[0].image, "rgb8")
+    more = [("/camera/image_raw", START + 9 * STEP, message) for message in (odd, again)]  # recorded late, at one time
+    path = write_bag(tmp_path / "room", "mcap", [*messages, *more])
+    tracker = opened(path)
+    assert_poses(tracker.frames, views[:3])
+    for said in ("1 images of /camera/image_raw have another size", "1 images of /camera/image_raw have the time of"):
+        assert any(said in note for note in tracker.notes)
+
+
+def test_a_cloud_that_leads_nowhere_is_told_and_points_are_triangulated(views, tmp_path, opened):
+    lost = ("/scan", START, Messages().cloud(START, PLANE.astype("<f4"), "velodyne"))
+    path = write_bag(tmp_path / "room", "mcap", [*recording(views[:4]), lost])
+    tracker = opened(path)
+    assert any("'velodyne' to 'odom' at its time (tracker.points): points are triang" in note for note in tracker.notes)
+    assert np.median(np.abs(np.concatenate([frame.points.xyz[:, 2] for frame in tracker.frames]))) < 0.02
+    with pytest.raises(InputError, match="no cloud of /scan has points"):
+        opened(path, points="/scan")
