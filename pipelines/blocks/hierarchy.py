@@ -14,7 +14,7 @@ from pipelines.blocks.merging import merged
 __all__ = ["LEVELS", "Hierarchy", "Level"]
 
 # Number of levels below the map itself. Each has cells of twice the side of the one above.
-LEVELS = 5
+LEVELS = 4
 # Number of Gaussians of a surface in a cell of the first level, about. A block is as large as a cell of the last one.
 IN_FIRST_CELL = 8
 # Number of Gaussians that are merged at once.
@@ -97,7 +97,6 @@ class Hierarchy:
             The level (S,) of each, -1 where a block is left out.
         """
         distance = self.blocks.boxes[seen].distance(eye)
-        level = count = np.zeros(len(seen), dtype=np.int64)
         for tolerance in TOLERANCES:
             cells = tolerance * distance / (focal * self.side)  # of the first level that fit into the tolerance
             level = np.clip(np.floor(np.log2(np.maximum(cells, 0.5))) + 1, 0, LEVELS).astype(np.int64)
@@ -106,7 +105,9 @@ class Hierarchy:
                 count[level == number] = self.level(number).counts[seen[level == number]]
             if count.sum() <= most:
                 return level
-        nearest = np.argsort(distance, kind="stable")
+        # A block around the camera, too, has to lose detail.
+        nearest, count = np.argsort(distance, kind="stable"), self.level(LEVELS).counts[seen]
+        level = np.full(len(seen), LEVELS)
         level[nearest[np.cumsum(count[nearest]) > most]] = -1
         return level
 

@@ -29,9 +29,8 @@ def merged(state: Mapping[str, NDArray], group: NDArray[np.integer], side: float
 
         S = sum w_i (S_i + (m_i - m)(m_i - m)^T) / sum w_i
 
-    Its opacity o = sum w_i / a keeps the total of opacity times area. Where that exceeds `MOST_OPAQUE`, as on surfaces
-    that overlapping Gaussians cover, the area grows instead: S is multiplied by o / `MOST_OPAQUE`. A Gaussian that is
-    alone in its cell, or too large to be merged, stays as it is.
+    Its opacity o = sum w_i / a keeps the total of opacity times area, up to `MOST_OPAQUE`. A Gaussian that is alone in
+    its cell, or too large to be merged, stays as it is.
 
     Args:
         state: N Gaussians by name, as from `GaussianField.to_numpy`.
@@ -68,14 +67,13 @@ def _moments(state: dict[str, NDArray[np.float64]], first: NDArray[np.integer]) 
     M = R * np.exp(state["log_scale"])[:, None, :]
     S = M @ M.transpose(0, 2, 1)
     weight = _area(S) / (1.0 + np.exp(-state["opacity_logit"]))
+    count = np.diff(np.append(first, len(weight)))
     total = np.add.reduceat(weight, first)
-    share = weight / np.repeat(total, np.diff(np.append(first, len(weight))))
+    share = weight / np.repeat(total, count)
     mean = np.add.reduceat(share[:, None] * state["position"], first)
-    offset = state["position"] - np.repeat(mean, np.diff(np.append(first, len(weight))), axis=0)
+    offset = state["position"] - np.repeat(mean, count, axis=0)
     S = np.add.reduceat(share[:, None, None] * (S + offset[:, :, None] * offset[:, None, :]), first)
-    opacity = total / _area(S)
-    S *= np.maximum(opacity / MOST_OPAQUE, 1.0)[:, None, None]
-    opacity = np.minimum(opacity, MOST_OPAQUE)
+    opacity = np.minimum(total / _area(S), MOST_OPAQUE)
     variance, axes = np.linalg.eigh(S)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return {
