@@ -26,6 +26,7 @@ __all__ = [
     "matrix_from_quaternion",
     "orthonormalised",
     "quaternion_from_matrix",
+    "quaternions_from_matrices",
     "torch_exp_se3",
 ]
 
@@ -127,8 +128,13 @@ def matrices_from_unit_quaternions(q: NDArray) -> NDArray:
 
 
 def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
-    """Unit quaternion (w, x, y, z) of a rotation matrix (3, 3), from its largest component for numerical stability."""
-    R = np.asarray(R, dtype=np.float64)
+    """Unit quaternion (w, x, y, z) of a rotation matrix (3, 3)."""
+    return quaternions_from_matrices(np.asarray(R, dtype=np.float64)[None])[0]
+
+
+def quaternions_from_matrices(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternions (N, 4) of rotation matrices (N, 3, 3), from their largest component for numerical stability."""
+    R = np.moveaxis(R, 0, -1)
     x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
     # Row k is 4 q_k q.
@@ -140,9 +146,9 @@ def quaternion_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
             [z, xz, yz, 1 - R[0, 0] - R[1, 1] + R[2, 2]],
         ]
     )
-    k = int(np.argmax(rows.diagonal()))
-    q = rows[k] / (2.0 * np.sqrt(rows[k, k]))
-    return q / np.linalg.norm(q)
+    k = np.argmax(rows[range(4), range(4)], axis=0)
+    q = rows[k, :, np.arange(len(k))]
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
 def torch_exp_se3(xi: torch.Tensor) -> torch.Tensor:

@@ -29,6 +29,7 @@ class Format(str, Enum):
     splat = "splat"
     spz = "spz"
     sog = "sog"
+    sog_lod = "sog-lod"
     compressed_ply = "compressed-ply"
     splat_glb = "splat-glb"
     html = "html"
@@ -46,7 +47,8 @@ def export(
             "-f",
             help="`html`: a page that shows the map in any browser, without network; `points`: coloured points (PLY); "
             "`mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, `sog`, `compressed-ply`, `splat-glb`: "
-            "splats for viewers; `colmap`, `nerfstudio`: images with poses and points, to train on; `video`: the path",
+            "splats for viewers; `sog-lod`: a folder to serve, of which a browser loads what it shows; `colmap`, "
+            "`nerfstudio`: images with poses and points, to train on; `video`: the path",
         ),
     ],
     output: Annotated[

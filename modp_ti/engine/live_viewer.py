@@ -23,6 +23,7 @@ from modp_ti.outputs.viewer.modes import SPLATS, Photograph, painter
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from modp_ti.outputs.viewer.splats import splats_of
 from pipelines.pipeline import FrameReport
+from pipelines.render.renderer import RenderedView
 
 __all__ = ["LiveViewer"]
 
@@ -255,9 +256,12 @@ class LiveViewer(Observer):
             k = store[index]
             return Photograph(k.rgba, k.camera, k.T_camera_world.copy(), copy(k.exposure), k.vignette)
 
-        of_map = pipeline.renderer, pipeline.near, store.scene_depth
+        def render(camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> RenderedView:
+            return pipeline.renderer.render(camera, T_camera_world, pipeline.near)
+
+        largest = images.max_width, images.max_height
         try:
-            paint = painter(mode, browser, self.page.units, *of_map, poses, photograph)
+            paint = painter(mode, browser, self.page.units, render, largest, store.scene_depth, poses, photograph)
         finally:
             images.resize(*size)  # also clears the buffers, so that the mapper's next step does not pay for it
         if paint is not None:

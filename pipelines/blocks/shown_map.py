@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
-from fields.map.blocks import Blocks, divide, extent_of, planes_of, seen
+from fields.map.blocks import planes_of, seen
 from fields.map.gaussians import GaussianField
+from pipelines.blocks.hierarchy import Hierarchy
 
 __all__ = ["ShownMap"]
 
-# Number of Gaussians of a block, about.
-GAUSSIANS_EACH = 50
-
 
 class ShownMap:
-    """Loads a map into a pool. If it does not fit, only the part that a view sees is loaded, the nearest blocks first.
+    """Loads a map into a pool. If it does not fit, only the part that a view sees is loaded.
+
+    If that does not fit either, far blocks are loaded with less detail, see `Hierarchy`.
 
     Args:
         gaussians: The pool, whose Gaussians are replaced.
@@ -32,10 +32,7 @@ class ShownMap:
     def __init__(self, gaussians: GaussianField, values: Mapping[str, NDArray]) -> None:
         self.gaussians = gaussians
         self.values = dict(values)
-        self._blocks: Blocks | None = None
-        if not self.fits:
-            position = self.values["position"].astype(np.float64)
-            self._blocks = divide(position, extent_of(self.values["log_scale"]), _side(position))
+        self._hierarchy = None if self.fits else Hierarchy(self.values)
 
     @property
     def fits(self) -> bool:
@@ -49,19 +46,12 @@ class ShownMap:
             camera: The view's camera.
             T_camera_world: Its pose (4, 4).
         """
-        if self._blocks is None:
+        if self._hierarchy is None:
             self.gaussians.load(self.values)
             return
-        blocks = self._blocks
-        chosen = np.flatnonzero(seen(planes_of(camera, T_camera_world, np.inf)[None], blocks.boxes)[0])
-        distance = blocks.boxes[chosen].distance(inverse_se3(T_camera_world)[:3, 3])
-        chosen = chosen[np.argsort(distance, kind="stable")]
-        chosen = chosen[np.cumsum(blocks.counts[chosen]) <= self.gaussians.capacity]
-        members = np.concatenate([np.zeros(0, dtype=np.int64), *(blocks.of(block) for block in chosen.tolist())])
-        self.gaussians.load({name: array[members] for name, array in self.values.items()})
-
-
-def _side(position: NDArray[np.float64]) -> float:
-    """Side of cubes that hold about `GAUSSIANS_EACH` positions (N, 3) of surfaces. Outliers do not count."""
-    low, high = np.quantile(position, [0.02, 0.98], axis=0)
-    return float(np.prod(np.sort(high - low)[1:]) * GAUSSIANS_EACH / len(position)) ** 0.5 or 1.0
+        hierarchy = self._hierarchy
+        planes = planes_of(camera, T_camera_world, np.inf)[None]
+        chosen = np.flatnonzero(seen(planes, hierarchy.blocks.boxes)[0])
+        eye = inverse_se3(T_camera_world)[:3, 3]
+        levels = hierarchy.levels_for(chosen, eye, camera.fx, self.gaussians.capacity)
+        self.gaussians.load(hierarchy.gaussians(chosen, levels))

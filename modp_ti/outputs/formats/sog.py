@@ -37,7 +37,7 @@ from modp_ti.outputs.formats.splat_packing import (
     with_largest,
 )
 
-__all__ = ["read_sog", "sog_bytes", "write_sog"]
+__all__ = ["read_sog", "sog_bytes", "sog_files", "write_sog"]
 
 CODES = 256
 # Rounds of Lloyd's algorithm for a codebook and for the palette.
@@ -64,7 +64,16 @@ def write_sog(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> Non
 def sog_bytes(state: Mapping[str, NDArray]) -> bytes:
     """Return the content of a `.sog` file; see `write_sog`."""
     order = morton_order(state["position"])
-    state = {name: values[order] for name, values in state.items()}
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
+        # A fixed date, so that the same map gives the same file.
+        for name, data in sog_files({name: values[order] for name, values in state.items()}).items():
+            archive.writestr(zipfile.ZipInfo(name), data)
+    return content.getvalue()
+
+
+def sog_files(state: Mapping[str, NDArray]) -> dict[str, bytes]:
+    """Return the files of a `.sog` archive by name, with the Gaussians in the order that is given."""
     count, harmonics = state["sh"].shape[:2]
     width = 4 * int(np.ceil(np.sqrt(max(count, 1)) / 4))
     height = 4 * int(np.ceil(max(count, 1) / width / 4))
@@ -115,7 +124,8 @@ def sog_bytes(state: Mapping[str, NDArray]) -> bytes:
             "codebook": _short(codes),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    return _archive(meta, images)
+    content = {f"{name}.webp": _webp(image) for name, image in images.items()}
+    return content | {"meta.json": json.dumps(meta, separators=(",", ":")).encode("ascii")}
 
 
 def read_sog(data: bytes, path: Path) -> dict[str, NDArray]:
@@ -260,15 +270,9 @@ def _short(codes: NDArray[np.float32]) -> list[float]:
     return [float(f"{code:.6g}") for code in codes]
 
 
-def _archive(meta: dict, images: dict[str, NDArray[np.uint8]]) -> bytes:
+def _webp(image: NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
-        # A fixed date, so that the same map gives the same file.
-        for name, image in images.items():
-            webp = io.BytesIO()
-            Image.fromarray(image).save(webp, "WEBP", lossless=True, exact=True, quality=100, method=4)
-            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), webp.getvalue())
-        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta, separators=(",", ":")))
+    Image.fromarray(image).save(content, "WEBP", lossless=True, exact=True, quality=100, method=4)
     return content.getvalue()

@@ -11,6 +11,7 @@ from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_tr
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
 from modp_ti.outputs.formats.sog import write_sog
+from modp_ti.outputs.formats.sog_lod import write_sog_lod
 from modp_ti.outputs.formats.splat_glb import write_splat_glb
 from modp_ti.outputs.formats.spz import DEFAULT_VERSION, write_spz
 from modp_ti.outputs.formats.web_splat import write_web_splat
@@ -24,7 +25,8 @@ from modp_ti.outputs.playback.surface import surface_views
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
 from modp_ti.outputs.splat_page.flight import level, moved, viewer_settings
-from modp_ti.outputs.splat_page.page import write_splat_page
+from modp_ti.outputs.splat_page.page import write_splat_page, write_streaming_page
+from pipelines.blocks.hierarchy import Hierarchy
 
 __all__ = ["DEFAULT_NAMES", "export_map"]
 
@@ -35,6 +37,7 @@ DEFAULT_NAMES = {
     "splat": "splats.splat",
     "spz": "splats.spz",
     "sog": "splats.sog",
+    "sog-lod": "splats-lod",
     "compressed-ply": "splats.compressed.ply",
     "splat-glb": "splats.glb",
     "html": "map.html",
@@ -43,6 +46,8 @@ DEFAULT_NAMES = {
     "video": "recorded.mp4",
 }
 SPLATS = {"sog": write_sog, "compressed-ply": write_compressed_ply, "splat-glb": write_splat_glb}
+# Formats that are written to a folder.
+FOLDERS = ("colmap", "nerfstudio", "sog-lod")
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL = 1 / 160
 FARTHEST = 4.0
@@ -99,6 +104,9 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         elif format == "html":
             with line.working("writing the page"):
                 _page(run, target)
+        elif format == "sog-lod":
+            with line.working("writing levels of detail"):
+                _levels_of_detail(run, target)
         elif format == "video":
             film(run, plan_flight(run, "recorded"), target, False, options.device, line)
         else:
@@ -111,7 +119,7 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
 def _target(run: FinishedRun, format: str, output: Path | None) -> Path:
     """Return the output path. Raises InputError if it is not usable, before anything is computed."""
     target = run.folder / DEFAULT_NAMES[format] if output is None else output.expanduser()
-    if format in ("colmap", "nerfstudio"):
+    if format in FOLDERS:
         return target
     if target.is_dir():
         raise InputError(f"{target}: is a folder; name a file, for example {target / DEFAULT_NAMES[format]}")
@@ -149,6 +157,15 @@ def _page(run: FinishedRun, target: Path) -> None:
     write_splat_page(target, run.folder.absolute().name, state, viewer_settings(run, upright))
     if target.resolve() == (run.folder / DEFAULT_NAMES["html"]).resolve():
         show_link_to_map(run.folder / "report.html")
+
+
+def _levels_of_detail(run: FinishedRun, target: Path) -> None:
+    """Write the map at all levels of detail, upright as in the page, with a page that streams it."""
+    upright = level(run.poses, run.record.scene_depth)
+    hierarchy = Hierarchy(moved(run.gaussians, upright.R, upright.scale))
+    with new_folder(target) as folder:
+        write_sog_lod(folder, hierarchy)
+        write_streaming_page(folder / "index.html", run.folder.absolute().name, viewer_settings(run, upright))
 
 
 def _dataset(run: FinishedRun, target: Path, format: str, line: ProgressLine) -> None:

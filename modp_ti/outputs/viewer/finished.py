@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import ViewSettings
 from modp_ti.files import read_bytes
 from modp_ti.files.errors import InputError
@@ -19,14 +21,17 @@ from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
-from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter
+from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from modp_ti.outputs.viewer.splats import splats_of
+from pipelines.blocks.hierarchy import Hierarchy
 
 __all__ = ["FinishedViewer"]
 
 # Pictures for a browser are at most this large, or as large as the run's cameras if those are larger [px].
 PICTURE = 1280, 960
+# Way of a camera after which a browser gets the splats of a large map again [scene depths].
+MOVED = 0.1
 # Maximum number of tracked points on the page. More are subsampled evenly.
 MAX_POINTS = 20_000
 
@@ -48,6 +53,7 @@ class FinishedViewer:
 
     def __init__(self, run: FinishedRun, settings: ViewSettings, device: str) -> None:
         self.run = run
+        self._max_splats = settings.max_splats
         self._chosen: Latest[int] = Latest()
         gaussians, points = run.gaussians, _tracked_points(run)
         self._kept = (run.folder / "colmap" / "images").is_dir()
@@ -63,7 +69,12 @@ class FinishedViewer:
         self.page.settle(run.record.scene_depth, run.poses[keyframes[0]])
         self.page.show_keyframes(run.poses[keyframes], run.cameras[keyframes[0]])
         self.page.show_points(points)
-        self.page.show_splats(splats_of(gaussians, self.page.units, settings.max_splats))
+        # Of a map with more splats than a browser draws, each browser gets those for its camera.
+        self._detail, self._shown = None, dict[int, NDArray]()
+        if len(gaussians["position"]) > settings.max_splats:
+            self._detail = Hierarchy(gaussians)
+        else:
+            self.page.show_splats(splats_of(gaussians, self.page.units, settings.max_splats))
         frames = f"**{len(run)}** frames, {len(keyframes)} keyframes  \n" if run.folder.is_dir() else ""
         self.page.show_numbers(f"{frames}{len(gaussians['position']):,} Gaussians")
         self._show_frame(0)
@@ -83,25 +94,46 @@ class FinishedViewer:
             mode = self.page.requests.mode
             if camera is not None and mode != SPLATS:
                 self._render(camera, mode)
+            elif camera is not None and self._detail is not None:
+                self._show_splats(camera, self._detail)
 
     def _show_frame(self, index: int) -> None:
         picture = self._photograph(index).rgba[..., :3] if self._kept else None
         self.page.show_frame(ShownFrame(self.run.poses[index], self.run.cameras[index], picture))
 
     def _render(self, browser: BrowserCamera, mode: str) -> None:
-        record, mapped = self.run.record, self.run.mapped
+        record, mapped, images = self.run.record, self.run.mapped, self._renderer.renderer.images
         paint = painter(
             mode,
             browser,
             self.page.units,
-            self._renderer.renderer,
-            record.near,
+            self._renderer.view,
+            (images.max_width, images.max_height),
             record.scene_depth,
             self.run.poses[mapped],
             lambda index: self._photograph(mapped[index]),
         )
         if paint is not None:
             self.page.show_picture(browser.client, paint())
+
+    def _show_splats(self, browser: BrowserCamera, detail: Hierarchy) -> None:
+        """Show a browser the blocks of a large map, the far ones with less detail; see `Hierarchy`.
+
+        All blocks are sent, also those behind the camera, and only after the camera has moved by `MOVED`.
+        """
+        seen_from = pinhole_of(browser, self.page.units, *PICTURE)
+        if seen_from is None:
+            return
+        camera, T_camera_world = seen_from
+        eye = inverse_se3(T_camera_world)[:3, 3]
+        before = self._shown.get(browser.client)
+        if before is not None and np.linalg.norm(eye - before) < MOVED * self.run.record.scene_depth:
+            return
+        self._shown[browser.client] = eye
+        blocks = np.arange(len(detail.blocks))
+        levels = detail.levels_for(blocks, eye, camera.fy, self._max_splats)
+        splats = splats_of(detail.gaussians(blocks, levels), self.page.units, self._max_splats)
+        self.page.show_splats(replace(splats, of=len(self.run.gaussians["position"])), browser.client)
 
     def _photograph(self, index: int) -> Photograph:
         """Return the kept image of a frame. Raises InputError if it is missing or damaged."""

@@ -13,7 +13,7 @@ from fields.geometry.se3 import camera_centres, inverse_se3, matrix_from_quatern
 from modp_ti.outputs.playback.film import depth_colours
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.viewer.handover import BrowserCamera
-from pipelines.render.renderer import RenderedView, Renderer
+from pipelines.render.renderer import RenderedView
 
 __all__ = ["MODES", "SPLATS", "Photograph", "image_error", "nearest_photograph", "painter", "picture_of", "pinhole_of"]
 
@@ -83,8 +83,8 @@ def painter(
     mode: str,
     browser: BrowserCamera,
     units: float,
-    renderer: Renderer,
-    near: float,
+    render: Callable[[PinholeCamera, NDArray[np.float64]], RenderedView],
+    largest: tuple[int, int],
     scene_depth: float,
     poses: NDArray[np.float64],
     photograph: Callable[[int], Photograph],
@@ -95,8 +95,8 @@ def painter(
         mode: One of MODES, except for SPLATS.
         browser: The camera to show the map from.
         units: Page units per world unit.
-        renderer: Holds the map.
-        near: Depth below which nothing is drawn [scene units].
+        render: Renders the map from a camera and T_camera_world (4, 4).
+        largest: Largest width and height of a picture [px].
         scene_depth: The scene's depth [scene units].
         poses: (N, 4, 4) T_camera_world of the photographs, for the error mode.
         photograph: Returns the photograph with this index among `poses`.
@@ -105,16 +105,16 @@ def painter(
         A function that computes the picture (H, W, 3) and does not use the map any more; None if the browser's camera
         is invalid or the renderer's capacity does not suffice, as can happen inside large Gaussians.
     """
-    seen_from = pinhole_of(browser, units, renderer.images.max_width, renderer.images.max_height)
+    seen_from = pinhole_of(browser, units, *largest)
     if seen_from is None:
         return None
     camera, T_camera_world = seen_from
     try:
-        view = renderer.render(camera, T_camera_world, near)
+        view = render(camera, T_camera_world)
         if mode != "error":
             return lambda: picture_of(view, mode, scene_depth)
         taken = photograph(nearest_photograph(poses, T_camera_world, scene_depth))
-        seen = renderer.render(taken.camera, taken.T_camera_world, near)
+        seen = render(taken.camera, taken.T_camera_world)
     except ValueError:
         return None
     return lambda: error_picture(image_error(view, camera, T_camera_world, taken, seen))

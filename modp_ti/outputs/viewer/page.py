@@ -95,6 +95,7 @@ class Page:
         self._units: float | None = None
         self._frame: ShownFrame | None = None
         self._nodes: dict[str, Any] = {}
+        self._splats: dict[int | None, Any] = {}  # by browser, None for all
         self._lock = threading.Lock()  # nodes are changed by the publishing thread and by viser's threads
         before = set(threading.enumerate())
         with _silent():
@@ -106,7 +107,7 @@ class Page:
         self._server.scene.world_axes.visible = False
         self._add_controls(modes, choose, frames)
         self._server.on_client_connect(self._connected)
-        self._server.on_client_disconnect(lambda client: self.requests.leave(client.client_id))
+        self._server.on_client_disconnect(self._disconnected)
 
     def close(self) -> None:
         """Stop serving the page."""
@@ -141,19 +142,20 @@ class Page:
         """Show Markdown text in the numbers panel."""
         self._numbers.content = text
 
-    def show_splats(self, splats: Splats) -> None:
-        """Replace the splats, which are visible in the splats mode."""
+    def show_splats(self, splats: Splats, client: int | None = None) -> None:
+        """Replace the splats of one browser, or of all, which are visible in the splats mode."""
         note = "" if len(splats.centres) == splats.of else f"{len(splats.centres):,} of {splats.of:,} Gaussians drawn"
         if note != self._note.content:
             self._note.content = note
         values = splats.centres, splats.covariances, splats.colours, splats.opacities
         with self._lock:
-            if "splats" in self._nodes:
-                self._nodes["splats"].set_gaussians(*values)
-            else:
-                node = self._server.scene.add_gaussian_splats("/splats", *values)
+            shown_by = self._server if client is None else self._server.get_clients().get(client)
+            if client in self._splats:
+                self._splats[client].set_gaussians(*values)
+            elif shown_by is not None:
+                node = shown_by.scene.add_gaussian_splats("/splats", *values)
                 node.visible = self.requests.mode == SPLATS
-                self._nodes["splats"] = node
+                self._splats[client] = node
 
     def show_picture(self, client: int, picture: NDArray[np.uint8]) -> None:
         """Set a picture (H, W, 3) as the background of one browser."""
@@ -245,8 +247,8 @@ class Page:
     def _set_mode(self, mode: str) -> None:
         with self._lock:
             self.requests.show(mode)
-            if "splats" in self._nodes:
-                self._nodes["splats"].visible = mode == SPLATS
+            for node in self._splats.values():
+                node.visible = mode == SPLATS
             if mode == SPLATS:
                 for client in self._server.get_clients().values():
                     client.scene.set_background_image(None)
@@ -262,6 +264,11 @@ class Page:
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._moved(client))
         self._moved(client)
+
+    def _disconnected(self, client: viser.ClientHandle) -> None:
+        self.requests.leave(client.client_id)
+        with self._lock:
+            self._splats.pop(client.client_id, None)
 
     def _moved(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self._server.get_clients():

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.runtime import disk_room
 from fields.runtime.backend import initialise
+from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.blocks.block_files import BlockError
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
@@ -158,11 +160,22 @@ def test_a_full_disk_is_told_and_leaves_out_what_has_no_room(
     assert mapper.caught().gaussians_without_room > 0
 
 
-def test_files_go_with_the_map(taichi_on_the_cpu: None, tmp_path: Path) -> None:
+def test_the_saved_map_holds_the_blocks_on_disk_whose_files_go_with_it(taichi_on_the_cpu: None, tmp_path: Path) -> None:
     (tmp_path / "blocks-left").mkdir()
     mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
     (folder,) = tmp_path.iterdir()
     assert folder.name != "blocks-left" and list(folder.glob("*.npy"))
+    # The saved map is what is in memory and what lies in these files, one after the other.
+    write_splats(tmp_path / "map.ply", mapper.all_gaussians())
+    saved = PlyData.read(tmp_path / "map.ply")["vertex"]
+    here, blocks = mapper.gaussians.to_numpy(), [mapper.paging.away.read(block) for block in mapper.paging.away]
+    assert sum(map(len, blocks)) > 100
+    for axis, name in enumerate("xyz"):
+        parts = [here["position"][:, axis], *(block["position"][:, axis] for block in blocks)]
+        np.testing.assert_array_equal(saved[name], np.concatenate(parts))
+    opacity = [here["opacity_logit"], *(block["opacity_logit"] for block in blocks)]
+    np.testing.assert_array_equal(saved["opacity"], np.concatenate(opacity))
+    (tmp_path / "map.ply").unlink()
     del mapper
     gc.collect()
     assert not list(tmp_path.iterdir())

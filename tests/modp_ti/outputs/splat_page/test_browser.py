@@ -1,10 +1,15 @@
-"""The exported page in a real browser, from the disk and without network: it shows the map and flies through it."""
+"""Exported pages in a real browser: from the disk and without network, and streamed from a server."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -15,7 +20,7 @@ import screenshot
 from fields.geometry.camera import PinholeCamera
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.export_map import ExportOptions, export_map
-from modp_ti.outputs.playback.finished_run import open_run
+from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.splat_page.flight import TO_VIEWER, level, moved, viewer_settings
@@ -30,32 +35,49 @@ WIDTH, HEIGHT = 320, 240
 EYE = "() => { const p = viewer.app.root.findByName('camera').getPosition(); return [p.x, p.y, p.z]; }"
 
 
-@pytest.fixture
-def opened(finished: Path, tmp_path: Path):
-    """The run, the open page of its map, what its console said, and what it requested."""
+@contextmanager
+def opened(url: str, offline: bool) -> Iterator[tuple]:
+    """The open page of a map, what its console said, and what it requested."""
     from playwright.sync_api import sync_playwright
-    from rich.console import Console
 
-    run = open_run(finished)
-    line = ProgressLine(Console(quiet=True))
-    file = export_map(run, "html", tmp_path / "map.html", ExportOptions(), line)
     executable = next(path for path in map(shutil.which, screenshot.NAMES) if path)
     with sync_playwright() as driver:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("VK_")}
         browser = driver.chromium.launch(executable_path=executable, args=screenshot.OPTIONS, env=environment)
         try:
-            context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=True)
+            context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=offline)
             page = context.new_page()
             errors: list[str] = []
             requests: list[str] = []
             page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
             page.on("pageerror", lambda error: errors.append(str(error)))
             page.on("request", lambda request: requests.append(request.url))
-            page.goto(file.as_uri())
+            page.goto(url)
             until(page, "() => Boolean(window.viewer && viewer.state.loaded)")
-            yield run, page, errors, requests, file
+            yield page, errors, requests
         finally:
             browser.close()
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a server of a folder."""
+
+    class Handler(SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+
+
+def exported(finished: Path, format: str, target: Path) -> tuple[FinishedRun, Path]:
+    from rich.console import Console
+
+    run = open_run(finished)
+    return run, export_map(run, format, target, ExportOptions(), ProgressLine(Console(quiet=True)))
 
 
 def until(page, condition: str) -> None:
@@ -65,25 +87,17 @@ def until(page, condition: str) -> None:
         page.wait_for_timeout(100)
 
 
-def test_the_page_shows_the_map_and_flies_through_it_without_a_request(opened, taichi_on_the_cpu: None) -> None:
-    run, page, errors, requests, file = opened
-    upright = level(run.poses, run.record.scene_depth)
-    track = viewer_settings(run, upright)["animTracks"][0]
-    eyes = np.reshape(track["keyframes"]["values"]["position"], (-1, 3))
+def eyes_of(run: FinishedRun) -> np.ndarray:
+    track = viewer_settings(run, level(run.poses, run.record.scene_depth))["animTracks"][0]
+    return np.reshape(track["keyframes"]["values"]["position"], (-1, 3))
 
-    # The flight runs by itself, and along the trajectory.
-    places = []
-    while len(places) < 5:
-        places.append(page.evaluate(EYE))
-        page.wait_for_timeout(200)
-    assert np.ptp(places, axis=0).max() > 0
-    step = np.linalg.norm(np.diff(eyes, axis=0), axis=1).max()
-    assert np.linalg.norm(eyes[:, None] - places, axis=2).min(axis=0).max() <= step
 
-    # The start view is what our renderer shows from there.
+def start_views(page, run: FinishedRun) -> tuple[np.ndarray, np.ndarray]:
+    """What the page shows at the start of the flight, and what our renderer shows from there."""
+    eye, upright = eyes_of(run)[0], level(run.poses, run.record.scene_depth)
     page.evaluate("() => { viewer.state.animationPaused = true; viewer.seek(0); }")
     page.evaluate("() => { document.querySelector('.sse-ui').style.display = 'none'; }")
-    until(page, f"() => {{ const p = ({EYE})(); return Math.abs(p[0] - ({eyes[0, 0]})) < 1e-3; }}")
+    until(page, f"() => {{ const p = ({EYE})(); return Math.abs(p[0] - ({eye[0]})) < 1e-3; }}")
     page.wait_for_timeout(2000)
     shown = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(np.float64)
     start = viewer_settings(run, upright)["cameras"][0]["initial"]
@@ -92,10 +106,55 @@ def test_the_page_shows_the_map_and_flies_through_it_without_a_request(opened, t
     renderer = MapRenderer(
         moved(run.gaussians, upright.R, upright.scale), WIDTH, HEIGHT, upright.scale * run.record.near
     )
-    ours = renderer.picture(PinholeCamera(focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT), T).astype(np.float64)
-    psnr = -10 * np.log10(((shown - ours) ** 2).mean() / 255**2)
-    mirrored = -10 * np.log10(((shown[:, ::-1] - ours) ** 2).mean() / 255**2)
-    assert psnr >= 25 > mirrored, (psnr, mirrored)
+    ours = renderer.picture(PinholeCamera(focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT), T)
+    return shown, ours.astype(np.float64)
 
-    assert not errors
-    assert [url for url in requests if not url.startswith(("blob:", "data:"))] == [file.as_uri()]
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(((one - other) ** 2).mean() / 255**2))
+
+
+def test_the_page_shows_the_map_and_flies_through_it_without_a_request(
+    finished: Path, tmp_path: Path, taichi_on_the_cpu: None
+) -> None:
+    run, file = exported(finished, "html", tmp_path / "map.html")
+    with opened(file.as_uri(), offline=True) as (page, errors, requests):
+        # The flight runs by itself, and along the trajectory.
+        eyes, places = eyes_of(run), []
+        while len(places) < 5:
+            places.append(page.evaluate(EYE))
+            page.wait_for_timeout(200)
+        assert np.ptp(places, axis=0).max() > 0
+        step = np.linalg.norm(np.diff(eyes, axis=0), axis=1).max()
+        assert np.linalg.norm(eyes[:, None] - places, axis=2).min(axis=0).max() <= step
+
+        # The start view is what our renderer shows from there.
+        shown, ours = start_views(page, run)
+        assert psnr(shown, ours) >= 25 > psnr(shown[:, ::-1], ours)
+        assert not errors
+        assert [url for url in requests if not url.startswith(("blob:", "data:"))] == [file.as_uri()]
+
+
+def test_a_browser_streams_levels_of_detail_from_a_server(
+    finished: Path, tmp_path: Path, taichi_on_the_cpu: None
+) -> None:
+    run, folder = exported(finished, "sog-lod", tmp_path / "lod")
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    quality, loaded = [], []
+    # All of it, and a hundredth of it [millions].
+    for budget in (1.0, 1e-8 * len(run.gaussians["position"])):
+        with (
+            served(folder) as url,
+            opened(f"{url}/index.html?budget={budget:.7f}", offline=False) as (
+                page,
+                errors,
+                requests,
+            ),
+        ):
+            quality.append(psnr(*start_views(page, run)))
+            loaded.append({wanted.removeprefix(f"{url}/") for wanted in requests if wanted.startswith(url)})
+            assert not errors
+    assert quality[0] >= 25 and quality[0] > quality[1] + 3 > 10
+    assert all("lod-meta.json" in wanted for wanted in loaded)
+    assert "0_0/meta.json" in loaded[0] and not any(wanted.startswith("0_") for wanted in loaded[1])
+    assert all(wanted.split("?")[0] in files for wanted in loaded[0] | loaded[1])

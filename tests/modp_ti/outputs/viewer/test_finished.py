@@ -23,6 +23,7 @@ from modp_ti.outputs.playback.splat_file import open_splats
 from modp_ti.outputs.viewer.finished import FinishedViewer
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import MODES, UNSEEN
+from modp_ti.outputs.viewer.splats import Splats
 
 pytestmark = pytest.mark.slow
 
@@ -107,6 +108,28 @@ def test_a_file_of_splats_is_shown_without_a_run(tmp_path: Path):
     finally:
         viewer.close()
     assert (got[0].max(axis=2) > 128).mean() > 0.9  # the wall fills this narrow view
+
+
+def test_a_browser_gets_the_splats_of_a_large_map_for_its_camera(tmp_path: Path):
+    write_splats(tmp_path / "wall.ply", wall())
+    run = open_splats(tmp_path / "wall.ply")
+    viewer = FinishedViewer(run, ViewSettings(port=0, max_splats=1000), "cpu")
+    got: list[tuple[int | None, Splats]] = []
+    viewer.page.show_splats = lambda splats, client=None: got.append((client, splats))
+    near, aside = np.eye(4), np.eye(4)
+    near[:3, 3], aside[:3, 3] = [1.4, 0.0, -1.5], [-1.4, 0.0, -1.5]  # half a unit before one end, and the other
+    try:
+        for T, count in ((near, 1), (near, 1), (aside, 2)):
+            looks(viewer, T, 96, 64)
+            turns = iter(range(3))
+            viewer.serve(lambda turns=turns: next(turns, None) is None)
+            assert len(got) == count
+    finally:
+        viewer.close()
+    assert all(client == 5 and splats.of == 2700 and 300 < len(splats.centres) <= 1000 for client, splats in got)
+    # Each has its own end of the wall, which the camera in (-1.4, 0, 1.5) sees to the left, in full detail.
+    left, right = (splats.centres[:, 0] / viewer.page.units for _, splats in got)
+    assert (left < -1.2).sum() > 2 * (left > 1.2).sum() and (right > 1.2).sum() > 2 * (right < -1.2).sum()
 
 
 def test_the_chosen_frame_is_shown_with_its_picture(run: FinishedRun):

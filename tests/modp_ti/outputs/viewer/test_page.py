@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import builtins
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urlparse
 from urllib.request import urlopen
@@ -123,6 +124,30 @@ def test_a_browser_that_does_not_listen_neither_blocks_nor_fills_the_memory(page
             page.show_frame(ShownFrame(np.eye(4), CAMERA, np.full((80, 120, 3), i % 256, dtype=np.uint8)))
         grown = resident() - before
         assert grown < 60e6  # of 128 MB that were shown
+
+
+def test_a_browser_has_splats_of_its_own_until_it_leaves(page: Page):
+    from websockets.sync.client import connect
+
+    one = np.zeros((1, 3), dtype=np.uint8)
+    splats = Splats(np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[None], one, one[:, :1], 5)
+    address = page.url.replace("http", "ws")
+    with connect(address, subprotocols=[f"viser-v{viser_version()}"], max_size=None):
+        until(lambda: len(page._server.get_clients()) == 1)
+        (client,) = page._server.get_clients()
+        page.show_splats(splats, client + 1)  # one that has left meanwhile
+        assert not page._splats
+        page.show_splats(splats, client)
+        page.show_splats(splats, client)
+        assert list(page._splats) == [client]
+    until(lambda: not page._splats)
+
+
+def until(happened: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def viser_version() -> str:

@@ -1,0 +1,146 @@
+"""`Hierarchy`: a map at several levels of detail, of which every block can be drawn at its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.blocks import divide, extent_of
+from pipelines.blocks.merging import merged
+
+__all__ = ["LEVELS", "Hierarchy", "Level"]
+
+# Number of levels below the map itself. Each has cells of twice the side of the one above.
+LEVELS = 4
+# Number of Gaussians of a surface in a cell of the first level, about. A block is as large as a cell of the last one.
+IN_FIRST_CELL = 8
+# Number of Gaussians that are merged at once.
+BATCH = 1 << 18
+# Sizes of cells in the image that are tried, one after the other [px].
+TOLERANCES = (0.0, *np.geomspace(0.5, 2048.0, 49).tolist())
+
+
+@dataclass(frozen=True)
+class Level:
+    """A map at one level of detail.
+
+    Attributes:
+        values: Gaussians by name, as from `GaussianField.to_numpy`.
+        places: Places of the Gaussians in `values`, in the order of the blocks.
+        first: Place (B + 1,) of each block's first Gaussian in `places`.
+    """
+
+    values: Mapping[str, NDArray]
+    places: NDArray[np.int64]
+    first: NDArray[np.int64]
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Number (B,) of Gaussians in each block."""
+        return np.diff(self.first)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def places_in(self, blocks: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the places in `values` of the Gaussians of blocks, in the order that is given."""
+        count = self.counts[blocks]
+        start = np.repeat(self.first[blocks] - np.append(0, np.cumsum(count)[:-1]), count)
+        return self.places[start + np.arange(len(start))]
+
+
+class Hierarchy:
+    """Divides a map into blocks, and merges Gaussians for each level when it is first asked for.
+
+    Level 0 is the map. At level k, the Gaussians of each cell of side `side * 2^(k - 1)` are one, see `merged`. A block
+    has the side of a cell of the last level, and more where its Gaussians are larger, see `divide`.
+
+    Args:
+        values: The map, by name as from `GaussianField.to_numpy`.
+
+    Attributes:
+        blocks: The blocks, with boxes around the Gaussians of level 0.
+        side: Side of the cells of level 1 [scene units].
+    """
+
+    def __init__(self, values: Mapping[str, NDArray]) -> None:
+        position = values["position"].astype(np.float64)
+        self.side = _side(position)
+        self.blocks = divide(position, extent_of(values["log_scale"]), self.side * 2 ** (LEVELS - 1))
+        self._levels = [Level(values, self.blocks.members, self.blocks.first)]
+
+    def level(self, number: int) -> Level:
+        """Return the map at a level, 0 to LEVELS. Coarser ones are computed when they are first asked for."""
+        while len(self._levels) <= number:
+            self._levels.append(self._merged(self.side * 2 ** (len(self._levels) - 1)))
+        return self._levels[number]
+
+    def levels_for(
+        self, seen: NDArray[np.integer], eye: NDArray[np.float64], focal: float, most: int
+    ) -> NDArray[np.int64]:
+        """Choose the level of each block such that at most so many Gaussians are drawn.
+
+        A block at a distance d is drawn at the coarsest level whose cells are at most t pixels wide at d. The smallest
+        tolerance t is taken with which all blocks fit; it is 0 if they do at level 0. If they do not fit at the last
+        level, the nearest are drawn.
+
+        Args:
+            seen: Blocks (S,) to draw.
+            eye: Camera centre (3,).
+            focal: Focal length [px].
+            most: Number of Gaussians.
+
+        Returns:
+            The level (S,) of each, -1 where a block is left out.
+        """
+        distance = self.blocks.boxes[seen].distance(eye)
+        for tolerance in TOLERANCES:
+            cells = tolerance * distance / (focal * self.side)  # of the first level that fit into the tolerance
+            level = np.clip(np.floor(np.log2(np.maximum(cells, 0.5))) + 1, 0, LEVELS).astype(np.int64)
+            count = np.zeros(len(seen), dtype=np.int64)
+            for number in np.unique(level).tolist():
+                count[level == number] = self.level(number).counts[seen[level == number]]
+            if count.sum() <= most:
+                return level
+        # A block around the camera, too, has to lose detail.
+        nearest, count = np.argsort(distance, kind="stable"), self.level(LEVELS).counts[seen]
+        level = np.full(len(seen), LEVELS)
+        level[nearest[np.cumsum(count[nearest]) > most]] = -1
+        return level
+
+    def gaussians(self, blocks: NDArray[np.integer], levels: NDArray[np.integer]) -> dict[str, NDArray]:
+        """Return the Gaussians of blocks (S,), each at its level (S,); see `levels_for`."""
+        parts = []
+        for number in range(LEVELS + 1):
+            if (levels == number).any():
+                level = self.level(number)
+                places = level.places_in(blocks[levels == number])
+                parts.append({name: array[places] for name, array in level.values.items()})
+        if not parts:
+            return {name: array[:0] for name, array in self.level(0).values.items()}
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _merged(self, side: float) -> Level:
+        """Merge the map in cells of this side, so many blocks at once that the memory is bounded."""
+        base, parts, groups = self.level(0), [], []
+        ends = np.searchsorted(base.first, np.arange(0, len(base), BATCH), side="left")
+        for begin, end in zip(ends, np.append(ends[1:], len(self.blocks)), strict=True):
+            places = base.places[base.first[begin] : base.first[end]]
+            group = np.repeat(np.arange(begin, end), base.counts[begin:end])
+            part, group = merged({name: array[places] for name, array in base.values.items()}, group, side)
+            parts.append(part)
+            groups.append(group)
+        values = {name: np.concatenate([part[name] for part in parts]) for name in base.values}
+        first = np.searchsorted(np.concatenate(groups), np.arange(len(self.blocks) + 1))
+        return Level(values, np.arange(first[-1]), first)
+
+
+def _side(position: NDArray[np.float64]) -> float:
+    """Side of cells that hold about `IN_FIRST_CELL` positions (N, 3) of surfaces. Outliers do not count."""
+    if len(position) == 0:
+        return 1.0
+    low, high = np.quantile(position, [0.02, 0.98], axis=0)
+    return float(np.prod(np.sort(high - low)[1:]) * IN_FIRST_CELL / len(position)) ** 0.5 or 1.0
