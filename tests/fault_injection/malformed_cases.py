@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from tests.fault_injection.corrupted_captures import CAPTURES
 from tests.fault_injection.corrupted_media import IMAGES, MASK, PATH, RUN, VIDEO
+from tests.fault_injection.corrupted_splats import SPLATS
 from tests.fault_injection.corrupted_trackers import (
     ARIA,
     COLMAP,
@@ -25,6 +26,7 @@ from tests.fault_injection.corrupted_trackers import (
 )
 from tests.fault_injection.corruptions import ANYWHERE, TEXT, Corruption
 from tests.fault_injection.samples import SAMPLES
+from tests.fault_injection.samples import SPLATS as SPLAT_FILES
 
 __all__ = ["CASES", "Case"]
 
@@ -99,6 +101,10 @@ def _cases() -> list[Case]:
     for kind, files in CAPTURES.items():
         for file, corruptions in files.items():
             add(kind, file, anything(*_harmless(file)) | corruptions)
+    for reader, file in SPLAT_FILES.items():
+        # Half of a .splat, and 64 bytes before it, are whole Gaussians again; archives may begin with anything.
+        whole = {"splat": ("cut in half", "noise before it"), "sog": ("noise before it",)}.get(reader, ())
+        add(reader, file, anything(*whole) | SPLATS[file])
     return cases
 
 
