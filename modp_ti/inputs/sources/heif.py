@@ -78,25 +78,29 @@ def read_heif_header(data: bytes) -> HeifHeader | None:
 
 
 def decoded_heif(data: bytes) -> NDArray[np.uint8] | None:
-    """Decode a file to (H, W, 3) uint8 RGB; None if that fails. HEIC is turned upright, AVIF is not.
+    """Decode a file to (H, W, 3) uint8 RGB; None if that fails, or if it has another size than stated.
 
-    HDR (PQ or HLG) HEIC is tone-mapped; of other images with more than 8 bits, the first 8 are kept.
+    HEIC is turned upright, AVIF is not. HDR (PQ or HLG) HEIC is tone-mapped; of other images with more
+    than 8 bits, the first 8 are kept.
 
     Raises:
         InputError: If the package that reads such files is missing.
     """
     try:
         if _is_avif(data):
-            return np.asarray(_avif(data).convert("RGB"))
+            image = _avif(data)
+            stated = image.size
+            return _of_size(np.asarray(image.convert("RGB")), stated)
         image = _heic(data)
+        stated = image.size
         number, bits = image.info.get("nclx_profile", {}).get("transfer_characteristics"), image.info["bit_depth"]
         transfer = next((each for each in Transfer if each.value == number), None)
         if transfer is not None and bits > 8:
             deep = np.asarray(_heic(data, deep=True))
             if deep.dtype == np.uint16 and deep.ndim == 3:
                 # The bits are in the highest places: 1023 of 10 bits is 65472.
-                return ToneMapping(transfer)(deep[..., :3] | deep[..., :3] >> bits)
-        return np.asarray(image.to_pillow().convert("RGB"))
+                return _of_size(ToneMapping(transfer)(deep[..., :3] | deep[..., :3] >> bits), stated)
+        return _of_size(np.asarray(image.to_pillow().convert("RGB")), stated)
     except ERRORS:
         return None
 
@@ -117,6 +121,11 @@ def _boxes(data: bytes, wanted: bytes, start: int, end: int) -> Iterator[tuple[i
         start = stop
 
 
+def _of_size(image: NDArray[np.uint8], stated: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """Return the image if it has the stated size (width, height), otherwise None."""
+    return image if image.shape[1::-1] == stated else None
+
+
 def _is_avif(data: bytes) -> bool:
     """Return whether the brands of the first box name AVIF."""
     first = data[8 : min(int.from_bytes(data[:4], "big"), 256)]
@@ -127,11 +136,8 @@ def _avif(data: bytes) -> Image.Image:
     try:
         from PIL import AvifImagePlugin
 
-        supported = AvifImagePlugin.SUPPORTED
     except ImportError:
-        supported = False
-    if not supported:
-        raise InputError("AVIF photographs need a newer package: pip install 'pillow>=11.3'")
+        raise InputError("AVIF photographs need a newer package: pip install 'pillow>=11.3'") from None
     return AvifImagePlugin.AvifImageFile(io.BytesIO(data))
 
 

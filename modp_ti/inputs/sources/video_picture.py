@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import av
 import av.error
+import av.filter
 import numpy as np
 from av.video.reformatter import Colorspace, VideoReformatter
 from numpy.typing import NDArray
@@ -107,7 +108,9 @@ def _upper_field(frame: av.VideoFrame) -> av.VideoFrame:
 def _turn(frame: av.VideoFrame) -> tuple[Turn, int]:
     """Return how the display matrix turns a frame, and the rest of its rotation [degrees clockwise]."""
     try:
-        a, b, _, c, d, *_ = struct.unpack("=9i", bytes(frame.side_data["DISPLAYMATRIX"]))
+        # The stubs lack this key.
+        matrix = frame.side_data["DISPLAYMATRIX"]  # pyright: ignore[reportGeneralTypeIssues]
+        a, b, _, c, d, *_ = struct.unpack("=9i", bytes(matrix))
     except (KeyError, ValueError, struct.error):  # ValueError: the frame has other data, unknown to PyAV
         a, b, c, d = 1, 0, 0, 1
     mirrored = a * d - b * c < 0
