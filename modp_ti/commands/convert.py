@@ -15,10 +15,12 @@ EXAMPLES = examples("modp-ti convert scene.spz scene.ply", "modp-ti convert out/
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="A", help="splats: .ply (3DGS, compressed), .spz, .sog, .splat")],
+    source: Annotated[
+        Path, typer.Argument(metavar="A", help="splats: .ply (3DGS, compressed), .spz, .sog, .splat, .ksplat")
+    ],
     target: Annotated[
         Path,
-        typer.Argument(metavar="B", help="file to write: .ply, .compressed.ply, .spz, .sog, .splat, .glb"),
+        typer.Argument(metavar="B", help="file to write: .ply, .compressed.ply, .spz, .sog, .splat, .ksplat, .glb"),
     ],
     spz_version: Annotated[int, typer.Option(min=2, max=4, help="version of an .spz file, 2 to 4")] = 3,
     quiet: Quiet = False,

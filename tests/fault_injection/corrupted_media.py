@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+from importlib.util import find_spec
+
 from tests.fault_injection.corruptions import (
     HUGE,
     TEXT,
@@ -54,6 +57,36 @@ IMAGES: dict[str, dict[str, Corruption]] = {
         "one row too few": changed(lambda data: data[:-144]),
     },
 }
+
+
+def _ispe(width: int, height: int) -> Corruption:
+    """State another size in every box of sizes of HEIC or AVIF."""
+
+    def change(data: bytes) -> bytes:
+        *parts, last = data.split(b"ispe")
+        start = parts[0] + b"ispe"
+        return start + b"ispe".join(
+            part[:4] + struct.pack(">II", width, height) + part[12:] for part in (*parts[1:], last)
+        )
+
+    return changed(change)
+
+
+HEIF: dict[str, Corruption] = {
+    "60,000 x 60,000": _ispe(60_000, 60_000),
+    "0 x 0": _ispe(0, 0),
+    "2^32 x 2^32": _ispe(2**32 - 1, 2**32 - 1),
+    "no sizes": changed(lambda data: data.replace(b"ispe", b"ispa")),
+    "no meta": changed(lambda data: data.replace(b"meta", b"mete")),
+    "no primary image": changed(lambda data: data.replace(b"pitm", b"pita")),
+    "a first box alone": changed(lambda data: data[:32]),
+    "boxes of length 0": changed(lambda data: data[:32] + bytes(200)),
+    "a box of 2^63": changed(lambda data: data + b"\0\0\0\1free\x7f" + b"\xff" * 7),
+    "no pixels": changed(lambda data: data[: data.index(b"mdat") + 4] + bytes(len(data) - data.index(b"mdat") - 4)),
+}
+IMAGES["images/6.avif"] = HEIF
+if find_spec("pillow_heif") is not None:
+    IMAGES["images/7.heic"] = HEIF
 
 MASK: dict[str, dict[str, Corruption]] = {
     "masks/frame-000001.color.png": {

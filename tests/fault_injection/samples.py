@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -40,7 +41,7 @@ from tests.fault_injection.small_recording import (
     write_text,
 )
 
-__all__ = ["SAMPLES", "Sample", "write_sample"]
+__all__ = ["CAPTURES", "SAMPLES", "SPLATS", "Sample", "write_sample"]
 
 
 @dataclass(frozen=True)
@@ -260,10 +261,14 @@ def _write_stella(folder: Path) -> None:
     scene_file(folder, "kind: stella_vslam, path: map.msg", "path: images")
 
 
+IMAGES = ["0.png", "1.jpg", "2.bmp", "3.tiff", "4.webp", "5.ppm", "6.avif"]
+if find_spec("pillow_heif") is not None:
+    IMAGES.append("7.heic")
+
+
 def _write_image(folder: Path) -> None:
-    names = ["0.png", "1.jpg", "2.bmp", "3.tiff", "4.webp", "5.ppm"]
-    write_images(folder, names)
-    _colmap_text(folder, names)
+    write_images(folder, IMAGES)
+    _colmap_text(folder, IMAGES)
     scene_file(folder, "kind: colmap", "path: images")
 
 
@@ -404,6 +409,23 @@ CAPTURES = {
 """The files under test of captures, by kind."""
 
 
+SPLATS = {
+    "spz": "a.spz",
+    "sog": "a.sog",
+    "splat": "a.splat",
+    "ksplat": "a.ksplat",
+    "compressed_ply": "a.compressed.ply",
+}
+"""The files of splats of other programs, by reader."""
+
+
+def _write_splats(file: str, folder: Path) -> None:
+    from modp_ti.outputs.formats.splat_files import convert_splats
+
+    write_bytes(folder, "source.ply", splats())
+    convert_splats(folder / "source.ply", folder / file)
+
+
 EXPORT = ("export", "out", "--format", "points", "-o", "written.ply", "--quiet")
 RUN_MODEL = tuple(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D"))
 SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
@@ -442,7 +464,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         ),
         (Sample("stella_vslam", ("map.msg",)), _write_stella),
         (
-            Sample("image", tuple(f"images/{n}" for n in ("0.png", "1.jpg", "2.bmp", "3.tiff", "4.webp", "5.ppm"))),
+            Sample("image", tuple(f"images/{name}" for name in IMAGES)),
             _write_image,
         ),
         (Sample("mask", (f"masks/{NAMES[1]}", "vignette.png")), _write_mask),
@@ -452,6 +474,10 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
         *((Sample(kind, files), partial(_write_capture, kind)) for kind, files in CAPTURES.items()),
         *((Sample(f"bag_{form}", (BAGS[form],)), partial(_write_bag, form)) for form in FORMS),
+        *(
+            (Sample(form, (file,), ("convert", file, "written.ply", "--quiet")), partial(_write_splats, file))
+            for form, file in SPLATS.items()
+        ),
     )
 }
 

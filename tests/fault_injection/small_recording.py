@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 __all__ = [
     "FOCAL",
@@ -86,7 +88,22 @@ def write_images(folder: Path, names: list[str] = NAMES, inside: str = "images")
     """Write the images in the formats given by their names."""
     for i, name in enumerate(names):
         suffix = Path(name).suffix
-        write_bytes(folder, f"{inside}/{name}", cv2.imencode(suffix, picture(i))[1].tobytes())
+        heif = suffix in (".avif", ".heic")
+        write_bytes(
+            folder, f"{inside}/{name}", _heif(i, suffix) if heif else cv2.imencode(suffix, picture(i))[1].tobytes()
+        )
+
+
+def _heif(i: int, suffix: str) -> bytes:
+    image = Image.fromarray(picture(i)[..., ::-1])
+    with io.BytesIO() as stream:
+        if suffix == ".avif":
+            image.save(stream, "AVIF")
+        else:
+            import pillow_heif
+
+            pillow_heif.from_pillow(image).save(stream)
+        return stream.getvalue()
 
 
 def tum_line(i: int) -> str:

@@ -12,6 +12,7 @@ from PIL import BmpImagePlugin, PpmImagePlugin
 from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
 
 from modp_ti.files.reading import available_memory
+from modp_ti.inputs.sources.heif import BRANDS, heif_size
 from modp_ti.inputs.sources.image_header import HEADER_ERRORS, JpegHeader, bounded, read_tiff_directory
 
 __all__ = ["MAX_IMAGE_PIXELS", "why_undecodable"]
@@ -38,12 +39,12 @@ Claim = tuple[int, int, int]
 def why_undecodable(data: bytes) -> str | None:
     """Return why these bytes should not be decoded, or None if they may be.
 
-    Accepted are JPEG, PNG, BMP, TIFF, WebP and PNM images whose stated size is compatible with the file's length and
-    fits into memory.
+    Accepted are JPEG, PNG, BMP, TIFF, WebP, PNM, HEIC and AVIF images whose stated size is compatible with the file's
+    length and fits into memory.
     """
     read = next((reader for magic, reader in FORMATS if re.match(magic, data[:16], re.DOTALL)), None)
     if read is None:
-        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM or PGM)"
+        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM, PGM, HEIC or AVIF)"
     try:
         width, height, least = read(data)
     except HEADER_ERRORS:
@@ -123,6 +124,10 @@ def _webp(data: bytes) -> Claim:
     raise ValueError
 
 
+def _heif(data: bytes) -> Claim:
+    return *heif_size(data), 0
+
+
 def _tiff(data: bytes) -> Claim:
     """Read the size of the first image in the file. A tile may be larger than the image and is decoded as a whole."""
     found = read_tiff_directory(data)
@@ -139,4 +144,5 @@ FORMATS: tuple[tuple[bytes, Callable[[bytes], Claim]], ...] = (
     (rb"II\*\0|MM\0\*|II\+\0|MM\0\+", _tiff),
     (rb"RIFF....WEBP", _webp),
     (rb"P[1-6]\s", _pnm),
+    (rb"....ftyp(?:" + b"|".join(BRANDS) + rb")", _heif),
 )

@@ -1,8 +1,8 @@
 """Size and completeness of an image file without decoding it, with Pillow in bounded memory.
 
 Decoders differ in what they do with a truncated file (older OpenCV versions fill the rest with grey), and a run should
-report it in its first second, not at frame 400. JPEG and PNG files are checked by their end markers; other formats are
-left to the decoder.
+report it in its first second, not at frame 400. JPEG and PNG files are checked by their end markers, HEIC and AVIF
+files by the lengths of their boxes; other formats are left to the decoder.
 
 Pillow keeps everything that it reads from a header, and thousands of TIFF or EXIF tags can refer to the same bytes:
 Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `bounded` file.
@@ -20,6 +20,8 @@ from typing import IO, BinaryIO
 from PIL import ExifTags, JpegImagePlugin, TiffImagePlugin
 
 from modp_ti.files import open_file
+from modp_ti.inputs.sources.heif import is_heif, read_heif_header
+from modp_ti.inputs.sources.video_container import end_of_boxes
 
 __all__ = [
     "HEADER_ERRORS",
@@ -50,10 +52,10 @@ class ImageHeader:
     """Size, orientation, depth and completeness of an image file.
 
     Attributes:
-        width: Stored width [px], before any EXIF rotation; 0 if the header is damaged.
-        height: Stored height [px], likewise.
-        complete: Whether the end marker is present.
-        orientation: EXIF orientation of a JPEG file, 1 to 8; 1 if it states none.
+        width: Width [px] of the decoded image, before any EXIF rotation; 0 if the header is damaged.
+        height: Height [px], likewise.
+        complete: Whether the end of the file is there.
+        orientation: EXIF orientation of a JPEG or AVIF file, 1 to 8; 1 if it states none.
         bits: Bits per channel.
     """
 
@@ -104,10 +106,17 @@ class JpegHeader(JpegImagePlugin.JpegImageFile):
 
 
 def read_image_header(file: BinaryIO) -> ImageHeader | None:
-    """Read the header of an open JPEG or PNG file. Returns None for all other files."""
-    signature = file.read(8)
-    if signature == PNG_SIGNATURE:
+    """Read the header of an open JPEG, PNG, HEIC or AVIF file. Returns None for all other files.
+
+    Raises:
+        InputError: If the package that reads HEIC or AVIF is missing.
+    """
+    signature = file.read(12)
+    if is_heif(signature):
+        return _heif_header(file)
+    if signature.startswith(PNG_SIGNATURE):
         # Pillow would also unpack the texts and the colour profile that follow. The size is at a fixed offset.
+        file.seek(8)
         chunk = file.read(17)
         if len(chunk) < 17 or chunk[4:8] != b"IHDR":
             return ImageHeader(0, 0, complete=False)
@@ -123,6 +132,16 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
         return ImageHeader(0, 0, complete=file.read() == JPEG_END)
     # Coded data never holds FF D9 except as the end marker, so the first one after the scan's start is it.
     return ImageHeader(*header.size, _ends_with(file, JPEG_END), _orientation(header))
+
+
+def _heif_header(file: BinaryIO) -> ImageHeader:
+    file.seek(0)
+    data = file.read()
+    header = read_heif_header(data)
+    complete = end_of_boxes(file, len(data)) <= len(data)
+    if header is None:
+        return ImageHeader(0, 0, complete)
+    return ImageHeader(header.width, header.height, complete, header.orientation)
 
 
 def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlugin.ImageFileDirectory_v2:
@@ -169,10 +188,20 @@ def _ends_with(file: BinaryIO, marker: bytes) -> bool:
 
 
 def focal_length_35mm(path: Path) -> float | None:
-    """Read the focal length in 35 mm equivalent [mm] from a JPEG file, or return None if it is not stated."""
+    """Read the focal length in 35 mm equivalent [mm] from a JPEG, HEIC or AVIF file; None if it is not stated.
+
+    Raises:
+        InputError: If the package that reads HEIC or AVIF is missing.
+    """
     try:
         with open_file(path) as file:
-            tiff = _tiff(JpegHeader(bounded(file)))
+            heif = is_heif(file.read(12))
+            file.seek(0)
+            if heif:
+                header = read_heif_header(file.read())
+                tiff = b"" if header is None else header.tiff
+            else:
+                tiff = _tiff(JpegHeader(bounded(file)))
         inner = read_tiff_directory(tiff)[ExifTags.IFD.Exif]
         value = read_tiff_directory(tiff, inner)[ExifTags.Base.FocalLengthIn35mmFilm]
     except HEADER_ERRORS:  # also raised if EXIF or the tag is missing

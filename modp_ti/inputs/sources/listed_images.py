@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import UnreadableImageError
 from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced, used_bits
+from modp_ti.inputs.sources.heif import decoded_heif, is_heif
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header
 from modp_ti.inputs.sources.intrinsics import Intrinsics
@@ -160,7 +161,7 @@ class ListedImages(ImageSource):
 
     @cached_property
     def _headers(self) -> dict[str, ImageHeader]:
-        """The header of each JPEG and PNG file that can be read, by name. All are read when the first is needed."""
+        """The header of each JPEG, PNG, HEIC and AVIF file that can be read, by name. All are read at once."""
         headers = {}
         for name in self.names:
             with suppress(OSError), self._open(name) as file:
@@ -176,7 +177,7 @@ class ListedImages(ImageSource):
 
 
 def decoded(data: bytes, bits: int = DEPTHS[-1]) -> NDArray[np.uint8] | None:
-    """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation; None if that fails.
+    """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation (HEIC upright); None if that fails.
 
     Args:
         data: The file's content.
@@ -184,6 +185,8 @@ def decoded(data: bytes, bits: int = DEPTHS[-1]) -> NDArray[np.uint8] | None:
     """
     import cv2
 
+    if is_heif(data[:12]):
+        return decoded_heif(data)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = decoded_as(data, flags) if bits == DEPTHS[-1] else decoded_deep(data)
     return None if image is None else np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from modp_ti.files import open_file
 
-__all__ = ["missing_bytes"]
+__all__ = ["end_of_boxes", "missing_bytes"]
 
 EBML = b"\x1aE\xdf\xa3"
 MATROSKA_SEGMENT = b"\x18S\x80g"
@@ -34,7 +34,7 @@ def missing_bytes(file: Path) -> int | None:
     with open_file(file) as stream:
         start = stream.read(12)
         if start[4:8] in MP4_BOXES:
-            end = _end_of_boxes(stream, size)
+            end = end_of_boxes(stream, size)
         elif start[:4] == b"RIFF" and start[8:] == b"AVI ":
             end = _end_of_riff(stream, size)
         elif start[:4] == EBML:
@@ -44,8 +44,8 @@ def missing_bytes(file: Path) -> int | None:
     return None if end is None else max(end - size, 0)
 
 
-def _end_of_boxes(stream: BinaryIO, size: int) -> int:
-    """Return the end of the last box.
+def end_of_boxes(stream: BinaryIO, size: int) -> int:
+    """Return the end of the last box of a file in MP4's structure, as its lengths say.
 
     A box starts with 4 bytes of length and 4 of type. Length 1 means that 8 bytes of length follow, 0 that the box
     extends to the end of the file.

@@ -1,4 +1,4 @@
-"""Decoding of a video file with PyAV (FFmpeg): frames with their index, time stamp and rotation, and seeking."""
+"""Decoding of a video file with PyAV (FFmpeg): frames with their index and time stamp, and seeking."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import av
-import av.error
 import numpy as np
-from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from modp_ti.inputs.sources.image_bounds import MAX_IMAGE_PIXELS
+from modp_ti.inputs.sources.video_picture import DECODING_ERRORS, PictureMaker, VideoForm
 
 __all__ = ["VideoDecoder"]
 
@@ -21,8 +20,6 @@ CONTAINERS = (
     "ivf,obu,av1,dv,gxf,mxf,nut,rm,wtv,yuv4mpegpipe,gif,apng"
 )
 LIMITS = {"max_pixels": str(MAX_IMAGE_PIXELS)}
-# Exceptions that PyAV raises for malformed files.
-DECODING_ERRORS = (av.error.FFmpegError, OSError, ValueError, ArithmeticError, MemoryError)
 
 
 class VideoDecoder:
@@ -31,7 +28,7 @@ class VideoDecoder:
     Args:
         path: The video file.
         in_threads: Decode in several threads. This is faster, but damaged parts look different each time.
-        form: (width, height, degrees clockwise) that all frames are scaled and rotated to; the first frame's if None.
+        form: Size, turn and colours that all frames have; the first frame's if None.
 
     Attributes:
         index: Index of the frame that was decoded last, -1 before the first.
@@ -41,7 +38,7 @@ class VideoDecoder:
         OSError: FFmpeg does not recognise the file as a video.
     """
 
-    def __init__(self, path: Path, in_threads: bool, form: tuple[int, int, int] | None = None) -> None:
+    def __init__(self, path: Path, in_threads: bool, form: VideoForm | None = None) -> None:
         options = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file", **LIMITS}
         try:
             self._container = av.open(f"file:{path}", options=options, metadata_errors="replace")
@@ -59,7 +56,7 @@ class VideoDecoder:
             self._stream.codec_context.thread_count = 1
         self._unit = float(self._stream.time_base or 0)  # [s]
         self._start = self._stream.start_time or 0
-        self._reformatter = VideoReformatter()  # reused, because a new one computes its tables again
+        self._pictures = PictureMaker()
         self._frame: av.VideoFrame | None = None
         self._frames = self._decoded()
         self.form = form
@@ -71,6 +68,11 @@ class VideoDecoder:
         if self._frame is None or self._frame.pts is None:
             return 0.0
         return (self._frame.pts - self._start) * self._unit * 1000.0
+
+    @property
+    def interlaced(self) -> bool:
+        """Whether the current frame is interlaced."""
+        return self._frame is not None and self._frame.interlaced_frame
 
     def advance(self) -> bool:
         """Decode the next frame. Returns False at the end."""
@@ -98,20 +100,12 @@ class VideoDecoder:
         return self.shown if self.advance() else None
 
     def image(self) -> NDArray[np.uint8] | None:
-        """Convert the frame that was decoded last to (H, W, 3) uint8 RGB; None if that fails."""
+        """Convert the frame that was decoded last to (H, W, 3) uint8 RGB, upright; None if that fails."""
         if self._frame is None:
             return None
         if self.form is None:
-            quarters, rest = divmod(1 - self._frame.rotation, 90)  # PyAV truncates 89.99 to 89
-            self.form = self._frame.width, self._frame.height, quarters % 4 * 90 if rest <= 2 else 0
-        width, height, turned = self.form
-        try:
-            # Conversion to BGR with this filter gives the same bits as OpenCV's reader. Direct RGB does not always.
-            shown = self._reformatter.reformat(self._frame, width, height, "bgr24", interpolation="BICUBIC")
-            image = np.asarray(shown.to_ndarray(), dtype=np.uint8)[..., ::-1]
-        except DECODING_ERRORS:
-            return None
-        return np.ascontiguousarray(np.rot90(image, -turned // 90))
+            self.form = VideoForm.of(self._frame)
+        return self._pictures.picture(self._frame, self.form)
 
     def close(self) -> None:
         self._frame, self._frames = None, iter(())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -12,11 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.orientation import AS_STORED
 from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.tone_mapping import PEAK, WHITE
 from modp_ti.inputs.sources.video_container import missing_bytes
 
 if TYPE_CHECKING:
     from modp_ti.inputs.sources.video_decoder import VideoDecoder
+    from modp_ti.inputs.sources.video_picture import VideoForm
 
 __all__ = ["VIDEO_SUFFIXES", "VideoFile"]
 
@@ -36,7 +40,8 @@ class VideoFile(ImageSource):
     """An `ImageSource` of a video file. Frame n, from 0, is called `<file stem>_<n, six digits>`.
 
     The file is decoded once when it is opened, because only that gives the number of frames and their times. Frames are
-    rotated as the file requests: phones store portrait videos in landscape.
+    turned as the file requests: phones store portrait videos in landscape. HDR is tone-mapped (`tone_mapping.py`), and
+    of interlaced frames one field is used.
 
     A frame is the same whenever and in whatever order it is read. New frames come from a decoder that runs forward from
     the first frame. Earlier frames come from a second decoder that seeks; each of its frames is compared with a
@@ -64,14 +69,15 @@ class VideoFile(ImageSource):
         self._lock = Lock()
         self._checksums: dict[int, int] = {}
         self._seeks = True
-        self._form: tuple[int, int, int] | None = None
+        self._form: VideoForm | None = None
         self._front = self._decoder(missing, in_threads=True)
         self._back: VideoDecoder | None = None
 
         shown: list[float] = []
-        first = None
+        first, interlaced = None, 0
         while (stop is None or len(shown) < stop) and self._front.advance():
             shown.append(self._front.shown)
+            interlaced += self._front.interlaced
             if len(shown) == 1:
                 first, self._form = self._front.image(), self._front.form
         cut_off = bool(missing) and (stop is None or len(shown) < stop)
@@ -90,11 +96,8 @@ class VideoFile(ImageSource):
 
         height, width = first.shape[:2]
         self._size = (width, height)
-        if turned := self._form[2]:
-            self.add_note(
-                f"{self.path} asks to be turned clockwise by {turned} degrees, and is: its frames are "
-                f"{width}x{height}, and intrinsics are for that"
-            )
+        for note in _form_notes(self._form, width, height, interlaced, len(shown)):
+            self.add_note(f"{self.path} {note}")
         if not timed:
             self.add_note(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
         self._front.close()
@@ -182,6 +185,32 @@ class VideoFile(ImageSource):
         return InputError(
             f"{self.path}: no video that FFmpeg can read, or without a frame: convert it, for example with "
             "`ffmpeg -i in -c:v libx264 out.mp4`"
+        )
+
+
+def _form_notes(form: VideoForm, width: int, height: int, interlaced: int, count: int) -> Iterator[str]:
+    """Yield what is done to the frames.
+
+    Args:
+        form: What the frames have in common.
+        width: Width of the pictures [px].
+        height: Height of the pictures [px].
+        interlaced: Number of interlaced frames.
+        count: Number of frames.
+    """
+    if form.turn != AS_STORED:
+        yield f"asks to be {form.turn}, and is: its frames are {width}x{height}, and intrinsics are for that"
+    if form.slant:
+        yield f"asks to be turned clockwise by {form.slant} degrees more, which is not done: only quarter turns are"
+    if form.transfer is not None:
+        yield (
+            f"is HDR ({form.transfer.name}, BT.2020): its colours are converted to BT.709, and {PEAK:g} cd/m2 become a "
+            f"white of {WHITE:g} cd/m2 by the curve of BT.2390"
+        )
+    if interlaced:
+        yield (
+            f"is interlaced ({interlaced} of {count} frames): of such a frame, the upper field is used, and the lines "
+            "between are interpolated"
         )
 
 

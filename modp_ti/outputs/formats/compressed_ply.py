@@ -105,11 +105,13 @@ def read_compressed_ply(data: bytes, path: Path) -> dict[str, NDArray]:
     """
     head, end, _ = data[:MAX_HEADER].partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    counts = {line[1]: int(line[2]) for line in lines if line[:1] == ["element"] and line[-1].isdecimal()}
+    elements = [line for line in lines if line[:1] == ["element"] and len(line) == 3]
+    counts = {name: int(number) for _, name, number in elements if number.isdecimal() and len(number) < 10}
     names = [line[2] for line in lines if line[:1] == ["property"] and len(line) == 3]
     count, coefficients = counts.get("vertex", 0), len(names) - len(RANGES) - len(WORDS)
     wanted = RANGES + WORDS + [f"f_rest_{i}" for i in range(coefficients)]
-    if not end or ["format", "binary_little_endian", "1.0"] not in lines or names != wanted or coefficients % 3:
+    layout = names == wanted and coefficients in (0, 9, 24, 45)
+    if not end or ["format", "binary_little_endian", "1.0"] not in lines or not layout:
         raise InputError(f"{path}: a compressed PLY of another layout than SuperSplat's")
     chunks = -(-count // CHUNK)
     sizes = np.cumsum([len(head) + len(end), 4 * len(RANGES) * chunks, 4 * len(WORDS) * count, coefficients * count])

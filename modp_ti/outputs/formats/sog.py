@@ -18,6 +18,7 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files.atomic import replace_file
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.outputs.formats.splat_packing import (
     logits,
     morton_order,
@@ -47,8 +49,13 @@ LARGEST_PALETTE, SHARE = 1 << 12, 16
 ENTRIES_PER_ROW = 64
 # Gaussians whose distances to the palette are computed at once.
 BLOCK = 4096
-# Largest image, and largest meta.json, that is read [px, bytes].
-MOST_PIXELS, MOST_TEXT = 1 << 27, 1 << 20
+# Largest meta.json that is read [bytes].
+MOST_TEXT = 1 << 20
+# What the archive, the images and their numbers raise where they are damaged.
+ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError),
+    *(LookupError, ValueError, TypeError, AttributeError, ArithmeticError),
+)
 
 
 def write_sog(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
@@ -146,10 +153,7 @@ def read_sog(data: bytes, path: Path) -> dict[str, NDArray]:
             if archive.getinfo("meta.json").file_size > MOST_TEXT:
                 raise ValueError("a large meta.json")
             return _read(archive, json.loads(archive.read("meta.json")))
-    except InputError:
-        raise
-    # What the archive, the images and their numbers raise where they are damaged.
-    except (zipfile.BadZipFile, KeyError, ValueError, TypeError, IndexError, OSError, AttributeError, RuntimeError):
+    except ERRORS:
         raise InputError(f"{path}: not a .sog file of version 2, or a damaged one") from None
 
 
@@ -166,7 +170,7 @@ def _read(archive: zipfile.ZipFile, meta: dict[str, Any]) -> dict[str, NDArray]:
     constant = _pixels(archive, meta["sh0"]["files"][0])[:count]
     sh = np.array(meta["sh0"]["codebook"], np.float64)[constant[:, :3]][:, None]
     if harmonics is not None:
-        coefficients = (harmonics["bands"] + 1) ** 2 - 1
+        coefficients = {1: 3, 2: 8, 3: 15}[harmonics["bands"]]
         entries = np.array(harmonics["codebook"], np.float64)[_pixels(archive, harmonics["files"][0])[:, :3]]
         labels = _pixels(archive, harmonics["files"][1])[:count].astype(np.int64)
         rest = entries.reshape(-1, coefficients, 3)[labels[:, 0] + 256 * labels[:, 1]]
@@ -189,9 +193,14 @@ def _pixels(archive: zipfile.ZipFile, name: str) -> NDArray[np.uint8]:
     """Return the pixels (N, 4) of an image in the archive, row by row."""
     from PIL import Image
 
-    with archive.open(name) as file, Image.open(io.BytesIO(file.read()), formats=["WEBP"]) as image:
-        if image.width * image.height > MOST_PIXELS:
-            raise ValueError("a large image")
+    # Images hardly shrink further in an archive.
+    entry = archive.getinfo(name)
+    if entry.file_size > 2 * entry.compress_size + MOST_TEXT:
+        raise ValueError("an image that unpacks to many times its size")
+    data = archive.read(entry)
+    if why_undecodable(data) is not None:
+        raise ValueError("an image of a wrong size")
+    with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
         return np.asarray(image.convert("RGBA")).reshape(-1, 4)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from modp_ti.files import read_bytes
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
+from modp_ti.outputs.formats.ksplat import read_ksplat, write_ksplat
 from modp_ti.outputs.formats.sog import read_sog, write_sog
 from modp_ti.outputs.formats.splat_glb import write_splat_glb
 from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
@@ -26,13 +28,14 @@ WRITERS: dict[str, Callable[[Path, dict[str, NDArray]], None]] = {
     ".spz": write_spz,
     ".sog": write_sog,
     ".splat": write_web_splat,
+    ".ksplat": write_ksplat,
     ".glb": write_splat_glb,
 }
-READERS = {".spz": read_spz, ".sog": read_sog, ".splat": read_web_splat}
+READERS = {".spz": read_spz, ".sog": read_sog, ".splat": read_web_splat, ".ksplat": read_ksplat}
 
 
 def read_any_splats(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Read splats: PLY of 3DGS, compressed PLY, `.spz`, `.sog` or `.splat`.
+    """Read splats: PLY of 3DGS, compressed PLY, `.spz`, `.sog`, `.splat` or `.ksplat`.
 
     Raises:
         InputError: If the file is of none of these formats, is damaged, or holds no splats or infinite numbers.
@@ -44,16 +47,19 @@ def read_any_splats(path: Path) -> dict[str, NDArray[np.float32]]:
         data = read_bytes(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if suffix in READERS:
-        state = READERS[suffix](data, path)
-    else:
-        state = read_compressed_ply(data, path) if is_compressed_ply(data) else read_splats(path)
-    state = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in state.items()}
+    with np.errstate(all="ignore"):  # infinite numbers are found below
+        if suffix in READERS:
+            state = READERS[suffix](data, path)
+        else:
+            state = read_compressed_ply(data, path) if is_compressed_ply(data) else read_splats(path)
+        state = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in state.items()}
     if len(state["position"]) == 0:
         raise InputError(f"{path}: holds no splat")
     for name, values in state.items():
         if not np.isfinite(values).all():
             raise InputError(f"{path}: the {name.replace('_', ' ')} of a splat is not finite; the file is damaged")
+    # A rotation of zeros, as 8 bits may round to, is none.
+    state["quaternion"][(state["quaternion"] == 0).all(axis=1)] = 1.0, 0.0, 0.0, 0.0
     return state
 
 
@@ -74,7 +80,7 @@ def convert_splats(source: Path, target: Path, spz_version: int = DEFAULT_VERSIO
     suffix = next((suffix for suffix in WRITERS if target.name.lower().endswith(suffix)), None)
     if suffix is None:
         raise InputError(f"{target}: splats are written to a file in {', '.join(WRITERS)}")
-    if target.resolve() == source.resolve():
+    if os.path.realpath(target) == os.path.realpath(source):  # `resolve` raises for a link to itself
         raise InputError(f"{target}: is the source itself; name another file")
     state = read_any_splats(source)
     try:

@@ -174,6 +174,8 @@ def _header(data: bytes, path: Path) -> tuple[int, int, int, int, int]:
     magic, version, count, degree, fractional, _, last = HEADER.unpack_from(data)
     if magic != MAGIC or not 1 <= version <= 4 or degree > 4 or fractional > 24 or count > MOST:
         raise InputError(f"{path}: not an .spz file of version 1 to 4")
+    if count == 0:
+        raise InputError(f"{path}: holds no splat")
     return version, count, degree, fractional, last
 
 

@@ -5,19 +5,44 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
+from modp_ti.inputs.inspection.survey import survey
+from modp_ti.inputs.trackers import given_poses
 
-def log(recording, unregistered: tuple[int, ...] = ()) -> list[str]:
-    """A `.log` of the recording, whose images of these numbers have no pose."""
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def log(recording, unregistered: tuple[int, ...] = (), wrongly=lambda T: T) -> list[str]:
+    """A `.log` of the recording, whose images of these numbers have no pose, and the others a changed one."""
     lines = []
-    for n, T in enumerate(recording.poses_in_world):
+    for n, T in enumerate(map(wrongly, recording.poses_in_world)):
         lines.append(f"{n} {-1 if n in unregistered else n} 0")
         T = np.eye(4) if n in unregistered else T
         lines += [" ".join(f"{value:.12f}" for value in row) for row in T]
     return lines
 
 
-def rows(recording, count: int) -> list[str]:
-    return [" ".join(f"{value:.12e}" for value in T.ravel()[:count]) for T in recording.poses_in_world]
+def rows(recording, count: int, wrongly=lambda T: T) -> list[str]:
+    return [" ".join(f"{value:.12e}" for value in wrongly(T).ravel()[:count]) for T in recording.poses_in_world]
+
+
+@pytest.mark.parametrize("kind", ["matrices", "tanksandtemples"])
+@pytest.mark.parametrize(
+    ("fault", "wrongly"),
+    [
+        (None, lambda T: T),
+        ("opengl_axes", lambda T: T @ OPENGL),
+        ("inverse_poses", np.linalg.inv),
+        ("inverse_poses_with_opengl_axes", lambda T: np.linalg.inv(T @ OPENGL)),
+    ],
+)
+def test_a_wrong_convention_is_found_by_check(recording, monkeypatch, kind, fault, wrongly):
+    """The images tell it. Triangulation, which finds no points with wrong poses, would take seconds."""
+    monkeypatch.setattr(given_poses, "triangulated_frames", lambda _, frames, *__: frames)
+    lines = rows(recording, 12, wrongly) if kind == "matrices" else log(recording, wrongly=wrongly)
+    recording.write("poses.txt" if kind == "matrices" else "scene.log", lines)
+    found = list(judge_geometry(measure_geometry(survey(recording.open(kind), 4, lambda _: None))))
+    assert [finding.code for finding in found] == ([fault] if fault else [])
 
 
 @pytest.mark.parametrize("count", [12, 16])

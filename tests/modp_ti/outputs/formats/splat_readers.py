@@ -176,4 +176,44 @@ def read_sog(path: Path) -> State:
     }
 
 
-READERS = {"splat": read_splat, "spz": read_spz, "sog": read_sog, "compressed-ply": read_compressed_ply}
+def read_ksplat(path: Path) -> State:
+    data = path.read_bytes()
+    assert data[:2] == b"\0\1"
+    most_sections, sections, most, count, level = struct.unpack_from("<4IH", data, 4)
+    assert (most_sections, sections, most) == (1, 1, count)
+    held, room, per_bucket, buckets, size = struct.unpack_from("<4If", data, 4096)
+    stride, steps, full, partly, degree = struct.unpack_from("<H2xI4xIIH", data, 4096 + 20)
+    assert (held, room, level, stride, full + partly) == (count, count, 1, 12, buckets)
+    filled = struct.unpack_from(f"<{partly}I", data, 5120)
+    places = 5120 + 4 * partly
+    at = places + 12 * buckets
+    rows: dict[str, list] = {name: [] for name in ("position", "log_scale", "quaternion", "opacity_logit", "sh")}
+    for bucket in range(buckets):
+        centre = np.array(struct.unpack_from("<3f", data, places + 12 * bucket))
+        for _ in range(per_bucket if bucket < full else filled[bucket - full]):
+            place, scale = struct.unpack_from("<3H", data, at), struct.unpack_from("<3e", data, at + 6)
+            *rgb, alpha = data[at + 20 : at + 24]
+            harmonics = list(struct.unpack_from(f"<{3 * ((degree + 1) ** 2 - 1)}e", data, at + 24))
+            sh = [(np.array(rgb) / 255 - 0.5) / SH_C0]
+            for each in range(1, degree + 1):
+                width = 2 * each + 1
+                red, green, blue = (harmonics[n * width : (n + 1) * width] for n in range(3))
+                sh += [np.array(colour) for colour in zip(red, green, blue, strict=True)]
+                del harmonics[: 3 * width]
+            rows["position"].append((np.array(place) - steps) * size / 2 / steps + centre)
+            rows["log_scale"].append(np.log(scale))
+            rows["quaternion"].append(struct.unpack_from("<4e", data, at + 12))
+            rows["opacity_logit"].append(logit(np.array(alpha / 255)))
+            rows["sh"].append(sh)
+            at += 24 + 6 * ((degree + 1) ** 2 - 1)
+    assert at == len(data)
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+READERS = {
+    "splat": read_splat,
+    "spz": read_spz,
+    "sog": read_sog,
+    "compressed-ply": read_compressed_ply,
+    "ksplat": read_ksplat,
+}

@@ -27,6 +27,7 @@ NAMES = {
     "spz": "a.spz",
     "sog": "a.sog",
     "compressed-ply": "a.compressed.ply",
+    "ksplat": "a.ksplat",
 }
 
 
@@ -75,6 +76,54 @@ def test_the_first_version_of_spz_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(state["opacity_logit"], logit(np.array([128 / 255])), rtol=1e-6)
     np.testing.assert_allclose(state["quaternion"], [[0, 1, 0, 0]], atol=0.01)
     np.testing.assert_allclose(state["sh"][0, 0], [(c / 255 - 0.5) / 0.15 for c in (255, 128, 0)], rtol=1e-5)
+
+
+def test_a_ksplat_holds_the_splats_up_to_degree_2(ply: Path, tmp_path: Path) -> None:
+    convert_splats(ply, tmp_path / "a.ksplat")
+    here, there = read_splats(ply), matched(read_splats(ply), READERS["ksplat"](tmp_path / "a.ksplat"))
+    small = np.exp(np.quantile(here["log_scale"].max(axis=1), 0.05))
+    assert np.abs(there["position"] - here["position"]).max() < 0.02 * small
+    np.testing.assert_allclose(there["log_scale"], here["log_scale"], atol=1e-3)
+    np.testing.assert_allclose(there["sh"][:, 1:], here["sh"][:, 1:9], rtol=1e-3, atol=1e-4)
+    assert np.abs(there["sh"][:, 0] - here["sh"][:, 0]).max() < 0.51 / 255 / 0.2821
+    assert same_rotation(there["quaternion"], here["quaternion"]) > 1 - 1e-5
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_every_level_of_ksplat_is_read(tmp_path: Path, level: int) -> None:
+    """Written here from the layout: two sections of four Gaussians, in a full bucket and a partly filled one."""
+    number = "<f4" if level == 0 else "<f2"
+    header, headers, content = bytearray(4096), b"", b""
+    struct.pack_into("<BBxx4IH", header, 0, 0, 1, 2, 2, 8, 8, level)
+    struct.pack_into("<2f", header, 36, -2.0, 1.0)
+    positions = []
+    for section in range(2):
+        one = bytearray(1024)
+        struct.pack_into("<4IfH", one, 0, 4, 4, 3, 2 if level else 0, 8.0, 12)
+        struct.pack_into("<I4xIIH", one, 24, 0, 1 if level else 0, 1 if level else 0, 1)
+        headers += one
+        centres = np.array([[1, 2, 3], [-5, section, 0]], "<f4")
+        if level:
+            content += struct.pack("<I", 1) + centres.tobytes()
+        for n in range(4):
+            code = np.array([32767, 0, 65534]) if n != 1 else np.array([49150, 32767, 32767])
+            place = (code - 32767) * 4.0 / 32767 + centres[n // 3]
+            positions.append(place)
+            content += (place.astype("<f4") if level == 0 else code.astype("<u2")).tobytes()
+            content += np.array([0.5, 1, 0.25, 0.8, 0, 0.6, 0], number).tobytes() + bytes([255, 0, 51, 204])
+            harmonics = np.arange(9) / 8 - 0.5
+            content += (
+                np.round((harmonics + 2) / 3 * 255).astype(np.uint8) if level == 2 else harmonics.astype(number)
+            ).tobytes()
+    (tmp_path / "a.ksplat").write_bytes(bytes(header) + headers + content)
+    state = read_any_splats(tmp_path / "a.ksplat")
+    np.testing.assert_allclose(state["position"], positions, atol=1e-4)
+    np.testing.assert_allclose(state["log_scale"], np.log([[0.5, 1, 0.25]] * 8), atol=1e-6)
+    np.testing.assert_allclose(state["quaternion"], [[0.8, 0, 0.6, 0]] * 8, atol=1e-3)
+    np.testing.assert_allclose(state["opacity_logit"], logit(np.full(8, 0.8)), rtol=1e-5)
+    np.testing.assert_allclose(state["sh"][0, 0], (np.array([1, 0, 0.2]) - 0.5) / 0.28209479, rtol=1e-5)
+    # Red, green and blue of the three harmonics, one colour after the other in the file.
+    np.testing.assert_allclose(state["sh"][5, 1:], (np.arange(9) / 8 - 0.5).reshape(3, 3).T, atol=0.51 * 3 / 255)
 
 
 def read_glb(path: Path) -> dict[str, NDArray]:
@@ -137,7 +186,7 @@ def test_converted_there_and_back_nothing_is_lost_in_a_ply(ply: Path, tmp_path: 
         ("source.ply", "b.obj", "splats are written to a file in .compressed.ply, .ply, .spz"),
         ("source.ply", "source.ply", "is the source itself"),
         ("gone.spz", "b.ply", "cannot be read: No such file"),
-        ("text.txt", "b.ply", "splats are read from .ply, .spz, .sog, .splat"),
+        ("text.txt", "b.ply", "splats are read from .ply, .spz, .sog, .splat, .ksplat"),
     ],
 )
 def test_what_cannot_be_converted_is_refused_in_one_line(ply: Path, source: str, target: str, part: str) -> None:
