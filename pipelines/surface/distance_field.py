@@ -1,4 +1,4 @@
-"""Adds depth views to a truncated signed distance field [Curless and Levoy 1996], weighted by their confidence."""
+"""Adds depth views to a truncated signed distance field [Curless and Levoy 1996]."""
 # pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 
 from fields.runtime.engine import ti
@@ -19,7 +19,6 @@ def integrate(
     K: IMAGE,
     T_camera_world: IMAGE,
     depth: IMAGE,  # 0 where unknown
-    confidence: IMAGE,
     colour: COLOURS,
     truncation: ti.f32,
     farthest: ti.f32,
@@ -46,12 +45,12 @@ def integrate(
             v = ti.floor(K[1, 1] * p[1] / p[2] + K[1, 2])
             if u >= 0.0 and v >= 0.0 and u < width and v < height:
                 x, y = ti.cast(u, ti.i32), ti.cast(v, ti.i32)
-                z, w = depth[y, x], confidence[y, x]
+                z, w = depth[y, x], 1.0
                 distance = (z - p[2]) / truncation
                 if z > 0.0 and z < farthest and distance >= -1.0:
                     if distance > 1.0:
                         distance = 1.0
-                        w *= free_weight
+                        w = free_weight
                     at = rows[b] + j
                     before = weight[at]
                     share = w / ti.max(before + w, 1e-12)

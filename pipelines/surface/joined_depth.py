@@ -27,8 +27,8 @@ Image = NDArray[np.float32]
 
 def joined_depth(
     views: Sequence[DepthView], matched: Sequence[Image], neighbours: Sequence[Sequence[int]], order: Iterable[int]
-) -> Iterator[tuple[Image, Image]]:
-    """Yield depth and confidence (H, W) of each view.
+) -> Iterator[Image]:
+    """Yield the depth (H, W) of each view, 0 where unknown.
 
     Each pixel takes the depth that most of the neighbours agree with: the matched one, that of the plane around its
     plain region, or the map's own.
@@ -49,7 +49,7 @@ def joined_depth(
         depth = matched[index]
         count = agreeing(depth)
         if (count >= KEPT).sum() < LEAST_AGREED * (depth > 0).sum():
-            yield depth, np.ones_like(depth)
+            yield depth
             continue
         inverse = np.where(depth > 0, 1.0 / np.maximum(depth, 1e-12), 0.0).astype(np.float32)
         plane = planes_of_plain_regions(view.grey, inverse, count >= TRUSTED)
@@ -57,4 +57,4 @@ def joined_depth(
             of_other = agreeing(other)
             better = of_other > count
             depth, count = np.where(better, other, depth), np.where(better, of_other, count)
-        yield np.where(count >= KEPT, depth, 0.0).astype(np.float32), np.ones_like(depth)
+        yield np.where(count >= KEPT, depth, 0.0).astype(np.float32)

@@ -123,7 +123,7 @@ class DepthMatcher:
         step = 1.0 / max(float(np.linalg.norm(warp[:2, 3])) for warp in warps)
         after = [other > index for other in self.neighbours[index]]
         start = np.ascontiguousarray(smooth, dtype=np.float32)
-        return self._sweep.sweep(view.grey, [other.grey for other in others], warps, after, start, step, reach).inverse
+        return self._sweep.sweep(view.grey, [other.grey for other in others], warps, after, start, step, reach)
 
 
 def _half(view: DepthView) -> DepthView:

@@ -2,7 +2,6 @@
 # pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ from fields.runtime.backend import on_gpu
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
-__all__ = ["MAX_STEPS", "PlaneSweep", "Swept"]
+__all__ = ["MAX_STEPS", "PlaneSweep"]
 
 # Most sweep steps, both directions and the middle one.
 MAX_STEPS = 33
@@ -33,18 +32,6 @@ SPREAD = HANDED_OUT // 8
 IMAGE = ti.types.ndarray(dtype=ti.f32, ndim=2)
 
 
-class Swept(NamedTuple):
-    """Result of a sweep.
-
-    Attributes:
-        inverse: (H, W) inverse depth of least smoothed cost.
-        cost: (H, W) matching cost there, 1 - ZNCC averaged over the neighbours.
-    """
-
-    inverse: NDArray[np.float32]
-    cost: NDArray[np.float32]
-
-
 @ti.data_oriented
 class PlaneSweep:
     """Sweeps inverse depth around a start for each pixel [Collins 1996], and smooths the costs [Hirschmueller 2008].
@@ -61,7 +48,6 @@ class PlaneSweep:
     def __init__(self, pixels: int, steps: int) -> None:
         # Powers of two, so that most sizes share the kernels of the offline cache.
         samples = 1 << (pixels * steps - 1).bit_length()
-        self.capacity = samples
         self.carried = ti.field(ti.f32, samples)
         self.total = ti.field(ti.f32, 2 * samples)
         self.count = ti.field(ti.f32, 2 * samples)
@@ -78,8 +64,8 @@ class PlaneSweep:
         inverse: NDArray[np.float32],
         step: float,
         reach: int,
-    ) -> Swept:
-        """Sweep `reach` steps to either side.
+    ) -> NDArray[np.float32]:
+        """Sweep `reach` steps to either side, and return the inverse depth (H, W) of least smoothed cost.
 
         Args:
             grey: (H, W) image of the view in [0, 1].
@@ -102,9 +88,9 @@ class PlaneSweep:
             self._compare(grey, mean, scale, int(later), steps)
         self._combine(reach, height, width)
         self._smooth(grey, steps, spread)
-        found, cost = np.empty_like(grey), np.empty_like(grey)
-        self._pick(inverse, step, reach, found, cost)
-        return Swept(found, cost)
+        found = np.empty_like(grey)
+        self._pick(inverse, step, reach, found)
+        return found
 
     @ti.kernel
     def _clear(self, samples: ti.i32):
@@ -231,8 +217,8 @@ class PlaneSweep:
             least, grey_before = lowest, value
 
     @ti.kernel
-    def _pick(self, inverse: IMAGE, step: ti.f32, reach: ti.i32, found: IMAGE, cost: IMAGE):
-        """Inverse depth of the least path cost, with a parabola between steps, and the matching cost there."""
+    def _pick(self, inverse: IMAGE, step: ti.f32, reach: ti.i32, found: IMAGE):
+        """Inverse depth of the least path cost, with a parabola between steps."""
         steps, width = 2 * reach + 1, inverse.shape[1]
         for i in range(inverse.shape[0] * width):
             y, x = i // width, i % width
@@ -245,4 +231,3 @@ class PlaneSweep:
             curvature = ti.max(left + right - 2.0 * middle, 1e-6)
             offset = ti.min(ti.max((left - right) / (2.0 * curvature), -0.5), 0.5)
             found[y, x] = inverse[y, x] + step * (best + offset - reach)
-            cost[y, x] = self.cost[at + best]

@@ -62,8 +62,8 @@ def surface_views(run: FinishedRun, renderer: MapRenderer, line: ProgressLine) -
         views, matched, matcher.neighbours, line.through("joining depth", range(len(views)), len(views))
     )
     return [
-        SurfaceView(view.camera, view.T_camera_world, without_edges(depth), confidence, picture / np.float32(255.0))
-        for view, (depth, confidence), picture in zip(views, joined, pictures, strict=True)
+        SurfaceView(view.camera, view.T_camera_world, without_edges(depth), picture / np.float32(255.0))
+        for view, depth, picture in zip(views, joined, pictures, strict=True)
     ]
 
 

@@ -75,7 +75,7 @@ def test_each_pixel_takes_the_depth_that_the_neighbours_have() -> None:
     shown = [replace(view, depth=view.depth.copy()) for view in seen]
     shown[4].depth[:48, :40] *= 1.2
     neighbours = [[2, 3, 5, 6]] * 9
-    depth, _ = next(joined_depth(shown, [*true[:4], wrong, *true[5:]], neighbours, [4]))
+    depth = next(joined_depth(shown, [*true[:4], wrong, *true[5:]], neighbours, [4]))
     inner = np.s_[8:-8, 48:-8]
     assert (depth[inner] == true[4][inner]).all()
     assert (depth[:48, 8:40] == 0).all()
@@ -85,5 +85,5 @@ def test_each_pixel_takes_the_depth_that_the_neighbours_have() -> None:
 def test_a_view_that_nobody_agrees_with_keeps_all_its_depth() -> None:
     shown, _ = views(0.3)
     wrong = [view.depth * np.float32(1 + 0.1 * i) for i, view in enumerate(shown)]
-    depth, _ = next(joined_depth(shown, wrong, [[2, 3, 5, 6]] * 9, [4]))
+    depth = next(joined_depth(shown, wrong, [[2, 3, 5, 6]] * 9, [4]))
     assert (depth == wrong[4]).all()

@@ -43,7 +43,7 @@ def plane_views(normal: np.ndarray, offset: float, count: int = 6) -> list[Surfa
         T[:3, 3] = -centre
         z = (offset - normal @ centre) / (rays @ normal)
         seen = np.where((z > 0.3) & (z < 4), z, 0).astype(np.float32)
-        views.append(SurfaceView(CAMERA, T, seen, np.ones_like(seen), np.tile(COLOUR, (120, 160, 1))))
+        views.append(SurfaceView(CAMERA, T, seen, np.tile(COLOUR, (120, 160, 1))))
     return views
 
 
@@ -55,7 +55,7 @@ def test_a_slanted_plane_is_fused_where_it_is() -> None:
     assert len(vertices) > 10_000
     for near, far in ((1.2, 1.8), (1.8, 2.5), (2.5, 3.5)):
         error = vertices[(vertices[:, 2] > near) & (vertices[:, 2] < far)] @ normal + 1.2
-        assert abs(error.mean()) < 0.001
+        assert abs(error.mean()) < 0.002  # a tenth of a voxel
         assert np.abs(error).mean() < 0.004
     # But for the rim, where a vertex lies beside voxels that nobody saw.
     coloured = np.abs(np.asarray(mesh.vertex_colors) - COLOUR).max(axis=1) < 2e-3
@@ -73,7 +73,7 @@ def test_the_room_is_fused_to_its_true_surface(room: Room) -> None:
         z = room.depth(camera, T, pixels)
         surface.append((camera.unproject(pixels, z) - T[:3, 3]) @ T[:3, :3])
         depth = without_edges(z.reshape(120, 160).astype(np.float32))
-        views.append(SurfaceView(camera, T, depth, np.ones_like(depth), grey))
+        views.append(SurfaceView(camera, T, depth, grey))
     mesh = without_floating_parts(extracted(fused(views, voxel=0.025, farthest=10.0)))
     vertices, true = (
         open3d().geometry.PointCloud(open3d().utility.Vector3dVector(xyz))
@@ -108,7 +108,7 @@ def test_small_parts_on_their_own_go_and_large_ones_stay() -> None:
 
 def test_views_of_nothing_are_refused() -> None:
     empty = np.zeros((120, 160), np.float32)
-    nothing = SurfaceView(CAMERA, np.eye(4), empty, empty, np.zeros((120, 160, 3), np.float32))
+    nothing = SurfaceView(CAMERA, np.eye(4), empty, np.zeros((120, 160, 3), np.float32))
     with pytest.raises(InputError, match="shows no surface"):
         fused([nothing], voxel=0.02, farthest=4.0)
 
