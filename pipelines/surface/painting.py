@@ -49,7 +49,7 @@ class Paint:
         K, T = camera.matrix().astype(np.float32), np.ascontiguousarray(T_camera_world, dtype=np.float32)
         _add(self._points, self._normals, K, T, depth, colour, self._sum)
 
-    def colours(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def colours(self) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
         """Return the colours (N, 3), and which of them (N,) some picture has seen."""
         weight = self._sum[:, 3:]
         return self._sum[:, :3] / np.maximum(weight, np.float32(1e-20)), weight[:, 0] > 0

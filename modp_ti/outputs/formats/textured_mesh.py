@@ -116,9 +116,10 @@ def painted(
     image, known = np.zeros((height, width, 3), np.float32), np.zeros((height, width), bool)
     image[inside], known[inside] = colours, seen
     # Labels of the nearest known texel for each texel.
-    _, nearest = cv2.distanceTransformWithLabels(
+    _, labels = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    nearest = np.asarray(labels, dtype=np.int32)
     of_label = np.zeros((nearest.max() + 1, 3), np.float32)
     of_label[nearest[known]] = image[known]
     image = np.rint(255 * np.clip(of_label[nearest], 0, 1)).astype(np.uint8)
