@@ -86,11 +86,12 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     if options.texture:
         if format != "mesh":
             raise InputError(f"--texture: --format {format} has no texture; use --format mesh")
-        require_atlas()
         output = run.folder / TEXTURED_NAME if output is None else output
     target = _target(run, format, output)
-    if options.texture and target.suffix.lower() != ".glb":
-        raise InputError(f"{target}: a mesh with --texture is written as .glb")
+    if options.texture:
+        if target.suffix.lower() != ".glb":
+            raise InputError(f"{target}: a mesh with --texture is written as .glb")
+        require_atlas()
     _make_folder(target.absolute().parent)
     try:
         if format == "points":

@@ -18,6 +18,8 @@ from modp_ti.outputs.formats.open3d_io import open3d
 from modp_ti.outputs.formats.textured_mesh import TexturedMesh, painted, unwrapped
 from tests.room import look_at
 
+pytest.importorskip("xatlas", reason="no wheel of xatlas for this Python")
+
 CAMERA = PinholeCamera(130.0, 130.0, 80.0, 60.0, 160, 120)
 
 
