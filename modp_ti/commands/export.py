@@ -15,7 +15,7 @@ __all__ = ["EXAMPLES", "export"]
 EXAMPLES = examples(
     "modp-ti export out/room --format html   (one page for a friend)",
     "modp-ti export out/room --format mesh   (out/room/mesh.ply)",
-    "modp-ti export out/room --format mesh -o room.glb   (for browsers)",
+    "modp-ti export out/room --format mesh --texture   (for browsers and game engines: out/room/mesh.glb)",
     "modp-ti export out/room --format spz   (splats, 1/5 to 1/4 of the size)",
     "modp-ti export out/room --format nerfstudio -o data/room",
 )
@@ -58,6 +58,9 @@ def export(
     voxel: Annotated[
         float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
     ] = None,
+    texture: Annotated[
+        bool, typer.Option("--texture", help="`mesh`: with a texture, as GLB (needs the extra `texture`)")
+    ] = False,
     spz_version: Annotated[int, typer.Option(min=2, max=4, help="`spz`: version of the format, 2 to 4")] = 3,
     device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
@@ -70,7 +73,7 @@ def export(
         from modp_ti.outputs.playback.finished_run import open_run
         from modp_ti.outputs.progress import ProgressLine
 
-        options = ExportOptions(voxel or None, device.value, spz_version)
+        options = ExportOptions(voxel or None, texture, device.value, spz_version)
         line = ProgressLine(progress_console(quiet))
         with line.working("reading the run"):
             run = open_run(out)

@@ -14,14 +14,15 @@ from modp_ti.outputs.formats.sog import write_sog
 from modp_ti.outputs.formats.sog_lod import write_sog_lod
 from modp_ti.outputs.formats.splat_glb import write_splat_glb
 from modp_ti.outputs.formats.spz import DEFAULT_VERSION, write_spz
+from modp_ti.outputs.formats.textured_mesh import painted, require_atlas, unwrapped
 from modp_ti.outputs.formats.web_splat import write_web_splat
 from modp_ti.outputs.playback.film import is_video
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.flight import film, plan_flight
-from modp_ti.outputs.playback.map_renderer import start_device
+from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.playback.mapped_images import dataset_names, write_images
 from modp_ti.outputs.playback.plain_colours import with_plain_colours
-from modp_ti.outputs.playback.surface import surface_views
+from modp_ti.outputs.playback.surface import largest_view, painted_from, surface_views
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
 from modp_ti.outputs.splat_page.flight import level, moved, viewer_settings
@@ -48,6 +49,7 @@ DEFAULT_NAMES = {
 SPLATS = {"sog": write_sog, "compressed-ply": write_compressed_ply, "splat-glb": write_splat_glb}
 # Formats that are written to a folder.
 FOLDERS = ("colmap", "nerfstudio", "sog-lod")
+TEXTURED_NAME = "mesh.glb"
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL = 1 / 160
 FARTHEST = 4.0
@@ -59,11 +61,13 @@ class ExportOptions:
 
     Attributes:
         voxel: Edge of the mesh's voxels [scene units], None for VOXEL times the scene's depth.
+        texture: Whether the mesh gets a texture instead of a colour per vertex.
         device: Device for rendering.
         spz_version: Version of `.spz` to write.
     """
 
     voxel: float | None = None
+    texture: bool = False
     device: str = "auto"
     spz_version: int = DEFAULT_VERSION
 
@@ -84,7 +88,15 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     Raises:
         InputError: If the export is not possible.
     """
+    if options.texture:
+        if format != "mesh":
+            raise InputError(f"--texture: --format {format} has no texture; use --format mesh")
+        output = run.folder / TEXTURED_NAME if output is None else output
     target = _target(run, format, output)
+    if options.texture:
+        if target.suffix.lower() != ".glb":
+            raise InputError(f"{target}: a mesh with --texture is written as .glb")
+        require_atlas()
     _make_folder(target.absolute().parent)
     try:
         if format == "points":
@@ -145,9 +157,21 @@ def _make_folder(folder: Path) -> None:
 
 def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     voxel = options.voxel or VOXEL * run.record.scene_depth
-    grid = fused(surface_views(run, options.device, line), voxel, FARTHEST * run.record.scene_depth)
+    with line.working("loading the map"):
+        gaussians = run.gaussians
+        start_device(options.device)
+    renderer = MapRenderer(gaussians, *largest_view(run, options.texture), run.record.near)
+    views = surface_views(run, renderer, line)
+    with line.working("fusing depth"):
+        grid = fused(views, voxel, FARTHEST * run.record.scene_depth)
     with line.working("extracting the surface"):
-        write_mesh(target, without_floating_parts(extracted(grid)))
+        mesh = without_floating_parts(extracted(grid))
+    if options.texture:
+        with line.working("unwrapping the surface"):
+            flat = unwrapped(mesh)
+        places = painted_from(run)
+        mesh = painted(flat, ((*p, renderer.view(*p).colour) for p in line.through("painting", places, len(places))))
+    write_mesh(target, mesh)
 
 
 def _page(run: FinishedRun, target: Path) -> None:

@@ -308,6 +308,8 @@ def failure(*arguments: str | Path) -> str:
     ("arguments", "part"),
     [
         (["--format", "mesh", "-o", "m.stl"], "--format mesh writes a file in .ply, .glb, .obj"),
+        (["--format", "mesh", "--texture", "-o", "m.ply"], "m.ply: a mesh with --texture is written as .glb"),
+        (["--format", "points", "--texture"], "--texture: --format points has no texture; use --format mesh"),
         (["--format", "spz", "-o", "{out}/splats.ply/here.spz"], "cannot be made: "),
         (["--format", "points", "-o", "{out}/splats.ply"], "is the map itself"),
         (["--format", "video", "-o", "film.avi"], "in .mp4 or .webm"),

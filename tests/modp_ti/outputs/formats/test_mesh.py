@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,19 +31,20 @@ CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
 COLOUR = np.float32([0.25, 0.5, 1.0])
 
 
-def plane_views(normal: np.ndarray, offset: float, count: int = 6) -> Iterator[SurfaceView]:
+def plane_views(normal: np.ndarray, offset: float, count: int = 6) -> list[SurfaceView]:
     """A plane normal . X = offset from cameras that look along z, with the exact depth of every pixel's centre."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:120, :160] + 0.5
     rays = np.stack([(u - 80.0) / 100.0, (v - 60.0) / 100.0, np.ones_like(u)], axis=2)
+    views = []
     for _ in range(count):
         centre = rng.uniform(-0.1, 0.1, 3)
         T = np.eye(4)
         T[:3, 3] = -centre
         z = (offset - normal @ centre) / (rays @ normal)
-        yield SurfaceView(
-            CAMERA, T, np.where((z > 0.3) & (z < 4), z, 0).astype(np.float32), np.tile(COLOUR, (120, 160, 1))
-        )
+        seen = np.where((z > 0.3) & (z < 4), z, 0).astype(np.float32)
+        views.append(SurfaceView(CAMERA, T, seen, np.tile(COLOUR, (120, 160, 1))))
+    return views
 
 
 def test_a_slanted_plane_is_fused_where_it_is() -> None:
@@ -55,7 +55,7 @@ def test_a_slanted_plane_is_fused_where_it_is() -> None:
     assert len(vertices) > 10_000
     for near, far in ((1.2, 1.8), (1.8, 2.5), (2.5, 3.5)):
         error = vertices[(vertices[:, 2] > near) & (vertices[:, 2] < far)] @ normal + 1.2
-        assert abs(error.mean()) < 0.001
+        assert abs(error.mean()) < 0.002  # a tenth of a voxel
         assert np.abs(error).mean() < 0.004
     # But for the rim, where a vertex lies beside voxels that nobody saw.
     coloured = np.abs(np.asarray(mesh.vertex_colors) - COLOUR).max(axis=1) < 2e-3
@@ -72,7 +72,8 @@ def test_the_room_is_fused_to_its_true_surface(room: Room) -> None:
     for T in poses:
         z = room.depth(camera, T, pixels)
         surface.append((camera.unproject(pixels, z) - T[:3, 3]) @ T[:3, :3])
-        views.append(SurfaceView(camera, T, without_edges(z.reshape(120, 160).astype(np.float32)), grey))
+        depth = without_edges(z.reshape(120, 160).astype(np.float32))
+        views.append(SurfaceView(camera, T, depth, grey))
     mesh = without_floating_parts(extracted(fused(views, voxel=0.025, farthest=10.0)))
     vertices, true = (
         open3d().geometry.PointCloud(open3d().utility.Vector3dVector(xyz))
@@ -106,7 +107,8 @@ def test_small_parts_on_their_own_go_and_large_ones_stay() -> None:
 
 
 def test_views_of_nothing_are_refused() -> None:
-    nothing = SurfaceView(CAMERA, np.eye(4), np.zeros((120, 160), np.float32), np.zeros((120, 160, 3), np.float32))
+    empty = np.zeros((120, 160), np.float32)
+    nothing = SurfaceView(CAMERA, np.eye(4), empty, np.zeros((120, 160, 3), np.float32))
     with pytest.raises(InputError, match="shows no surface"):
         fused([nothing], voxel=0.02, farthest=4.0)
 

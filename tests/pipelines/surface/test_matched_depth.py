@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.outputs.formats.matched_depth import DepthView, agreed_depth, choose_neighbours, matched_depth
+from pipelines.surface.joined_depth import joined_depth
+from pipelines.surface.matched_depth import DepthMatcher, DepthView, choose_neighbours
 
 CAMERA = PinholeCamera(100.0, 100.0, 64.0, 48.0, 128, 96)
 NORMAL, OFFSET = np.array([0.3, -0.2, -1.0]), -2.5  # the plane NORMAL . X = OFFSET, 2 to 3.3 before the cameras
@@ -42,7 +43,7 @@ def error(depth: np.ndarray, true: np.ndarray) -> np.ndarray:
 def test_a_depth_that_is_wrong_everywhere_is_put_right(wrong: float) -> None:
     seen, true = views(contrast=1.0)
     shown = [replace(view, depth=view.depth * np.float32(wrong)) for view in seen]
-    depth = matched_depth(shown, 4, choose_neighbours(shown, 4))
+    depth = DepthMatcher(shown).matched(4)
     assert error(shown[4].depth, true[4]).min() > 0.05
     assert np.median(error(depth, true[4])) < 0.01
     assert (error(depth, true[4]) < 0.03).mean() > 0.9
@@ -50,10 +51,10 @@ def test_a_depth_that_is_wrong_everywhere_is_put_right(wrong: float) -> None:
 
 def test_where_pictures_say_nothing_the_map_stands() -> None:
     seen, true = views(contrast=0.0)
-    depth = matched_depth(seen, 4, choose_neighbours(seen, 4))
+    depth = DepthMatcher(seen).matched(4)
     assert error(depth, true[4]).max() < 0.01
     alone = seen[:1]
-    np.testing.assert_array_equal(matched_depth(alone, 0, choose_neighbours(alone, 0)), alone[0].depth)
+    np.testing.assert_array_equal(DepthMatcher(alone).matched(0), alone[0].depth)
 
 
 def test_neighbours_lie_on_both_sides_at_the_wanted_parallaxes() -> None:
@@ -65,17 +66,24 @@ def test_neighbours_lie_on_both_sides_at_the_wanted_parallaxes() -> None:
     assert 5 not in choose_neighbours([*seen[:5], turned, *seen[6:]], 4)
 
 
-def test_depth_is_kept_where_neighbours_agree_on_it() -> None:
+def test_each_pixel_takes_the_depth_that_the_neighbours_have() -> None:
+    """Where matching is wrong the map's depth stands if the neighbours agree with it, and nothing where none does."""
     seen, _ = views(contrast=1.0)
-    bent = seen[4].depth.copy()
-    bent[:, :40] *= 1.03  # no neighbour agrees
-    shown = [*seen[:4], replace(seen[4], depth=bent), *seen[5:]]
-    depth = agreed_depth(shown, 4, [2, 3, 5, 6])
-    assert (depth[:, :40] == 0).all()
-    assert (depth[8:-8, 48:-8] == bent[8:-8, 48:-8]).all()
+    true = [view.depth for view in seen]
+    wrong = true[4].copy()
+    wrong[:, :40] *= 1.1
+    shown = [replace(view, depth=view.depth.copy()) for view in seen]
+    shown[4].depth[:48, :40] *= 1.2
+    neighbours = [[2, 3, 5, 6]] * 9
+    depth = next(joined_depth(shown, [*true[:4], wrong, *true[5:]], neighbours, [4]))
+    inner = np.s_[8:-8, 48:-8]
+    assert (depth[inner] == true[4][inner]).all()
+    assert (depth[:48, 8:40] == 0).all()
+    assert (depth[48:-8, 8:40] == true[4][48:-8, 8:40]).all()
 
 
 def test_a_view_that_nobody_agrees_with_keeps_all_its_depth() -> None:
     shown, _ = views(0.3)
-    wrong = [replace(view, depth=view.depth * np.float32(1 + 0.1 * i)) for i, view in enumerate(shown)]
-    assert (agreed_depth(wrong, 4, [2, 3, 5, 6]) == wrong[4].depth).all()
+    wrong = [view.depth * np.float32(1 + 0.1 * i) for i, view in enumerate(shown)]
+    depth = next(joined_depth(shown, wrong, [[2, 3, 5, 6]] * 9, [4]))
+    assert (depth == wrong[4]).all()

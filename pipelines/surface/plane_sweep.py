@@ -1,0 +1,233 @@
+"""`PlaneSweep`: compares a view with its neighbours over inverse depth, and picks the depth of least smoothed cost."""
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.runtime.backend import on_gpu
+from fields.runtime.engine import ti
+from fields.runtime.parallel import HANDED_OUT
+
+__all__ = ["MAX_STEPS", "PlaneSweep"]
+
+# Most sweep steps, both directions and the middle one.
+MAX_STEPS = 33
+# A constant added to the variance of matching windows, which suppresses weaker contrast.
+LEAST_VARIANCE = 1e-5
+# Costs are 1 - ZNCC. Penalties: a change by one step between adjacent pixels; a larger change, which decreases with
+# their grey difference on the scale GREY_EDGE; and the distance from the start, relative to the sweep's range. The last
+# one only breaks ties: with 0.05, whole regions stayed at the map's depth.
+SMALL_JUMP, LARGE_JUMP, GREY_EDGE = 0.1, 0.8, 0.05
+START_WEIGHT = 0.002
+# Least number of neighbours on one side that may decide alone.
+LEAST_SIDE = 2.0
+# Grey value outside of an image.
+OUTSIDE = -99.0
+# Eight rows per chunk, see `fields.runtime.parallel`.
+SPREAD = HANDED_OUT // 8
+
+IMAGE = ti.types.ndarray(dtype=ti.f32, ndim=2)
+
+
+@ti.data_oriented
+class PlaneSweep:
+    """Sweeps inverse depth around a start for each pixel [Collins 1996], and smooths the costs [Hirschmueller 2008].
+
+    Windows of 3x3 pixels are compared by ZNCC. A surface behind an edge is hidden from the neighbours on one side, so
+    the cost is the smaller one of the means over the neighbours before and after the view. Costs are summed along rows
+    and columns.
+
+    Args:
+        pixels: Most pixels of a view.
+        steps: Most steps of a sweep of such a view.
+    """
+
+    def __init__(self, pixels: int, steps: int) -> None:
+        # Powers of two, so that most sizes share the kernels of the offline cache.
+        samples = 1 << (pixels * steps - 1).bit_length()
+        self.carried = ti.field(ti.f32, samples)
+        self.total = ti.field(ti.f32, 2 * samples)
+        self.count = ti.field(ti.f32, 2 * samples)
+        self.cost = ti.field(ti.f32, samples)
+        self.paths = ti.field(ti.f32, samples)
+        self.line = ti.field(ti.f32, 2 * MAX_STEPS * 4096)
+
+    def sweep(
+        self,
+        grey: NDArray[np.float32],
+        others: Sequence[NDArray[np.float32]],
+        warps: Sequence[NDArray[np.float32]],
+        after: Sequence[bool],
+        inverse: NDArray[np.float32],
+        step: float,
+        reach: int,
+    ) -> NDArray[np.float32]:
+        """Sweep `reach` steps to either side, and return the inverse depth (H, W) of least smoothed cost.
+
+        Args:
+            grey: (H, W) image of the view in [0, 1].
+            others: (H, W) images of the neighbours.
+            warps: (3, 4) warp to each neighbour, see `plane_warp`.
+            after: Whether each neighbour comes after the view.
+            inverse: (H, W) inverse depth to start from.
+            step: Step of inverse depth.
+            reach: Number of steps to either side.
+        """
+        height, width = grey.shape
+        steps = 2 * reach + 1
+        mean = cv2.blur(grey, (3, 3))
+        variance = np.maximum(cv2.blur(grey * grey, (3, 3)) - mean * mean, 0.0)
+        scale = (1.0 / np.sqrt(variance + LEAST_VARIANCE)).astype(np.float32)
+        spread = 1 if on_gpu() else SPREAD
+        self._clear(2 * steps * height * width)
+        for other, warp, later in zip(others, warps, after, strict=True):
+            self._carry(other, warp, inverse, step, reach)
+            self._compare(grey, mean, scale, int(later), steps)
+        self._combine(reach, height, width)
+        self._smooth(grey, steps, spread)
+        found = np.empty_like(grey)
+        self._pick(inverse, step, reach, found)
+        return found
+
+    @ti.kernel
+    def _clear(self, samples: ti.i32):
+        for i in range(samples):
+            self.total[i] = 0.0
+            self.count[i] = 0.0
+
+    @ti.kernel
+    def _carry(
+        self,
+        other: IMAGE,
+        warp: IMAGE,
+        inverse: IMAGE,
+        step: ti.f32,
+        reach: ti.i32,
+    ):
+        """Warp the neighbour's image to the view, for each step: carried[d, y, x]."""
+        height, width = inverse.shape[0], inverse.shape[1]
+        right, bottom = other.shape[1] - 1.0, other.shape[0] - 1.0
+        for i in range((2 * reach + 1) * height):
+            d, y = i // height, i % height
+            offset = step * (d - reach)
+            v = y + 0.5
+            for x in range(width):
+                u, w = x + 0.5, inverse[y, x] + offset
+                over = 1.0 / ti.max(warp[2, 0] * u + warp[2, 1] * v + warp[2, 2] + warp[2, 3] * w, 1e-3)
+                px = (warp[0, 0] * u + warp[0, 1] * v + warp[0, 2] + warp[0, 3] * w) * over - 0.5
+                py = (warp[1, 0] * u + warp[1, 1] * v + warp[1, 2] + warp[1, 3] * w) * over - 0.5
+                value = OUTSIDE
+                if px >= 0.0 and py >= 0.0 and px < right and py < bottom:
+                    x0, y0 = ti.cast(px, ti.i32), ti.cast(py, ti.i32)
+                    s, t = px - x0, py - y0
+                    above = other[y0, x0] + s * (other[y0, x0 + 1] - other[y0, x0])
+                    below = other[y0 + 1, x0] + s * (other[y0 + 1, x0 + 1] - other[y0 + 1, x0])
+                    value = above + t * (below - above)
+                self.carried[i * width + x] = value
+
+    @ti.kernel
+    def _compare(self, grey: IMAGE, mean: IMAGE, scale: IMAGE, side: ti.i32, steps: ti.i32):
+        """Add 1 - ZNCC of the 3x3 windows of the view and of `carried` to the total of a side."""
+        height, width = grey.shape[0], grey.shape[1]
+        for i in range(steps * height):
+            d, y = i // height, i % height
+            up, down = ti.max(y - 1, 0), ti.min(y + 1, height - 1)
+            a, b, c = (d * height + up) * width, i * width, (d * height + down) * width
+            to = side * steps * height * width + b
+            # Sums over the window's columns: of the neighbour, of its square, of its product with the view.
+            left, middle = ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0])
+            for x in range(width + 1):
+                at = ti.min(x, width - 1)
+                p, q, r = self.carried[a + at], self.carried[b + at], self.carried[c + at]
+                column = ti.Vector(
+                    [p + q + r, p * p + q * q + r * r, p * grey[up, at] + q * grey[y, at] + r * grey[down, at]]
+                )
+                if x == 0:
+                    left = column
+                else:
+                    total = (left + middle + column) / 9.0
+                    if total[0] >= 0.0:  # the whole window is inside
+                        spread = ti.max(total[1] - total[0] * total[0], 0.0) + LEAST_VARIANCE
+                        together = total[2] - total[0] * mean[y, x - 1]
+                        cost = 1.0 - together * scale[y, x - 1] / ti.sqrt(spread)
+                        self.total[to + x - 1] = self.total[to + x - 1] + cost
+                        self.count[to + x - 1] = self.count[to + x - 1] + 1.0
+                    left = middle
+                middle = column
+
+    @ti.kernel
+    def _combine(self, reach: ti.i32, height: ti.i32, width: ti.i32):
+        """cost[y, x, d] from the totals of both sides; 1 where no neighbour sees the pixel."""
+        steps, pixels = 2 * reach + 1, height * width
+        for i in range(pixels):
+            for d in range(steps):
+                first, second = d * pixels + i, (steps + d) * pixels + i
+                m, n = self.count[first], self.count[second]
+                s, t = self.total[first], self.total[second]
+                cost = 1.0
+                if m + n > 0.0:
+                    cost = (s + t) / (m + n)
+                if m >= LEAST_SIDE and n >= LEAST_SIDE:
+                    cost = ti.min(s / m, t / n)
+                self.cost[i * steps + d] = cost + START_WEIGHT * ti.abs(d - reach) / reach
+                self.paths[i * steps + d] = 0.0
+
+    @ti.kernel
+    def _smooth(self, grey: IMAGE, steps: ti.i32, spread: ti.i32):
+        """Sum the costs of the best paths to each pixel along its row and column, from both sides, into `paths`."""
+        height, width = grey.shape[0], grey.shape[1]
+        for i in range(height * spread):
+            if i % spread == 0:
+                y = i // spread
+                for backwards in range(2):
+                    self._walk(grey, steps, y, width, y, 0, 0, 1, backwards)
+        for i in range(width * spread):
+            if i % spread == 0:
+                x = i // spread
+                for backwards in range(2):
+                    self._walk(grey, steps, x, height, 0, x, 1, 0, backwards)
+
+    @ti.func
+    def _walk(self, grey: ti.template(), steps, number, length, row, column, down, across, backwards):
+        """Add the costs of the best paths along one line to `paths`."""
+        width = grey.shape[1]
+        here, before = 2 * number * MAX_STEPS, (2 * number + 1) * MAX_STEPS
+        least, grey_before = 0.0, 0.0
+        for k in range(length):
+            j = ti.select(backwards == 1, length - 1 - k, k)
+            y, x = row + j * down, column + j * across
+            at = (y * width + x) * steps
+            value = grey[y, x]
+            jump = ti.max(LARGE_JUMP * ti.exp(-ti.abs(value - grey_before) / GREY_EDGE), 1.5 * SMALL_JUMP)
+            lowest = 1e30
+            for d in range(steps):
+                cost = self.cost[at + d]
+                if k > 0:
+                    best = ti.min(self.line[before + d], least + jump)
+                    best = ti.min(best, self.line[before + ti.max(d - 1, 0)] + SMALL_JUMP)
+                    best = ti.min(best, self.line[before + ti.min(d + 1, steps - 1)] + SMALL_JUMP)
+                    cost += best - least
+                self.line[here + d] = cost
+                lowest = ti.min(lowest, cost)
+                self.paths[at + d] = self.paths[at + d] + cost
+            here, before = before, here
+            least, grey_before = lowest, value
+
+    @ti.kernel
+    def _pick(self, inverse: IMAGE, step: ti.f32, reach: ti.i32, found: IMAGE):
+        """Inverse depth of the least path cost, with a parabola between steps."""
+        steps, width = 2 * reach + 1, inverse.shape[1]
+        for i in range(inverse.shape[0] * width):
+            y, x = i // width, i % width
+            best, at = 0, i * steps
+            for d in range(1, steps):
+                if self.paths[at + d] < self.paths[at + best]:
+                    best = d
+            best = ti.min(ti.max(best, 1), steps - 2)
+            left, middle, right = self.paths[at + best - 1], self.paths[at + best], self.paths[at + best + 1]
+            curvature = ti.max(left + right - 2.0 * middle, 1e-6)
+            offset = ti.min(ti.max((left - right) / (2.0 * curvature), -0.5), 0.5)
+            found[y, x] = inverse[y, x] + step * (best + offset - reach)
