@@ -15,7 +15,8 @@ from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
 from fields.map.gaussian_motion import GaussianMotion
 from fields.map.gaussians import NO_ANCHOR
-from fields.map.keyframes import NO_MOTION, Keyframe, KeyframeStore
+from fields.map.keyframe import NO_MOTION, Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.paging import Paging
 from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import NO_ANCHOR
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.densify.densifier import Anchor
 from pipelines.online_map import OnlineMap
 from pipelines.render.cpu.photometric_model import IDENTITY

@@ -11,7 +11,8 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
 from pipelines.corrections import CorrectionReport, revise
 from pipelines.densify.adaptive_density import AdaptiveDensity

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines import finished_map, online_state
 from pipelines.corrections import CorrectionReport
 from pipelines.finished_map import FinishedMap

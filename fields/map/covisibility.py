@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 
 __all__ = ["SeenPoints", "covisibility"]
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 
 __all__ = ["KeyframeRows", "keyframe_arrays"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.se3 import camera_centres
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from modp_ti.outputs.detail import explained_detail
 from modp_ti.outputs.lpips import Lpips
 from modp_ti.outputs.still_scores import StillScore, StillScorer

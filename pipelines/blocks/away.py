@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from fields.map.blocks import Boxes, box_of, extent_of, planes_of, seen
 from fields.map.gaussians import GaussianField
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.block_files import BlockError, BlockFiles, StoredBlock, records_of, state_of
 
 __all__ = ["BlockOnDisk", "BlocksOnDisk", "planes_of_views"]

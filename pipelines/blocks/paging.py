@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.blocks import Blocks, Boxes, divide, extent_of, seen
 from fields.map.gaussians import GaussianField
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.away import BlocksOnDisk, planes_of_views
 from pipelines.blocks.groups import grouped
 from pipelines.memory_budget import OBSERVATION, MemoryBudget

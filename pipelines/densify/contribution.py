@@ -4,7 +4,7 @@
 from collections.abc import Iterable
 
 from fields.map.gaussians import GaussianField
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from fields.runtime.engine import ti
 from pipelines.render.renderer import Renderer
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.blocks.paging import Paging
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import SH_C0, GaussianField
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.optimise.exposure import scene_colours
 
 __all__ = ["PointCloud", "initialise", "spacing", "union_of_points"]

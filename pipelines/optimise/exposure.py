@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.optimise.light import DARK, SATURATED, light_changes, resized_vignette
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.cpu.photometric_model import IDENTITY

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from fields.runtime.async_readback import AsyncReadback
 from pipelines.optimise.adam import Adam, LearningRates
 from pipelines.optimise.exposure import ExposureRefinement

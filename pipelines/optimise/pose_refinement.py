@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.pixel_metric import pixel_jacobian, pixel_metric
 from fields.geometry.se3 import exp_se3, log_se3, orthonormalised
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.optimise.safeguards import Safeguards
 
 __all__ = ["PoseRefinement", "reprojection"]

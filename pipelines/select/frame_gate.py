@@ -13,7 +13,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.pixel_metric import pixel_metric
 from fields.geometry.se3 import inverse_se3, log_se3
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from fields.map.trajectory import Trajectory
 from pipelines.render.renderer import Renderer
 from pipelines.settings import GateSettings

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.se3 import inverse_se3
 from fields.map.covisibility import SeenPoints, covisibility
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
 from pipelines.select.sharpness import sharpness
 from pipelines.settings import KeyframeSettings

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.paging import Paging
 from pipelines.render.renderer import RenderedView, Renderer
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes

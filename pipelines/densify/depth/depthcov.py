@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.densify.depth.covariance import nonstationary_matern32, nonstationary_variance
 from pipelines.densify.depth.depthcov_checkpoint import DepthCovWeights
 from pipelines.densify.depth.depthcov_network import STRIDE, pixel_covariances

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from fields.runtime.backend import on_gpu
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 
 __all__ = ["DepthEstimate", "DepthEstimator", "point_depths", "unknown_depth"]
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.densify.depth.estimate import DepthEstimate, DepthEstimator, unknown_depth
 
 __all__ = ["FusedDepth"]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.densify.depth.covariance import matern32
 from pipelines.densify.depth.estimate import DepthEstimate, unknown_depth
 from pipelines.densify.depth.regression import MIN_POINTS, conditioning_points, regress_log_depth

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 
 __all__ = ["misplacement"]
 

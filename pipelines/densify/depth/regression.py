@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.densify.depth.estimate import DepthEstimate, point_depths
 
 __all__ = ["MIN_POINTS", "conditioning_points", "regress_log_depth"]

@@ -10,7 +10,8 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import SH_C0, GaussianField
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from fields.map.occupancy import OccupancyVoxels
 from pipelines.densify.depth import DepthEstimate
 from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds

@@ -6,7 +6,8 @@ import pytest
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import SH_C0, GaussianField
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.densify.point_initialisation import PointCloud, initialise, spacing, union_of_points
 
 CAMERA = PinholeCamera(20.0, 20.0, 8.0, 6.0, 16, 12)

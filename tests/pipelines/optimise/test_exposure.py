@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.online import OnlineMapper
 from pipelines.optimise.exposure import ExposureRefinement, fitted_gains, scene_colours

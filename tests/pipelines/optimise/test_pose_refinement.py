@@ -10,7 +10,8 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.pixel_metric import pixel_metric
 from fields.geometry.se3 import exp_se3, inverse_se3, log_se3
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from fields.runtime.engine import ti
 from pipelines.optimise.losses import PhotometricLoss
 from pipelines.optimise.pose_refinement import PoseRefinement, reprojection

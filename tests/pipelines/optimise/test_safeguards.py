@@ -7,7 +7,7 @@ import pytest
 
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import GaussianField
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from pipelines.optimise.adam import Adam
 from pipelines.optimise.pose_refinement import PoseRefinement
 from pipelines.optimise.safeguards import Safeguards

@@ -14,7 +14,7 @@ from torch.nn.functional import conv2d
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, torch_exp_se3
 from fields.map.gaussians import SH_C0, GaussianField
-from fields.map.keyframes import Keyframe
+from fields.map.keyframe import Keyframe
 from fields.runtime.backend import initialise
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.render.rasterize import RasterizedView, rasterize

@@ -11,7 +11,8 @@ from scipy.ndimage import map_coordinates
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.densify.depth import DepthCov, load_depthcov
 from pipelines.densify.depth.depthcov_checkpoint import DepthCovWeights
 from pipelines.settings import DepthSettings

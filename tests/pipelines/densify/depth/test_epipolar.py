@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fields.geometry.se3 import inverse_se3
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.densify.depth import EpipolarDepth
 from pipelines.densify.depth.epipolar import OUTSIDE, RADIUS
 from pipelines.densify.depth.plane_sweep import plane_warp

@@ -5,7 +5,8 @@ import pytest
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from pipelines.densify.depth import GaussianProcessDepth, ImageGuidedDepth
 from pipelines.settings import DepthSettings
 

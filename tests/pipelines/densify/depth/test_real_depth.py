@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fields.frames.tracked_frame import SparsePoints
-from fields.map.keyframes import Keyframe, KeyframeStore
+from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
 from modp_ti.config.settings import SceneConfig, SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings
 from modp_ti.inputs.trackers import open_tracker
