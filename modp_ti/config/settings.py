@@ -15,7 +15,8 @@ from pydantic import Field, field_validator, model_validator
 from fields.runtime.parallel import available_cores
 from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
-from modp_ti.config.tracker_settings import AnyTrackerSettings, GivenPosesSettings
+from modp_ti.config.tracker_base_settings import GivenPosesSettings
+from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
 from pipelines.offline_settings import OfflineSettings
 from pipelines.settings import MappingSettings, RefineSettings, StrictModel

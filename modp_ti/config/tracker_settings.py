@@ -7,112 +7,46 @@ To add a kind, write its model here, add it to `AnyTrackerSettings`, and open it
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from pipelines.settings import StrictModel
+from modp_ti.config.capture_settings import (
+    ArkitScenesSettings,
+    BagSettings,
+    EurocSettings,
+    KittiSettings,
+    NerfCaptureSettings,
+    PolycamSettings,
+    Record3dSettings,
+    ScannerAppSettings,
+    ScanNetSettings,
+    StrayScannerSettings,
+)
+from modp_ti.config.tracker_base_settings import (
+    GivenPosesSettings,
+    RecordedSettings,
+    TimedPosesSettings,
+    TrackerSettings,
+)
 
 __all__ = [
     "AnyTrackerSettings",
     "AriaSettings",
-    "ArkitScenesSettings",
-    "BagSettings",
-    "CaptureSettings",
     "ColmapSettings",
-    "DepthCaptureSettings",
-    "EurocSettings",
-    "GivenPosesSettings",
-    "KittiSettings",
     "KltSettings",
     "MatricesSettings",
     "ModpSettings",
-    "NerfCaptureSettings",
     "OrbSlam3Settings",
-    "PolycamSettings",
-    "Record3dSettings",
-    "RecordedSettings",
     "ReplicaSettings",
-    "ScanNetSettings",
-    "ScannerAppSettings",
     "SevenScenesSettings",
     "SfmSettings",
     "SocketSettings",
     "StellaVslamSettings",
-    "StrayScannerSettings",
     "TanksAndTemplesSettings",
-    "TimedPosesSettings",
-    "TrackerSettings",
     "TransformsSettings",
     "TumSettings",
 ]
-
-
-class TrackerSettings(StrictModel):
-    """Base class of all tracker settings, with the properties of a kind that other sections depend on."""
-
-    # Each kind narrows it to one literal. Declared here so that it is the first key in `config.yaml` and in the docs.
-    kind: Any
-
-    needs_source: ClassVar[bool] = True
-    """Whether the images come from `source`; other trackers provide their own."""
-    brings_cameras: ClassVar[bool] = False
-    """Whether the tracker provides the camera of every image, so that `source.intrinsics` must be empty."""
-    follows_streams: ClassVar[bool] = False
-    """Whether the tracker works on a live `source.stream`, whose images are not known in advance."""
-    is_live: ClassVar[bool] = False
-    """Whether the frames arrive from another program and cannot be read again after the run."""
-    places_panoramas: ClassVar[bool] = False
-    """Whether the tracker has poses of images that see all round, which `source.panorama` cuts into faces."""
-
-
-class RecordedSettings(TrackerSettings):
-    """Base class for trackers that read the results of earlier tracking from files."""
-
-    # Each kind describes its file and the default places in its own `description`.
-    path: Path | None = None
-
-
-class TimedPosesSettings(RecordedSettings):
-    """Base class for trackers that match poses with images by time stamp."""
-
-    max_difference: float = Field(
-        default=0.02, gt=0, description="largest difference [s] between the times of an image and its pose"
-    )
-    time_offset: float = Field(
-        default=0.0, description="offset [s] added to the times of the poses, if their clock differs from the images'"
-    )
-
-
-class GivenPosesSettings(RecordedSettings):
-    """Base class for trackers whose file contains poses but no points."""
-
-    adjusts_by_default: ClassVar[bool] = False
-
-    points: Path | None = Field(
-        default=None,
-        description="world points: PLY, or text with `x y z` per line; empty: features are tracked and triangulated "
-        "with the poses",
-    )
-    adjust: bool | None = Field(
-        default=None,
-        description="without `points`: bundle adjust the poses with the triangulated points before the first frame. "
-        "Use it for poses of another sensor or with errors of more than a pixel. Empty: false",
-    )
-    max_points: int = Field(
-        default=2000, ge=10, description="largest number of points of a frame that are taken from `points`"
-    )
-
-    @property
-    def adjusts(self) -> bool:
-        """Whether the poses are adjusted before the first frame."""
-        return self.adjusts_by_default if self.adjust is None else self.adjust
-
-    @model_validator(mode="after")
-    def _only_triangulated_points_can_adjust(self) -> GivenPosesSettings:
-        if self.adjust and self.points is not None:
-            raise ValueError("tracker.adjust cannot be used with tracker.points; remove one of them")
-        return self
 
 
 class ColmapSettings(RecordedSettings):
@@ -313,128 +247,6 @@ class SevenScenesSettings(GivenPosesSettings):
         default=None,
         description="without `points`: bundle adjust the poses with the triangulated points before the first frame. "
         "Empty: true, since the poses are those of the depth camera",
-    )
-
-
-class CaptureSettings(TrackerSettings):
-    """Base class for captures, whose cameras and poses come with the images of `source.path`."""
-
-    brings_cameras: ClassVar[bool] = True
-
-    adjust: bool = Field(
-        default=False,
-        description="bundle adjust the poses with triangulated points before the first frame: for poses with errors of "
-        "more than a pixel",
-    )
-
-
-class DepthCaptureSettings(CaptureSettings):
-    """Base class for captures with depth maps."""
-
-    depth: bool = Field(
-        default=True,
-        description="take the tracked points from the depth maps, where there are some; false, and with `adjust`: "
-        "triangulate them",
-    )
-    max_points: int = Field(default=400, ge=10, description="largest number of points of a frame from its depth map")
-    max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] that is used")
-
-
-class Record3dSettings(DepthCaptureSettings):
-    """A capture of Record3D."""
-
-    kind: Literal["record3d"] = Field(
-        default="record3d", description="a capture of Record3D, `.r3d` or its export of EXR and RGB files"
-    )
-
-
-class ScannerAppSettings(DepthCaptureSettings):
-    """A capture of 3D Scanner App."""
-
-    kind: Literal["scanner_app"] = Field(
-        default="scanner_app", description='a capture of 3D Scanner App, exported as "All Data"'
-    )
-
-
-class StrayScannerSettings(DepthCaptureSettings):
-    """A capture of Stray Scanner."""
-
-    kind: Literal["stray_scanner"] = Field(default="stray_scanner", description="a capture of Stray Scanner")
-
-
-class PolycamSettings(DepthCaptureSettings):
-    """A raw export of Polycam."""
-
-    kind: Literal["polycam"] = Field(default="polycam", description="a raw export of Polycam, a folder or zip")
-
-
-class NerfCaptureSettings(CaptureSettings):
-    """A capture of NeRFCapture."""
-
-    kind: Literal["nerfcapture"] = Field(default="nerfcapture", description="a capture of NeRFCapture, a folder or zip")
-
-
-class EurocSettings(CaptureSettings):
-    """A sequence in EuRoC's layout."""
-
-    kind: Literal["euroc"] = Field(default="euroc", description="the true poses of a sequence in EuRoC's layout")
-
-
-class KittiSettings(CaptureSettings):
-    """A sequence of KITTI odometry."""
-
-    kind: Literal["kitti"] = Field(default="kitti", description="the true poses of a sequence of KITTI odometry")
-
-
-class ScanNetSettings(DepthCaptureSettings):
-    """A scene of ScanNet."""
-
-    kind: Literal["scannet"] = Field(default="scannet", description="the poses of a scene of ScanNet")
-
-
-class ArkitScenesSettings(DepthCaptureSettings):
-    """A scene of ARKitScenes."""
-
-    kind: Literal["arkitscenes"] = Field(default="arkitscenes", description="the poses of a scene of ARKitScenes")
-
-
-class BagSettings(TrackerSettings):
-    """Poses and points of a ROS bag."""
-
-    kind: Literal["bag"] = Field(default="bag", description="the poses of a ROS bag")
-    pose: str | None = Field(
-        default=None,
-        description="topic of the poses (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped), or `tf` "
-        "for the transforms alone; empty: the first topic of these types, or else `tf`",
-    )
-    world: str | None = Field(
-        default=None, description="frame of the map; empty: that of the poses, or the root of the transforms"
-    )
-    body: str | None = Field(
-        default=None,
-        description="frame that the poses are of; empty: the messages' child_frame_id, or else that of the camera",
-    )
-    camera: str | None = Field(
-        default=None,
-        description="frame of the camera, with z forward and y down (the optical frame); empty: that of the images",
-    )
-    max_gap: float = Field(
-        default=0.5,
-        gt=0,
-        description="largest time [s] between two poses, or two transforms, between which an image may lie",
-    )
-    points: str | None = Field(
-        default=None,
-        description="topic of the points (PointCloud2), or `none` to triangulate them; empty: the first such topic, if "
-        "there is one",
-    )
-    max_points: int = Field(
-        default=2000, ge=10, description="largest number of points of a frame that are taken from the clouds"
-    )
-    adjust: bool = Field(
-        default=False,
-        description="bundle adjust the poses with triangulated points before the first frame: for poses with errors of "
-        "more than a pixel",
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from modp_ti.config import tracker_settings as kinds
+from modp_ti.config.capture_settings import CaptureSettings
 from modp_ti.inputs.protocol import Progress, Tracker
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def _opened(config: SceneConfig, progress: Progress | None) -> Tracker:
             from modp_ti.inputs.trackers.data_sets import open_sevenscenes
 
             return open_sevenscenes(source, tracker, progress)
-        case kinds.CaptureSettings() as tracker:
+        case CaptureSettings() as tracker:
             from modp_ti.inputs.trackers.captures import open_capture
 
             return open_capture(source, tracker, progress)

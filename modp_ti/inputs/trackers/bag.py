@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_poses
+from modp_ti.config.capture_settings import BagSettings
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import BagSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bags.bag import CLOUD, POSES
 from modp_ti.inputs.bags.clouds import world_points

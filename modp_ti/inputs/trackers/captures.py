@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from modp_ti.config.capture_settings import CaptureSettings, DepthCaptureSettings
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import CaptureSettings, DepthCaptureSettings
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame
 from modp_ti.inputs.captures.depth_maps import depth_points

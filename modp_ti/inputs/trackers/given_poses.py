@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import GivenPosesSettings
+from modp_ti.config.tracker_base_settings import GivenPosesSettings
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import GivenPosesSettings, MatricesSettings, TanksAndTemplesSettings
+from modp_ti.config.tracker_base_settings import GivenPosesSettings
+from modp_ti.config.tracker_settings import MatricesSettings, TanksAndTemplesSettings
 from modp_ti.files import LARGEST, input_lines
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import NumberRows, read_number_rows

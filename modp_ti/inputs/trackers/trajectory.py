@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import TimedPosesSettings
+from modp_ti.config.tracker_base_settings import TimedPosesSettings
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.files.trajectory import read_tum_rows, tum_poses
 from modp_ti.inputs.sources import ImageSource

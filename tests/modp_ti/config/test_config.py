@@ -212,7 +212,7 @@ def test_missing_key_is_named_with_its_meaning(scene, text, parts):
             "{kind: colmap, points: x}",
             [
                 "unknown key `tracker.points`",
-                "replica, matrices, tanksandtemples and sevenscenes, not colmap",
+                "replica, matrices, tanksandtemples, sevenscenes and bag, not colmap",
                 "`tracker.path`",
             ],
         ),
@@ -220,7 +220,7 @@ def test_missing_key_is_named_with_its_meaning(scene, text, parts):
             "{kind: klt, path: x}",
             ["unknown key `tracker.path`", "not klt, which has `tracker.loops`, `tracker.maps`; take it out"],
         ),
-        ("{kind: tum, camera: x}", ["`tracker.camera`: it is for tracker.kind: aria, not tum"]),
+        ("{kind: tum, camera: x}", ["`tracker.camera`: it is for tracker.kind: aria and bag, not tum"]),
         ("{kind: replica, time_offset: 1}", ["`tracker.time_offset`"]),
         ("{kind: colmap, adress: x}", ["did you mean `tracker.address`, which is for tracker.kind: socket?"]),
         ("{points: x, pth: y}", ["unknown key `tracker.pth`; did you mean `tracker.path`?"]),
