@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fields.map.blocks import divide, extent_of
 from pipelines.blocks.merging import merged
 
-__all__ = ["LEVELS", "Hierarchy", "Level"]
+__all__ = ["LEVELS", "Hierarchy", "Level", "side_of"]
 
 # Number of levels below the map itself. Each has cells of twice the side of the one above.
 LEVELS = 4
@@ -68,7 +68,7 @@ class Hierarchy:
 
     def __init__(self, values: Mapping[str, NDArray]) -> None:
         position = values["position"].astype(np.float64)
-        self.side = _side(position)
+        self.side = side_of(position, IN_FIRST_CELL)
         self.blocks = divide(position, extent_of(values["log_scale"]), self.side * 2 ** (LEVELS - 1))
         self._levels = [Level(values, self.blocks.members, self.blocks.first)]
 
@@ -138,9 +138,9 @@ class Hierarchy:
         return Level(values, np.arange(first[-1]), first)
 
 
-def _side(position: NDArray[np.float64]) -> float:
-    """Side of cells that hold about `IN_FIRST_CELL` positions (N, 3) of surfaces. Outliers do not count."""
+def side_of(position: NDArray[np.float64], each: int) -> float:
+    """Return the side of cubes that hold about `each` positions (N, 3) of surfaces. Outliers do not count."""
     if len(position) == 0:
         return 1.0
     low, high = np.quantile(position, [0.02, 0.98], axis=0)
-    return float(np.prod(np.sort(high - low)[1:]) * IN_FIRST_CELL / len(position)) ** 0.5 or 1.0
+    return float(np.prod(np.sort(high - low)[1:]) * each / len(position)) ** 0.5 or 1.0

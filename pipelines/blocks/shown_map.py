@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
-from fields.map.blocks import planes_of, seen
+from fields.map.blocks import Blocks, divide, extent_of, planes_of, seen
 from fields.map.gaussians import GaussianField
-from pipelines.blocks.hierarchy import Hierarchy
+from pipelines.blocks.hierarchy import Hierarchy, side_of
 
 __all__ = ["ShownMap"]
+
+# Number of Gaussians of a block, about.
+GAUSSIANS_EACH = 50
 
 
 class ShownMap:
@@ -32,7 +35,12 @@ class ShownMap:
     def __init__(self, gaussians: GaussianField, values: Mapping[str, NDArray]) -> None:
         self.gaussians = gaussians
         self.values = dict(values)
-        self._hierarchy = None if self.fits else Hierarchy(self.values)
+        self._blocks: Blocks | None = None
+        self._hierarchy: Hierarchy | None = None
+        if not self.fits:
+            position = self.values["position"].astype(np.float64)
+            # Smaller blocks than those of the hierarchy, of which views see less in vain.
+            self._blocks = divide(position, extent_of(self.values["log_scale"]), side_of(position, GAUSSIANS_EACH))
 
     @property
     def fits(self) -> bool:
@@ -46,12 +54,19 @@ class ShownMap:
             camera: The view's camera.
             T_camera_world: Its pose (4, 4).
         """
-        if self._hierarchy is None:
+        blocks = self._blocks
+        if blocks is None:
             self.gaussians.load(self.values)
             return
-        hierarchy = self._hierarchy
         planes = planes_of(camera, T_camera_world, np.inf)[None]
-        chosen = np.flatnonzero(seen(planes, hierarchy.blocks.boxes)[0])
+        chosen = np.flatnonzero(seen(planes, blocks.boxes)[0])
+        if blocks.counts[chosen].sum() <= self.gaussians.capacity:
+            members = np.concatenate([np.zeros(0, dtype=np.int64), *(blocks.of(block) for block in chosen.tolist())])
+            self.gaussians.load({name: array[members] for name, array in self.values.items()})
+            return
+        if self._hierarchy is None:
+            self._hierarchy = Hierarchy(self.values)
+        chosen = np.flatnonzero(seen(planes, self._hierarchy.blocks.boxes)[0])
         eye = inverse_se3(T_camera_world)[:3, 3]
-        levels = hierarchy.levels_for(chosen, eye, camera.fx, self.gaussians.capacity)
-        self.gaussians.load(hierarchy.gaussians(chosen, levels))
+        levels = self._hierarchy.levels_for(chosen, eye, camera.fx, self.gaussians.capacity)
+        self.gaussians.load(self._hierarchy.gaussians(chosen, levels))

@@ -51,16 +51,17 @@ def test_from_afar_merged_gaussians_look_as_the_whole_map(values: dict[str, np.n
     initialise("cpu")
     few, many = GaussianField(0, 1024), GaussianField(0, 4096)
     T = exp_se3([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])
-    pictures = []
+    pictures, renderers = [], {}
     for field in (many, few):
         ShownMap(field, values).show(CAMERA, T)
-        pictures.append(Renderer(field, CAMERA.width, CAMERA.height).render(CAMERA, T, 0.01).colour)
+        renderers[field] = Renderer(field, CAMERA.width, CAMERA.height)
+        pictures.append(renderers[field].render(CAMERA, T, 0.01).colour)
     assert len(many) == 3000 and 300 < len(few) <= 1024
     whole, merged = (np.clip(picture, 0.0, 1.0) for picture in pictures)
     shown = whole.max(axis=2) > 0.02
     # A third of the Gaussians, chosen at random, are what it has to be better than.
     third = np.random.default_rng(0).permutation(3000)[: len(few)]
     many.load({name: array[third] for name, array in values.items()})
-    chosen = np.clip(Renderer(many, CAMERA.width, CAMERA.height).render(CAMERA, T, 0.01).colour, 0.0, 1.0)
+    chosen = np.clip(renderers[many].render(CAMERA, T, 0.01).colour, 0.0, 1.0)
     errors = [float(np.mean((picture - whole)[shown] ** 2)) for picture in (merged, chosen)]
     assert 4.0 * errors[0] < errors[1]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import builtins
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import urlparse
 from urllib.request import urlopen
 
@@ -126,28 +126,20 @@ def test_a_browser_that_does_not_listen_neither_blocks_nor_fills_the_memory(page
         assert grown < 60e6  # of 128 MB that were shown
 
 
-def test_a_browser_has_splats_of_its_own_until_it_leaves(page: Page):
-    from websockets.sync.client import connect
-
-    one = np.zeros((1, 3), dtype=np.uint8)
-    splats = Splats(np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[None], one, one[:, :1], 5)
-    address = page.url.replace("http", "ws")
-    with connect(address, subprotocols=[f"viser-v{viser_version()}"], max_size=None):
-        until(lambda: len(page._server.get_clients()) == 1)
-        (client,) = page._server.get_clients()
-        page.show_splats(splats, client + 1)  # one that has left meanwhile
-        assert not page._splats
-        page.show_splats(splats, client)
-        page.show_splats(splats, client)
-        assert list(page._splats) == [client]
-    until(lambda: not page._splats)
-
-
-def until(happened: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not happened():
-        assert time.monotonic() < end
-        time.sleep(0.02)
+def test_a_browser_has_splats_of_its_own_until_it_leaves(page: Page, monkeypatch: pytest.MonkeyPatch):
+    grey = np.zeros((2, 3), dtype=np.uint8)
+    splats = Splats(np.zeros((2, 3), np.float32), np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)), grey, grey[:, :1], 5)
+    browser = SimpleNamespace(client_id=7, scene=page._server.scene)
+    monkeypatch.setattr(page._server, "get_clients", lambda: {7: browser})
+    page.show_splats(splats, 8)  # one that has left meanwhile
+    assert not page._splats
+    page.show_splats(splats, 7)
+    node = page._splats[7]
+    page.show_splats(splats, 7)
+    assert page._splats == {7: node} and node.visible
+    assert page._note.content == "2 of 5 Gaussians drawn"
+    page._disconnected(browser)
+    assert not page._splats
 
 
 def viser_version() -> str:
