@@ -15,7 +15,7 @@ __all__ = ["EXAMPLES", "export"]
 EXAMPLES = examples(
     "modp-ti export out/room --format html   (one page for a friend)",
     "modp-ti export out/room --format mesh   (out/room/mesh.ply)",
-    "modp-ti export out/room --format mesh --texture   (for browsers and game engines: out/room/mesh.glb)",
+    "modp-ti export out/room --format mesh --texture   (out/room/mesh.glb)",
     "modp-ti export out/room --format spz   (splats, 1/5 to 1/4 of the size)",
     "modp-ti export out/room --format nerfstudio -o data/room",
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -123,7 +123,12 @@ class Bag:
                     raise InputError(f"{file}: SQLite cannot open a path with ?, # or %: rename it (source.path)")
                 with self._damaged(file):
                     reader = (Reader1 if self._first else Reader2)(_SafePath(file))
-                    reader.open()
+                    try:
+                        reader.open()
+                    except Exception:
+                        with suppress(Exception):  # it may not have got as far as a file
+                            reader.close()
+                        raise
                     self._readers.append(reader)
             with self._damaged(path):
                 self.topics = {c.topic: c.msgtype for r in self._readers for c in r.connections if c.msgcount > 0}

@@ -86,7 +86,7 @@ def test_a_bag_without_poses_is_tracked_by_its_images(views, tmp_path, opened):
     images = open_source(SourceSettings(path=path))
     np.testing.assert_array_equal(images.read("room_000001"), views[1].image[..., ::-1])
     np.testing.assert_array_equal(images.read("room_000000"), views[0].image[..., ::-1])
-    with pytest.raises(InputError, match=r"no transform leads from 'optical'"):
+    with pytest.raises(InputError, match=r"holds no poses: set tracker.kind: klt"):
         opened(path, world="odom")
     images.close()
 
