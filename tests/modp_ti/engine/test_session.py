@@ -22,6 +22,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.engine import session
 from modp_ti.engine.build import build_mapper
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import summary
 from modp_ti.outputs.formats.scores_csv import read_scores
@@ -279,6 +280,9 @@ class DeafMapper:
     pipeline = DeafPipeline()
     frames = ()
 
+    def takes(self, width, height) -> bool:
+        return True
+
     def add(self, frame) -> None: ...
 
     def finish(self, progress) -> None: ...
@@ -306,6 +310,7 @@ def test_a_realtime_run_makes_a_larger_mapper_only_for_images_larger_than_expect
         return build_mapper(config, camera, pace)
 
     monkeypatch.setattr(session, "EXPECTED", PinholeCamera(1.0, 1.0, 8.0, 8.0, expected, expected))
+    monkeypatch.setattr(ReplayedTracker, "largest", (0, 0))  # a live tracker does not know
     monkeypatch.setattr(session, "build_mapper", noted)
     output = session.run_scene(load_scene(scene, ["mapping.pace=realtime"]))
     assert sides == made
