@@ -150,5 +150,5 @@ def test_the_page_shows_the_lag_that_the_session_records(run: tuple[subprocess.P
     with zipfile.ZipFile(tmp_path / "out" / "session.zip") as session:
         lag = json.loads(session.read("about.json"))["lag"]
     shown.pop(0, None)
-    assert len(shown) > 3
+    assert len(shown) >= 3  # the frames of the steps; whether one after them is seen hangs on the machine
     assert shown == {number: f"{lag[number - 1]:.1f}" for number in shown}
