@@ -139,7 +139,7 @@ def test_the_page_shows_the_lag_that_the_session_records(run: tuple[subprocess.P
     shown: dict[int, str] = {}
     with screenshot.open_page(url) as page:
         wait_until(page, lambda: shown_lag(page)[0] == 1)
-        for number in (2, 3, 4):  # the stream goes on meanwhile, so that each frame is later than the one before
+        for number in (2, 3, 4, 5):  # the stream goes on meanwhile, so that each frame is later than the one before
             page.get_by_role("button", name="Step").click()
             wait_until(page, lambda number=number: shown_lag(page)[0] == number)
             shown.update([shown_lag(page)])
@@ -150,5 +150,5 @@ def test_the_page_shows_the_lag_that_the_session_records(run: tuple[subprocess.P
     with zipfile.ZipFile(tmp_path / "out" / "session.zip") as session:
         lag = json.loads(session.read("about.json"))["lag"]
     shown.pop(0, None)
-    assert len(shown) >= 3  # the frames of the steps; whether one after them is seen hangs on the machine
+    assert len(shown) > 3
     assert shown == {number: f"{lag[number - 1]:.1f}" for number in shown}
