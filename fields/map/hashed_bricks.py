@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.bricks import BRICK_LEVELS, WORDS, Bricks, corner_of, depth_reached, place_of
+from fields.map.bricks import WORDS, Bricks, depth_reached, place_of, without_repetitions
 from fields.runtime.engine import dense_array, ti
 
 __all__ = ["HashedBricks"]
@@ -67,15 +67,12 @@ class HashedBricks(Bricks):
 
     def mark(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> None:
         """Mark each cell, from its level up to the coarsest. All cells lie in the range of some level."""
-        first = self.depth_reached(cells, level) // BRICK_LEVELS
-        self._add(np.concatenate([corner_of(cells[first <= stack], stack) for stack in range(self.stacks)]))
+        self._add(self.corners_to_mark(cells, level))
         _mark(self._table, self._corners, self._halves, self.levels, cells, level)
 
     def _add(self, corners: NDArray[np.int32]) -> None:
         """Allocate the bricks with these corners (N, 3) that are not allocated yet."""
-        x, y, z = corners.astype(np.int64).T
-        key = np.unique((x << 32) | (y << 16) | z)
-        corners = np.stack([key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF], axis=1).astype(np.int32)
+        corners = without_repetitions(corners)
         missing = np.empty(len(corners), dtype=np.int32)
         _find_missing(self._table, self._corners, corners, missing)
         corners = corners[missing != 0]

@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.bricks import BRICK_LEVELS, BRICKS, WORDS, Bricks, depth_reached, place_of
+from fields.map.bricks import BRICK_LEVELS, BRICKS, WORDS, Bricks, depth_reached, place_of, without_repetitions
 from fields.runtime.backend import on_gpu, refuse_too_many_fields
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
@@ -30,6 +30,11 @@ class SparseBricks(Bricks):
     The stacks share one tree, because every additional tree takes address space, of which Taichi 1.7.4 handles only the
     first GB well.
 
+    On CUDA, a node must not be activated in the launch that writes below it. The engine reads the pointers of a node
+    through the multiprocessor's own cache, which may still hold that of a node without children; the write then goes to
+    the element that stands for all inactive ones. On an H100, 3 of 2,265 words were lost so, and other bricks seemed to
+    be marked. Hence the bricks of a batch are activated before, level by level.
+
     Args:
         levels: Number of levels.
     """
@@ -39,11 +44,11 @@ class SparseBricks(Bricks):
         self.words = ti.field(ti.u64)
         outer, *inner = POINTERS
         builder = ti.FieldsBuilder()
-        node = builder.pointer(ti.ijk, (outer * self.stacks, outer, outer))
+        self._nodes = [builder.pointer(ti.ijk, (outer * self.stacks, outer, outer))]
         for fan_out in inner:
-            node = node.pointer(ti.ijk, (fan_out,) * 3)
-        node.dense(ti.l, WORDS).place(self.words)
-        self._bricks = node
+            self._nodes.append(self._nodes[-1].pointer(ti.ijk, (fan_out,) * 3))
+        self._bricks = self._nodes[-1]
+        self._bricks.dense(ti.l, WORDS).place(self.words)
         self._next = ti.field(ti.i32)
         builder.place(self._next)
         builder.finalize()
@@ -69,6 +74,8 @@ class SparseBricks(Bricks):
 
     def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
         """Set words (M,) at their places (M, 4): the brick's corner and the word in the brick."""
+        if on_gpu():
+            self._activate(without_repetitions(places[:, :3]))
         self._write(places, words)
 
     def query(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -79,6 +86,8 @@ class SparseBricks(Bricks):
 
     def mark(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> None:
         """Mark each cell, from its level up to the coarsest. All cells lie in the range of some level."""
+        if on_gpu():
+            self._activate(without_repetitions(self.corners_to_mark(cells, level)))
         self._mark(cells, level)
 
     def admit(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -113,6 +122,14 @@ class SparseBricks(Bricks):
             corners[row, 0], corners[row, 1], corners[row, 2] = i, j, k
             for word in range(WORDS):
                 words[row, word] = self.words[i, j, k, word]
+
+    @ti.kernel
+    def _activate(self, corners: CELLS):
+        # Each loop is a launch of its own, so that a level sees the nodes of the level above.
+        for node in ti.static(range(len(POINTERS))):
+            for i in range(corners.shape[0]):
+                corner = ti.Vector([corners[i, 0], corners[i, 1], corners[i, 2]])
+                ti.activate(self._nodes[node], corner // ti.static(int(np.prod(POINTERS[node + 1 :]))))
 
     @ti.kernel
     def _write(self, places: CELLS, words: ti.types.ndarray(dtype=ti.u64, ndim=1)):
