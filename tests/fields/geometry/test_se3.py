@@ -16,6 +16,7 @@ from fields.geometry.se3 import (
     matrix_from_quaternion,
     orthonormalised,
     quaternion_from_matrix,
+    quaternions_from_matrices,
     torch_exp_se3,
 )
 
@@ -71,6 +72,12 @@ def test_quaternions_are_those_of_scipy(seed: int) -> None:
     x, y, z, w = rotation.as_quat()
     np.testing.assert_allclose(q * np.sign(q @ [w, x, y, z]), [w, x, y, z], atol=1e-9)
     np.testing.assert_allclose(matrix_from_quaternion(-3.0 * q), rotation.as_matrix(), atol=1e-9)
+
+
+def test_one_quaternion_is_that_of_many() -> None:
+    """To the last bit, since both are used for the same poses."""
+    matrices = Rotation.random(1000, rng=0).as_matrix()
+    np.testing.assert_array_equal([quaternion_from_matrix(R) for R in matrices], quaternions_from_matrices(matrices))
 
 
 def test_the_nearest_motion_of_a_motion_with_noise_is_a_motion() -> None:
