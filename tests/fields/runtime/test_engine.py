@@ -100,3 +100,33 @@ def test_no_other_module_imports_an_engine() -> None:
             if {name.partition(".")[0] for name in names} & set(ENGINES):
                 importing.add(path)
     assert importing == {DOOR}
+
+
+def test_attributes_of_data_oriented_objects_are_looked_up_by_python_itself(taichi_on_the_cpu: None) -> None:
+    """A function in Python for every attribute took the host 0.3 ms a step."""
+
+    @module.ti.data_oriented
+    class Doubled:
+        def __init__(self) -> None:
+            self.x = module.ti.field(module.ti.f32, shape=2, needs_grad=True)
+            self.y = module.ti.field(module.ti.f32, shape=2, needs_grad=True)
+
+        @module.ti.kernel
+        def double(self):
+            for i in self.x:
+                self.y[i] = 2.0 * self.x[i]
+
+        @property
+        def total(self) -> float:
+            return float(self.y.to_numpy().sum())
+
+    @module.ti.data_oriented
+    class Inherited(Doubled):
+        pass
+
+    assert Inherited.__getattribute__ is object.__getattribute__
+    doubled = Inherited()
+    doubled.x[0], doubled.y.grad[0] = 3.0, 5.0
+    doubled.double()
+    doubled.double.grad()
+    assert (doubled.total, doubled.x.grad[0]) == (6.0, 10.0)
