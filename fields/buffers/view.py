@@ -53,20 +53,14 @@ class ViewField:
             near: Depth below which nothing is drawn [scene units].
         """
         T = np.asarray(T_camera_world, dtype=np.float64)
-        margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
-        margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
-        values = np.concatenate(
-            [
-                T[:3, :3].ravel(),
-                T[:3, 3],
-                [camera.fx, camera.fy, camera.cx, camera.cy],
-                [-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x],
-                [-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y],
-                [near],
-            ]
-        )
-        self.width, self.height = camera.width, camera.height
-        self._write(without_waiting(values.astype(self.dtype)), camera.width, camera.height)
+        fx, fy, cx, cy, width, height = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+        margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
+        limits = (-cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y)
+        values = np.empty(21, dtype=self.dtype)
+        values[:9], values[9:12] = T[:3, :3].reshape(9), T[:3, 3]
+        values[12:] = (fx, fy, cx, cy, *limits, near)
+        self.width, self.height = width, height
+        self._write(without_waiting(values), width, height)
 
     @ti.kernel
     def _set(self, values: ti.types.ndarray(), width: ti.i32, height: ti.i32):

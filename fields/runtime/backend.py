@@ -184,8 +184,8 @@ def torch_device() -> torch.device:
 def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
     """Prepare a small array as a read-only kernel argument, so that the launch does not wait for the device.
 
-    On CUDA, the engine copies NumPy arrays to the device and back and waits for both. Passing the values as scalars
-    takes eight microseconds each.
+    On CUDA, the engine copies NumPy arrays to the device and back and waits for both. The driver takes a copy of a
+    small array at once, so that the array may change after this call; pinned memory would have to be kept until then.
 
     Args:
         array: The array.
@@ -195,7 +195,7 @@ def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
     """
     if configuration().arch != ti.cuda:
         return array
-    return torch.from_numpy(array).pin_memory().to("cuda", non_blocking=True)
+    return torch.from_numpy(array).to("cuda", non_blocking=True)
 
 
 def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:

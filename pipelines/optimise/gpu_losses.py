@@ -88,8 +88,8 @@ class DevicePhotometricLoss(PhotometricLoss):
         values, row = self._values, self._values.written
         width, height = self.images.width, self.images.height
         self._compare(width, height, self._partial)
+        self._totals = values.sums[row]
         self._sum(3 * tile_count(width, height), self._partial, self._totals)
-        values.sums[row] = self._totals
         values.written += 1
         return LossValues(partial(values.row, row))
 

@@ -12,12 +12,14 @@ from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.cpu.projection import Projection
-from pipelines.render.gpu.reductions import THREADS, sum_over_block
+from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, sum_over_block
 
 __all__ = ["DeviceProjection"]
 
 # Sorts after every depth. Not infinity, since Taichi's fast-math assumes that there is none.
 UNSEEN = 3e38
+# Number of blocks that sum the slots' tangents. The host adds their sums, which saves a launch.
+BLOCKS = 64
 
 
 @ti.data_oriented
@@ -32,7 +34,7 @@ class DeviceProjection(Projection):
         self._cull, self._assign = CompiledKernel(self._cull_all), CompiledKernel(self._assign_sorted)
         self._sum_tangents = CompiledKernel(self._sum_all_tangents)
         self._prepare_differentiable()
-        self._tangent = torch.zeros(6, dtype=torch.float32, device=torch_device())
+        self._tangents = torch.zeros((BLOCKS, 6), dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
         """Fill `projected` for the current view.
@@ -57,12 +59,12 @@ class DeviceProjection(Projection):
 
     def camera_gradient(self) -> np.ndarray:
         """Return d loss / d xi (6,) of T_camera_world, summed over slots in a fixed order. Waits for the device."""
-        return self.async_camera_gradient().numpy().astype(np.float64)
+        return self.async_camera_gradient().numpy()
 
     def async_camera_gradient(self) -> AsyncReadback:
-        """Return `camera_gradient` in float32 as an asynchronous copy."""
-        self._sum_tangents(self._tangent)
-        return AsyncReadback(self._tangent)
+        """Return `camera_gradient` as an asynchronous copy."""
+        self._sum_tangents(self._tangents)
+        return AsyncReadback(self._tangents, summed=True)
 
     @ti.kernel
     def _none_seen(self):
@@ -90,15 +92,16 @@ class DeviceProjection(Projection):
                 self.projected.seen[None] = 0
 
     @ti.kernel
-    def _sum_all_tangents(self, out: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+    def _sum_all_tangents(self, out: ti.types.ndarray(dtype=ti.f32, ndim=2)):
         ti.loop_config(block_dim=THREADS)
-        for thread in range(THREADS):
+        for first in range(BLOCKS * THREADS):
+            thread = first & (THREADS - 1)
             partial = ti.simt.block.SharedArray((6 * THREADS,), ti.f32)
             total = ti.Vector.zero(ti.f32, 6)
-            for k in range((self.projected.seen[None] - thread + THREADS - 1) // THREADS):
-                total += self.projected.tangent.grad[thread + k * THREADS]
+            for k in range((self.projected.seen[None] - first + BLOCKS * THREADS - 1) // (BLOCKS * THREADS)):
+                total += self.projected.tangent.grad[first + k * BLOCKS * THREADS]
             for c in ti.static(range(6)):
                 partial[c * THREADS + thread] = total[c]
             sum_over_block(partial, thread, 6)
             if thread < 6:
-                out[thread] = partial[thread * THREADS]
+                out[first >> THREAD_BITS, thread] = partial[thread * THREADS]
