@@ -16,6 +16,7 @@ from modp_ti.inputs.sources.listed_images import decoded
 __all__ = ["DEPTH_ENCODINGS", "is_deep", "is_depth", "is_grey", "picture", "picture_size", "stored_values"]
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 
 
 class Layout(NamedTuple):
@@ -52,26 +53,30 @@ LAYOUTS = {
 """Encodings of sensor_msgs/Image that are read."""
 
 
+def _is_compressed(message: Any) -> bool:
+    return message.__msgtype__ == COMPRESSED
+
+
 def is_depth(message: Any) -> bool:
     """Whether an image message holds depths."""
-    return getattr(message, "encoding", None) in DEPTH_ENCODINGS or "compressedDepth" in getattr(message, "format", "")
+    return "compressedDepth" in message.format if _is_compressed(message) else message.encoding in DEPTH_ENCODINGS
 
 
 def is_grey(message: Any) -> bool:
     """Whether an image message is known to be grey."""
-    stated = getattr(message, "encoding", None) or getattr(message, "format", "")
+    stated = message.format if _is_compressed(message) else message.encoding
     return stated.startswith(("mono", "8UC1"))
 
 
 def is_deep(message: Any) -> bool:
     """Whether an image message has 16 bits per channel."""
-    layout = LAYOUTS.get(getattr(message, "encoding", ""))
+    layout = None if _is_compressed(message) else LAYOUTS.get(message.encoding)
     return layout is not None and layout.dtype == "u2"
 
 
 def picture_size(message: Any) -> tuple[int, int] | None:
     """Return the size (width, height) that an image message states; None if it states none, or is cut off."""
-    if hasattr(message, "encoding"):
+    if not _is_compressed(message):
         return (message.width, message.height) if message.width > 0 and message.height > 0 else None
     header = read_image_header(io.BytesIO(message.data.tobytes()))
     return None if header is None or not header.complete or header.width < 1 else (header.width, header.height)
@@ -89,7 +94,7 @@ def picture(message: Any, bits: int = DEPTHS[-1]) -> NDArray[np.uint8]:
     """
     import cv2
 
-    if not hasattr(message, "encoding"):
+    if _is_compressed(message):
         return _uncompressed(message.data.tobytes())
     layout = LAYOUTS.get(message.encoding)
     if layout is None:

@@ -44,9 +44,8 @@ def read_pose_topic(bag: Bag, topic: str) -> PoseTopic:
 
 def _row(message: Any) -> list[float]:
     time = seconds(message.header.stamp)
-    if hasattr(message, "transform"):
+    if message.__msgtype__ == "geometry_msgs/msg/TransformStamped":
         return pose_row(time, message.transform.translation, message.transform.rotation)
-    pose = message.pose
-    if hasattr(pose, "covariance"):
-        pose = pose.pose
+    # Odometry and PoseWithCovarianceStamped state how certain the pose is.
+    pose = message.pose if message.__msgtype__ == "geometry_msgs/msg/PoseStamped" else message.pose.pose
     return pose_row(time, pose.position, pose.orientation)
