@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import os
 import shutil
@@ -14,7 +13,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
-import msgpack
 import numpy as np
 
 from tests.bags import FORMS
@@ -30,7 +28,6 @@ from tests.fault_injection.small_recording import (
     picture,
     pixels_on,
     points_file,
-    points_ply,
     position,
     scene_file,
     seen_on,
@@ -39,6 +36,25 @@ from tests.fault_injection.small_recording import (
     write_bytes,
     write_images,
     write_text,
+)
+from tests.fault_injection.tracker_samples import (
+    colmap_binary,
+    colmap_text,
+    write_aria,
+    write_colmap_binary,
+    write_colmap_text,
+    write_log,
+    write_matrices,
+    write_modp,
+    write_orbslam3,
+    write_points_ply,
+    write_replica,
+    write_scene,
+    write_sevenscenes,
+    write_stella,
+    write_transforms,
+    write_tum,
+    write_tum_rgbd,
 )
 
 __all__ = ["CAPTURES", "SAMPLES", "SPLATS", "Sample", "write_sample"]
@@ -58,209 +74,6 @@ class Sample:
     arguments: tuple[str, ...] = ("check", "scene.yaml", "--quiet")
 
 
-def _colmap_text(folder: Path, names: list[str] = NAMES) -> None:
-    write_text(folder, "sparse/0/cameras.txt", [f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}"])
-    images, tracks = [], {n: [] for n in range(40)}
-    for i, name in enumerate(names):
-        images.append(f"{i + 1} 1 0 0 0 {-position(i)} 0 0 1 {name}")
-        pixels, seen = pixels_on(i), seen_on(i)
-        images.append(" ".join(f"{pixels[n, 0]:.4f} {pixels[n, 1]:.4f} {n + 1}" for n in seen))
-        for place, n in enumerate(seen):
-            tracks[n].append(f"{i + 1} {place}")
-    write_text(folder, "sparse/0/images.txt", images)
-    points = [
-        f"{n + 1} {x:.6f} {y:.6f} {z:.6f} 200 100 50 0.5 {' '.join(tracks[n])}"
-        for n, (x, y, z) in enumerate(wall())
-        if len(tracks[n]) > 1
-    ]
-    write_text(folder, "sparse/0/points3D.txt", points)
-
-
-def _colmap_binary(folder: Path, names: list[str] = NAMES, inside: str = "sparse/0") -> None:
-    cameras = struct.pack("<QiiQQ4d", 1, 1, 1, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
-    images, tracks = struct.pack("<Q", len(names)), dict.fromkeys(range(40), b"")
-    for i, name in enumerate(names):
-        images += struct.pack("<i7di", i + 1, 1, 0, 0, 0, -position(i), 0, 0, 1) + name.encode() + b"\0"
-        pixels, seen = pixels_on(i), seen_on(i)
-        images += struct.pack("<Q", len(seen)) + b"".join(struct.pack("<ddq", *pixels[n], n + 1) for n in seen)
-        for place, n in enumerate(seen):
-            tracks[n] += struct.pack("<ii", i + 1, place)
-    points = struct.pack("<Q", len(tracks))
-    for n, xyz in enumerate(wall()):
-        points += struct.pack("<Q3d3BdQ", n + 1, *xyz, 200, 100, 50, 0.5, len(tracks[n]) // 8) + tracks[n]
-    for stem, data in (("cameras", cameras), ("images", images), ("points3D", points)):
-        write_bytes(folder, f"{inside}/{stem}.bin", data)
-
-
-def _write_scene(folder: Path) -> None:
-    write_images(folder)
-    _colmap_text(folder)
-    write_text(
-        folder,
-        "scene.yaml",
-        ["source:", "  path: images", "  scale: 1.0", "tracker:", "  kind: colmap", "output: out", "device: cpu"],
-    )
-
-
-def _write_colmap_text(folder: Path) -> None:
-    write_images(folder)
-    _colmap_text(folder)
-    scene_file(folder, "kind: colmap", "path: images")
-
-
-def _write_colmap_binary(folder: Path) -> None:
-    write_images(folder)
-    _colmap_binary(folder)
-    scene_file(folder, "kind: colmap", "path: images")
-
-
-def _write_transforms(folder: Path) -> None:
-    write_images(folder)
-    frames = []
-    for i, name in enumerate(NAMES):
-        rows = [[1.0, 0.0, 0.0, position(i)], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-        frames.append({"file_path": f"images/{name}", "transform_matrix": rows})
-    data = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT, "frames": frames}
-    write_text(folder, "transforms.json", [json.dumps({**data, "ply_file_path": "points.ply"}, indent=1)])
-    write_bytes(folder, "points.ply", points_ply())
-    scene_file(folder, "kind: transforms", "path: images")
-
-
-def _write_tum(folder: Path) -> None:
-    write_images(folder)
-    write_text(folder, "trajectory.txt", ["# time tx ty tz qx qy qz qw", *(tum_line(i) for i in range(FRAMES))])
-    points_file(folder)
-    scene_file(folder, "kind: tum, points: points.txt")
-
-
-def _write_points_ply(folder: Path) -> None:
-    _write_tum(folder)
-    write_bytes(folder, "points.ply", points_ply())
-    scene_file(folder, "kind: tum, points: points.ply")
-
-
-def _write_orbslam3(folder: Path) -> None:
-    write_images(folder)
-    lines = [f"{1400000000000000000 + i * 50000000}.0 {position(i)} 0 0 0 0 0 1" for i in range(FRAMES)]
-    write_text(folder, "CameraTrajectory.txt", lines)
-    points_file(folder)
-    scene_file(folder, "kind: orbslam3, points: points.txt, time_offset: -1400000000.0, max_difference: 0.2")
-
-
-def _write_tum_rgbd(folder: Path) -> None:
-    write_images(folder, inside="rgb")
-    write_text(folder, "rgb.txt", ["# freiburg1", *(f"{i / 30:.6f} rgb/{name}" for i, name in enumerate(NAMES))])
-    write_text(folder, "groundtruth.txt", [tum_line(i) for i in range(FRAMES)])
-    points_file(folder)
-    scene_file(folder, "kind: tum, points: points.txt", f"path: ., kind: tum_rgbd, {INTRINSICS}")
-
-
-def _matrix(i: int) -> list[str]:
-    return [f"1 0 0 {position(i)}", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
-
-
-def _write_replica(folder: Path) -> None:
-    write_images(folder, [f"frame{i:06d}.jpg" for i in range(FRAMES)], "results")
-    write_text(folder, "traj.txt", [" ".join(_matrix(i)) for i in range(FRAMES)])
-    points_file(folder)
-    scene_file(folder, "kind: replica, points: points.txt", f"path: ., kind: replica, {INTRINSICS}")
-
-
-def _write_matrices(folder: Path) -> None:
-    write_images(folder)
-    write_text(folder, "poses.txt", [" ".join(_matrix(i)[:3]) for i in range(FRAMES)])
-    points_file(folder)
-    scene_file(folder, "kind: matrices, points: points.txt")
-
-
-def _write_log(folder: Path) -> None:
-    write_images(folder)
-    write_text(folder, "scene.log", [line for i in range(FRAMES) for line in (f"{i} {i} 0", *_matrix(i))])
-    points_file(folder)
-    scene_file(folder, "kind: tanksandtemples, points: points.txt")
-
-
-def _write_sevenscenes(folder: Path) -> None:
-    write_images(folder, inside="seq")
-    for i in range(FRAMES):
-        write_text(folder, f"seq/frame-{i:06d}.pose.txt", _matrix(i))
-    points_file(folder)
-    scene_file(folder, "kind: sevenscenes, points: points.txt", f"path: seq, kind: sevenscenes, {INTRINSICS}")
-
-
-def _write_modp(folder: Path) -> None:
-    write_images(folder, inside="rectified")
-    cameras = []
-    for i, name in enumerate(NAMES):
-        rows = [[1.0, 0.0, 0.0, -position(i)], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-        cameras.append({"image": name, "T_camera_world": rows})
-        cloud = [" ".join(f"{v:.6f}" for v in row) for row in wall()[seen_on(i)]]
-        if i < 2:
-            write_text(folder, f"point_cloud/point_cloud_{i}.txt", cloud)
-    with (folder / "point_cloud" / "point_cloud_2.npy").open("wb") as file:
-        np.save(file, wall()[seen_on(2)].astype(np.float32))
-    write_text(folder, "trajectory.json", [json.dumps({"cameras": cameras}, indent=1)])
-    scene_file(folder, "kind: modp", f"path: ., kind: release, {INTRINSICS}")
-
-
-def _write_aria(folder: Path) -> None:
-    write_images(folder)
-    axes = [f"{axis}_world_device" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
-    header = ["graph_uid", "tracking_timestamp_us", "utc_timestamp_ns", *axes, "quality_score"]
-    rows = [f"g1,{round(1e6 * i / 30)},0,{position(i)},0,0,0,0,0,1,1.0" for i in range(FRAMES)]
-    write_text(folder, "closed_loop_trajectory.csv", [",".join(header), *rows])
-    mount = {"Translation": [0.0, 0.0, 0.0], "UnitQuaternion": [1.0, [0.0, 0.0, 0.0]]}
-    lines = [
-        json.dumps(
-            {
-                "tracking_timestamp_us": str(round(1e6 * i / 30)),
-                "CameraCalibrations": [{"Label": "camera-rgb", "T_Device_Camera": mount}],
-            }
-        )
-        for i in range(FRAMES)
-    ]
-    write_text(folder, "online_calibration.jsonl", lines)
-    table = ["uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"]
-    table += [f"{n},g1,{x:.5f},{y:.5f},{z:.5f},0.001,0.01" for n, (x, y, z) in enumerate(wall())]
-    write_bytes(folder, "semidense_points.csv.gz", gzip.compress(("\n".join(table) + "\n").encode(), mtime=0))
-    seen = ["uid,frame_tracking_timestamp_us,camera_serial,u,v"]
-    seen += [f"{n},{round(1e6 * i / 30)},c1,1.0,2.0" for i in range(FRAMES) for n in seen_on(i)]
-    write_text(folder, "semidense_observations.csv", seen)
-    scene_file(folder, "kind: aria, path: .")
-
-
-def _stella_map() -> dict:
-    camera = {"model_type": "Perspective", "setup_type": "Monocular", "cols": WIDTH, "rows": HEIGHT, "fps": 30.0}
-    camera |= {"fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2 - 0.5, "cy": HEIGHT / 2 - 0.5}
-    camera |= dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
-    keyframes = {}
-    for i in range(FRAMES):
-        pixels, seen = pixels_on(i), seen_on(i)
-        keyframes[str(i)] = {
-            "ts": i / 30,
-            "cam": "lens",
-            "rot_cw": [0.0, 0.0, 0.0, 1.0],
-            "trans_cw": [-position(i), 0.0, 0.0],
-            "n_keypts": len(seen),
-            "undist_keypts": [{"pt": (pixels[n] - 0.5).tolist(), "ang": 0.0, "oct": 0} for n in seen],
-            "lm_ids": seen.tolist(),
-            "descs": [[1, 2, 3, 4] for _ in seen],
-            "span_parent": -1,
-        }
-    landmarks = {
-        str(n): {"1st_keyfrm": 0, "pos_w": xyz.tolist(), "ref_keyfrm": 0, "n_vis": 3, "n_fnd": 3}
-        for n, xyz in enumerate(wall())
-    }
-    return {"cameras": {"lens": camera}, "orb_params": {}, "keyframes": keyframes, "landmarks": landmarks}
-
-
-def _write_stella(folder: Path) -> None:
-    write_images(folder)
-    write_bytes(folder, "map.msg", msgpack.packb(_stella_map()))
-    write_text(folder, "frame_trajectory.txt", [tum_line(i) for i in range(FRAMES)])
-    scene_file(folder, "kind: stella_vslam, path: map.msg", "path: images")
-
-
 IMAGES = ["0.png", "1.jpg", "2.bmp", "3.tiff", "4.webp", "5.ppm", "6.avif"]
 if find_spec("pillow_heif") is not None:
     IMAGES.append("7.heic")
@@ -268,13 +81,13 @@ if find_spec("pillow_heif") is not None:
 
 def _write_image(folder: Path) -> None:
     write_images(folder, IMAGES)
-    _colmap_text(folder, IMAGES)
+    colmap_text(folder, IMAGES)
     scene_file(folder, "kind: colmap", "path: images")
 
 
 def _write_mask(folder: Path) -> None:
     write_images(folder)
-    _colmap_text(folder)
+    colmap_text(folder)
     for name in NAMES:
         write_bytes(folder, f"masks/{name}", cv2.imencode(".png", np.full((HEIGHT, WIDTH), 255, np.uint8))[1].tobytes())
     light = np.full((HEIGHT, WIDTH), 60000, np.uint16)
@@ -307,8 +120,8 @@ def splats() -> bytes:
 
 def _write_run(folder: Path) -> None:
     """Write the output folder of a finished run, `out`."""
-    _write_colmap_binary(folder)
-    _colmap_binary(folder, inside="out/colmap")
+    write_colmap_binary(folder)
+    colmap_binary(folder, inside="out/colmap")
     write_bytes(folder, "out/splats.ply", splats())
     write_text(folder, "out/trajectory.txt", [tum_line(i) for i in range(FRAMES)])
     write_text(folder, "path.txt", [tum_line(i) for i in range(FRAMES)])
@@ -328,7 +141,7 @@ def _write_run(folder: Path) -> None:
 def _write_weights(folder: Path) -> None:
     import torch
 
-    _write_colmap_text(folder)
+    write_colmap_text(folder)
     torch.save({"lin0.model.1.weight": torch.ones(1, 4, 1, 1)}, folder / "weights.pth")
     older = {"lin0.model.1.weight": torch.ones(1, 4, 1, 1), "more": torch.zeros(3)}
     torch.save(older, folder / "older.pth", _use_new_zipfile_serialization=False)
@@ -431,24 +244,24 @@ RUN_MODEL = tuple(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "po
 SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
     sample.reader: (sample, write)
     for sample, write in (
-        (Sample("scene", ("scene.yaml",)), _write_scene),
+        (Sample("scene", ("scene.yaml",)), write_scene),
         (
             Sample("colmap_text", tuple(f"sparse/0/{s}.txt" for s in ("cameras", "images", "points3D"))),
-            _write_colmap_text,
+            write_colmap_text,
         ),
-        (Sample("colmap", tuple(f"sparse/0/{s}.bin" for s in ("cameras", "images", "points3D"))), _write_colmap_binary),
-        (Sample("transforms", ("transforms.json",)), _write_transforms),
-        (Sample("tum", ("trajectory.txt", "points.txt")), _write_tum),
-        (Sample("ply", ("points.ply",)), _write_points_ply),
-        (Sample("orbslam3", ("CameraTrajectory.txt",)), _write_orbslam3),
-        (Sample("tum_rgbd", ("rgb.txt",)), _write_tum_rgbd),
-        (Sample("replica", ("traj.txt",)), _write_replica),
-        (Sample("matrices", ("poses.txt",)), _write_matrices),
-        (Sample("tanksandtemples", ("scene.log",)), _write_log),
-        (Sample("sevenscenes", ("seq/frame-000001.pose.txt",)), _write_sevenscenes),
+        (Sample("colmap", tuple(f"sparse/0/{s}.bin" for s in ("cameras", "images", "points3D"))), write_colmap_binary),
+        (Sample("transforms", ("transforms.json",)), write_transforms),
+        (Sample("tum", ("trajectory.txt", "points.txt")), write_tum),
+        (Sample("ply", ("points.ply",)), write_points_ply),
+        (Sample("orbslam3", ("CameraTrajectory.txt",)), write_orbslam3),
+        (Sample("tum_rgbd", ("rgb.txt",)), write_tum_rgbd),
+        (Sample("replica", ("traj.txt",)), write_replica),
+        (Sample("matrices", ("poses.txt",)), write_matrices),
+        (Sample("tanksandtemples", ("scene.log",)), write_log),
+        (Sample("sevenscenes", ("seq/frame-000001.pose.txt",)), write_sevenscenes),
         (
             Sample("modp", ("trajectory.json", "point_cloud/point_cloud_1.txt", "point_cloud/point_cloud_2.npy")),
-            _write_modp,
+            write_modp,
         ),
         (
             Sample(
@@ -460,9 +273,9 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
                     "semidense_observations.csv",
                 ),
             ),
-            _write_aria,
+            write_aria,
         ),
-        (Sample("stella_vslam", ("map.msg",)), _write_stella),
+        (Sample("stella_vslam", ("map.msg",)), write_stella),
         (
             Sample("image", tuple(f"images/{name}" for name in IMAGES)),
             _write_image,

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import NO_ANCHOR
-from fields.runtime.backend import initialise
 from pipelines.finished_map import FinishedMap, placed_by
 from pipelines.online import OnlineMapper
+from tests.pipelines.mapped_wall import finished_map, finished_mapper, fresh_mapper
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
 
@@ -21,50 +22,43 @@ pytestmark = pytest.mark.slow
 FRAMES = 5
 
 
-def fresh() -> OnlineMapper:
-    initialise("cpu")  # a process has room for one map
-    return OnlineMapper(SETTINGS, 64, 48, seed=1)
+class Finished(NamedTuple):
+    """What a finished run keeps, the errors of its keyframes, and the PSNR of the first."""
+
+    map: FinishedMap
+    errors: NDArray[np.float64]
+    psnr: float
 
 
 @pytest.fixture(scope="module")
-def finished() -> dict:
-    """What a finished run of the wall keeps."""
-    mapper = fresh()
-    for i in range(FRAMES):
-        mapper.process(frame(i))
-    mapper.finish()
+def finished() -> Finished:
+    """A finished run of the wall."""
+    mapper = finished_mapper(FRAMES)
     store = mapper.keyframes
-    return {
-        "gaussians": mapper.gaussians.to_numpy(),
-        "frames": [replace(frame(i), T_camera_world=store.corrected(i, T)) for i, T in mapper.trajectory.items()],
-        "keyframes": [view.index for view in store.selected],
-        "scene_depth": store.scene_depth,
-        "errors": store.errors(),
-        "psnr": mapper.optimiser.compare(store[0], store.scene_depth).psnr,
-    }
+    psnr = mapper.optimiser.compare(store[0], store.scene_depth).psnr
+    return Finished(finished_map(mapper), store.errors(), psnr)
 
 
-def gone_on(finished: dict) -> OnlineMapper:
-    mapper = fresh()
-    kept = (finished[name] for name in ("gaussians", "frames", "keyframes"))
-    mapper.go_on_with(FinishedMap(*kept, {}, finished["scene_depth"]))
+def gone_on(finished: Finished) -> OnlineMapper:
+    mapper = fresh_mapper()
+    mapper.go_on_with(finished.map)
     return mapper
 
 
-def test_the_map_is_the_finished_one(finished: dict) -> None:
+def test_the_map_is_the_finished_one(finished: Finished) -> None:
     mapper = gone_on(finished)
     for name, array in mapper.gaussians.to_numpy().items():
-        np.testing.assert_array_equal(array, finished["gaussians"][name])
+        np.testing.assert_array_equal(array, finished.map.gaussians[name])
     store = mapper.keyframes
-    assert [view.index for view in store.selected] == finished["keyframes"]
+    assert [view.index for view in store.selected] == finished.map.keyframes
     assert list(mapper.trajectory) == list(range(FRAMES)) and mapper.frame_count == FRAMES
-    assert store.scene_depth == pytest.approx(finished["scene_depth"], rel=1e-2)
-    assert mapper.optimiser.compare(store[0], store.scene_depth).psnr == pytest.approx(finished["psnr"], abs=0.1)
+    assert store.scene_depth == pytest.approx(finished.map.scene_depth, rel=1e-2)
+    assert mapper.optimiser.compare(store[0], store.scene_depth).psnr == pytest.approx(finished.psnr, abs=0.1)
     # The errors are those of the map, and not those of keyframes that nothing has optimised.
-    assert store.errors().max() < 2.0 * finished["errors"].max()
+    assert store.errors().max() < 2.0 * finished.errors.max()
 
 
-def test_every_gaussian_has_the_first_keyframe_that_shows_it_as_anchor(finished: dict) -> None:
+def test_every_gaussian_has_the_first_keyframe_that_shows_it_as_anchor(finished: Finished) -> None:
     mapper = gone_on(finished)
     anchors, store = mapper.gaussians.anchors(), mapper.keyframes
     position = mapper.gaussians.to_numpy()["position"].astype(np.float64)
@@ -79,7 +73,7 @@ def test_every_gaussian_has_the_first_keyframe_that_shows_it_as_anchor(finished:
             assert not view.camera.contains(view.camera.project(local[ahead])).any()
 
 
-def test_the_voxels_of_the_map_are_taken(finished: dict) -> None:
+def test_the_voxels_of_the_map_are_taken(finished: Finished) -> None:
     mapper = gone_on(finished)
     assert mapper.densifier.voxels is not None
     known = mapper.gaussians.anchors() != NO_ANCHOR
@@ -97,7 +91,7 @@ def test_the_voxels_of_the_map_are_taken(finished: dict) -> None:
     assert grown[0] < 0.7 * grown[1]
 
 
-def test_a_correction_of_later_frames_leaves_the_finished_map_alone(finished: dict) -> None:
+def test_a_correction_of_later_frames_leaves_the_finished_map_alone(finished: Finished) -> None:
     mapper = gone_on(finished)
     for i in range(FRAMES, FRAMES + 3):
         mapper.process(frame(i))

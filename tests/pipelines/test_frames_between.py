@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fields.runtime.backend import initialise
 from pipelines.online import OnlineMapper
 from pipelines.pipeline import FrameReport
 from pipelines.settings import MappingSettings
+from tests.pipelines.mapped_wall import fresh_mapper
 from tests.pipelines.wall import frame
 
 pytestmark = pytest.mark.slow
@@ -16,10 +16,9 @@ pytestmark = pytest.mark.slow
 
 def mapped(**keyframes) -> tuple[OnlineMapper, list[FrameReport]]:
     """Map six frames, of which the first and the fifth are keyframes."""
-    initialise("cpu")  # a process has room for one map
     apart = {"covisibility": 0.0, "baseline": 9.0, "max_gap": 3}
     settings = MappingSettings(optimise={"steps": 20}, densify={"warm_up": 2}, keyframes=apart | keyframes)
-    mapper = OnlineMapper(settings, 64, 48, seed=1)
+    mapper = fresh_mapper(settings)
     return mapper, [mapper.process(frame(i)) for i in range(6)]
 
 

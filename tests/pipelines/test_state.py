@@ -10,11 +10,11 @@ import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3
-from fields.runtime.backend import initialise
 from pipelines.online import OnlineMapper
 from pipelines.refinement import refine
 from pipelines.settings import ExposureSettings, RefineSettings
 from pipelines.state import MapState
+from tests.pipelines.mapped_wall import fresh_mapper
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
 
@@ -52,13 +52,8 @@ def copied(state: MapState) -> MapState:
     return MapState({n: a.copy() for n, a in state.arrays.items()}, json.loads(json.dumps(state.numbers)))
 
 
-def fresh(seed: int, settings=SETTINGS) -> OnlineMapper:
-    initialise("cpu")  # a process has room for one map
-    return OnlineMapper(settings, 64, 48, seed=seed)
-
-
 def restored(state: MapState, settings=SETTINGS) -> OnlineMapper:
-    mapper = fresh(99, settings)
+    mapper = fresh_mapper(settings, seed=99)
     mapper.restore(state, (frame(i) for i in range(FRAMES)))
     return mapper
 
@@ -66,7 +61,7 @@ def restored(state: MapState, settings=SETTINGS) -> OnlineMapper:
 @pytest.fixture(scope="module")
 def states() -> dict[str, MapState]:
     """States of one map with exposures: after so many steps, within `finish` and the refinement, at the end."""
-    mapper = fresh(5, EXPOSED)
+    mapper = fresh_mapper(EXPOSED, seed=5)
     states = {}
     for step in STEPS[:-1]:
         step(mapper)

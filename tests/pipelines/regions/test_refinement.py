@@ -9,14 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
-from fields.runtime.backend import initialise
 from pipelines.finished_map import FinishedMap
-from pipelines.online import OnlineMapper
 from pipelines.refinement import refine
 from pipelines.regions.refinement import RefinedRegion, Span, refine_region, with_history
 from pipelines.settings import RefineSettings
-from tests.pipelines.test_online import SETTINGS
-from tests.pipelines.wall import frame
+from tests.pipelines.mapped_wall import finished_map, finished_mapper, fresh_mapper
 
 pytestmark = pytest.mark.slow
 
@@ -24,29 +21,16 @@ FRAMES, STEPS = 5, 6
 REFINE = RefineSettings(steps=STEPS, views=2)
 
 
-def fresh() -> OnlineMapper:
-    initialise("cpu")  # a process has room for one map
-    return OnlineMapper(SETTINGS, 64, 48, seed=1)
-
-
 @pytest.fixture(scope="module")
 def finished() -> FinishedMap:
     """A finished map of the wall, with the optimiser state of a new one."""
-    mapper = fresh()
-    for i in range(FRAMES):
-        mapper.process(frame(i))
-    mapper.finish()
-    store = mapper.keyframes
-    frames = [
-        replace(frame(i), T_camera_world=store.corrected(i, T), points=SparsePoints())
-        for i, T in mapper.trajectory.items()
-    ]
-    keyframes = [view.index for view in store.selected]
-    return FinishedMap(with_history(mapper.gaussians.to_numpy()), frames, keyframes, {}, store.scene_depth)
+    kept = finished_map(finished_mapper(FRAMES))
+    frames = [replace(view, points=SparsePoints()) for view in kept.frames]
+    return replace(kept, gaussians=with_history(kept.gaussians), frames=frames)
 
 
 def refined(finished: FinishedMap, own: NDArray[np.bool_], span: Span) -> RefinedRegion:
-    return refine_region(fresh(), finished, own, REFINE, span)
+    return refine_region(fresh_mapper(), finished, own, REFINE, span)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +48,7 @@ def halves(finished: FinishedMap) -> list[RefinedRegion]:
 
 
 def test_one_region_in_one_round_is_the_refinement_of_the_map(finished: FinishedMap, whole: RefinedRegion) -> None:
-    mapper = fresh()
+    mapper = fresh_mapper()
     values = {name: finished.gaussians[name] for name in mapper.gaussians.to_numpy()}
     mapper.go_on_with(replace(finished, gaussians=values))
     refine(mapper, REFINE)

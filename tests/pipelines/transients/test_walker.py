@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from fields.runtime.backend import initialise
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
+from tests.pipelines.mapped_wall import fresh_mapper
 from tests.pipelines.walked_wall import FRAMES, SETTINGS, still, walked, walker
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("taichi_on_the_cpu")]
@@ -31,8 +31,7 @@ class Mapped:
 
 @cache
 def mapped(walks: bool, transients: bool) -> Mapped:
-    initialise("cpu")  # a process has room for one map
-    mapper = OnlineMapper(MappingSettings(**SETTINGS, transients=transients), 64, 48, seed=1)
+    mapper = fresh_mapper(MappingSettings(**SETTINGS, transients=transients))
     for i in range(FRAMES):
         mapper.process(walked(i) if walks else still(i))
     mapper.finish()
@@ -63,14 +62,12 @@ def test_nothing_is_masked_where_nothing_moves() -> None:
 
 
 def test_a_restored_map_has_its_masks() -> None:
-    initialise("cpu")
-    mapper = OnlineMapper(MappingSettings(**SETTINGS, transients=True), 64, 48, seed=1)
+    mapper = fresh_mapper(MappingSettings(**SETTINGS, transients=True))
     for i in range(FRAMES):
         mapper.process(walked(i))
     mapper.finish()
     state, views = mapper.state(), list(mapper.keyframes)
-    initialise("cpu")
-    again = OnlineMapper(MappingSettings(**SETTINGS, transients=True), 64, 48, seed=1)
+    again = fresh_mapper(MappingSettings(**SETTINGS, transients=True))
     again.restore(state, [walked(i) for i in range(FRAMES)])
     assert any(view.transient is not None for view in views)
     for old, new in zip(views, again.keyframes, strict=True):
