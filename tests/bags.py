@@ -61,14 +61,20 @@ class Messages:
         return self.make("sensor_msgs/CompressedImage", self.header(time, frame), form, np.frombuffer(data, np.uint8))
 
     def info(
-        self, time: int, K: NDArray, size: tuple[int, int], model: str = "plumb_bob", D: Sequence[float] = (0.0,) * 5
+        self,
+        time: int,
+        K: NDArray,
+        size: tuple[int, int],
+        model: str = "plumb_bob",
+        D: Sequence[float] = (0.0,) * 5,
+        frame: str = "optical",
     ) -> Any:
         """`K`: with pixel centres at +0.5."""
         there = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         P = np.hstack([there, np.zeros((3, 1))])
         roi = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
         matrices = [np.array(D, float), there.ravel(), np.eye(3).ravel(), P.ravel()]
-        header = self.header(time, "optical")
+        header = self.header(time, frame)
         return self.make("sensor_msgs/CameraInfo", header, size[1], size[0], model, *matrices, 0, 0, roi)
 
     def quaternion(self, T: NDArray) -> Any:

@@ -136,6 +136,13 @@ class BagSettings(TrackerSettings):
         description="topic of the points (PointCloud2), or `none` to triangulate them; empty: the first such topic, if "
         "there is one",
     )
+    depth: str | None = Field(
+        default=None,
+        description="topic of depth images (Image of encoding 16UC1 or 32FC1, or compressedDepth), each of which gives "
+        "the image that was taken with it up to 400 points, or `none`; empty: the first such topic whose camera is "
+        "known, unless `points` is set",
+    )
+    max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] of a point of a depth image")
     max_points: int = Field(
         default=2000, ge=10, description="largest number of points of a frame that are taken from the clouds"
     )

@@ -11,7 +11,7 @@ from modp_ti.inputs.captures.capture import checked_numbers, plausible_camera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 
-__all__ = ["camera_of_info"]
+__all__ = ["camera_of_info", "info_beside", "is_rectified"]
 
 
 def camera_of_info(message: Any, rectified: bool, where: str) -> Intrinsics | None:
@@ -35,6 +35,26 @@ def camera_of_info(message: Any, rectified: bool, where: str) -> Intrinsics | No
     # The calibration has pixel centres at whole numbers.
     camera = plausible_camera(fx, fy, cx + 0.5, cy + 0.5, (message.width, message.height), where, lens)
     return Intrinsics(camera, lens)
+
+
+def info_beside(topic: str, infos: list[str]) -> str | None:
+    """Return the topic of CameraInfo that belongs to a topic of images, or None.
+
+    It lies beside the images. The topic of compressed images lies below that of the images.
+    """
+    above = topic.rpartition("/")[0]
+    while True:
+        if f"{above}/camera_info" in infos:
+            return f"{above}/camera_info"
+        if not above:
+            return infos[0] if len(infos) == 1 else None
+        above = above.rpartition("/")[0]
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether the images of a topic are rectified, by its name."""
+    name = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[2]
+    return name.startswith("image_rect")
 
 
 def _lens(model: str, D: list[float], where: str) -> Distortion:

@@ -13,7 +13,16 @@ from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.listed_images import decoded
 
-__all__ = ["DEPTH_ENCODINGS", "is_deep", "is_depth", "is_grey", "picture", "picture_size", "stored_values"]
+__all__ = [
+    "DEPTH_ENCODINGS",
+    "is_compressed",
+    "is_deep",
+    "is_depth",
+    "is_grey",
+    "picture",
+    "picture_size",
+    "stored_values",
+]
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -53,30 +62,31 @@ LAYOUTS = {
 """Encodings of sensor_msgs/Image that are read."""
 
 
-def _is_compressed(message: Any) -> bool:
+def is_compressed(message: Any) -> bool:
+    """Whether an image message is a sensor_msgs/CompressedImage."""
     return message.__msgtype__ == COMPRESSED
 
 
 def is_depth(message: Any) -> bool:
     """Whether an image message holds depths."""
-    return "compressedDepth" in message.format if _is_compressed(message) else message.encoding in DEPTH_ENCODINGS
+    return "compressedDepth" in message.format if is_compressed(message) else message.encoding in DEPTH_ENCODINGS
 
 
 def is_grey(message: Any) -> bool:
     """Whether an image message is known to be grey."""
-    stated = message.format if _is_compressed(message) else message.encoding
+    stated = message.format if is_compressed(message) else message.encoding
     return stated.startswith(("mono", "8UC1"))
 
 
 def is_deep(message: Any) -> bool:
     """Whether an image message has 16 bits per channel."""
-    layout = None if _is_compressed(message) else LAYOUTS.get(message.encoding)
+    layout = None if is_compressed(message) else LAYOUTS.get(message.encoding)
     return layout is not None and layout.dtype == "u2"
 
 
 def picture_size(message: Any) -> tuple[int, int] | None:
     """Return the size (width, height) that an image message states; None if it states none, or is cut off."""
-    if not _is_compressed(message):
+    if not is_compressed(message):
         return (message.width, message.height) if message.width > 0 and message.height > 0 else None
     header = read_image_header(io.BytesIO(message.data.tobytes()))
     return None if header is None or not header.complete or header.width < 1 else (header.width, header.height)
@@ -94,7 +104,7 @@ def picture(message: Any, bits: int = DEPTHS[-1]) -> NDArray[np.uint8]:
     """
     import cv2
 
-    if _is_compressed(message):
+    if is_compressed(message):
         return _uncompressed(message.data.tobytes())
     layout = LAYOUTS.get(message.encoding)
     if layout is None:

@@ -17,7 +17,7 @@ from modp_ti.inputs.sources.listed_images import decoded_as
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.undistortion import Undistorter
 
-__all__ = ["depth_points", "millimetre_png", "read_millimetres"]
+__all__ = ["depth_points", "millimetre_png", "read_millimetres", "sampled_pixels"]
 
 # Where the depths of a pixel and its eight neighbours differ by more than this share, the pixel lies on an edge: the
 # sensor blends what is before and behind it.
@@ -84,7 +84,7 @@ def depth_points(
     Returns:
         The points. No two frames have one in common.
     """
-    rows, columns = _sampled(depth, index, limit, farthest)
+    rows, columns = sampled_pixels(depth, index, limit, farthest)
     height, width = depth.metres.shape
     camera = captured.camera
     stored = np.stack([(columns + 0.5) * camera.width / width, (rows + 0.5) * camera.height / height], axis=1)
@@ -103,7 +103,9 @@ def depth_points(
     return points_inside(xyz, pixels, ids, frame.undistorter, frame.T_camera_world)
 
 
-def _sampled(depth: DepthMap, index: int, limit: int, farthest: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def sampled_pixels(
+    depth: DepthMap, index: int, limit: int, farthest: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Choose pixels (N,), (N,) by row and column: one at random in each cell of a grid of at most `limit` cells."""
     import cv2
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from modp_ti.config.camera_settings import BagImagesSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.bags.bag import IMAGES, INFO, Bag, Place
-from modp_ti.inputs.bags.camera_info import camera_of_info
+from modp_ti.inputs.bags.camera_info import camera_of_info, info_beside, is_rectified
 from modp_ti.inputs.bags.frame_tree import clean, seconds
-from modp_ti.inputs.bags.pictures import is_deep, is_depth, is_grey, picture, picture_size, stored_values
+from modp_ti.inputs.bags.pictures import is_compressed, is_deep, is_depth, is_grey, picture, picture_size, stored_values
 from modp_ti.inputs.sources.bit_depth import DEPTHS, used_bits
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -68,7 +68,7 @@ class BagImages(ImageSource):
             super().__init__(path, names, [image.time for image in images])
             self._size = size
             self._place = {name: image.place for name, image in zip(names, images, strict=True)}
-            stated = getattr(first, "encoding", None) or getattr(first, "format", "")
+            stated = first.format if is_compressed(first) else first.encoding
             choice = f"; there are also {', '.join(others)} (source.bag.image)" if others else ""
             self.add_note(f"{path}: images of {self.topic} ({stated}){choice}")
             if left_out:
@@ -141,12 +141,12 @@ class BagImages(ImageSource):
         if given is not None:
             topic = self.bag.chosen(given, (INFO,), "source.bag.camera_info")
         else:
-            topic = _info_beside(self.topic, topics)
+            topic = info_beside(self.topic, topics)
         if topic is None:
             there = f"; there is {', '.join(topics)} (source.bag.camera_info)" if topics else ""
             self.add_note(f"{self.path}: no CameraInfo belongs to {self.topic}{there}")
             return None
-        rectified = self.topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
+        rectified = is_rectified(self.topic)
         camera = camera_of_info(self.bag.first(topic), rectified, f"{self.path}: {topic}")
         of = "the rectified camera P" if rectified else "the camera K with its lens"
         self.add_note(f"{self.path}: {f'{topic} is not calibrated' if camera is None else f'{of} of {topic}'}")
@@ -164,17 +164,3 @@ def _chosen_topic(bag: Bag, given: str | None) -> tuple[str, list[str]]:
         raise InputError(f"{bag.path}: holds no images; its topics are {there or 'none'} (source.path)")
     pictures.sort(key=lambda topic: (is_grey(firsts[topic]), topic))
     return pictures[0], pictures[1:]
-
-
-def _info_beside(topic: str, infos: list[str]) -> str | None:
-    """Return the topic of CameraInfo that belongs to a topic of images, or None.
-
-    It lies beside the images. The topic of compressed images lies below that of the images.
-    """
-    above = topic.rpartition("/")[0]
-    while True:
-        if f"{above}/camera_info" in infos:
-            return f"{above}/camera_info"
-        if not above:
-            return infos[0] if len(infos) == 1 else None
-        above = above.rpartition("/")[0]

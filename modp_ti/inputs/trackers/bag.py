@@ -11,11 +11,12 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bags.bag import CLOUD, POSES
 from modp_ti.inputs.bags.clouds import world_points
+from modp_ti.inputs.bags.depth_images import DepthTopic, depth_topics, read_depth_topic, with_depth_points
 from modp_ti.inputs.bags.frame_tree import FrameTree, clean, read_frame_tree
 from modp_ti.inputs.bags.pose_topics import read_pose_topic
 from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.sources.bag import BagImages
 from modp_ti.inputs.trackers.given_poses import posed_images, selected_frames, solving, spread_points
@@ -27,7 +28,8 @@ def open_bag(source: SourceSettings, tracker: BagSettings, progress: Progress | 
     """Open the images that were taken while the poses of a bag are known.
 
     The poses are those of the topic `tracker.pose`, moved to the camera by the transforms of the bag, or those
-    transforms alone. The points are those of all clouds of `tracker.points`; without, they are triangulated.
+    transforms alone. The points are those of the depth images of `tracker.depth`, or of all clouds of `tracker.points`;
+    without, they are triangulated.
 
     Raises:
         InputError: If `source.path` is no bag, the camera is not known, or no image has a pose.
@@ -77,6 +79,9 @@ def _opened(
     if tracker.adjust:
         frames, note = adjusted_frames(images, frames, solving(frames, source), progress)
         return ReplayedTracker(reader, frames, [*notes, note])
+    with_depths = _with_depths(images, tracker, tree, world, frames, times[known], notes, progress)
+    if with_depths is not None:
+        return ReplayedTracker(reader, with_depths, notes)
     xyz = _points(images, tracker, tree, world, notes)
     if xyz is None:
         return ReplayedTracker(reader, triangulated_frames(images, frames, solving(frames, source), progress), notes)
@@ -109,6 +114,56 @@ def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree) -> tup
     choice = f"; there are also {', '.join(others)} (tracker.pose)" if others else ""
     taken = "" if tracker.body or poses.body else f", which does not say of what: of {camera} (tracker.body)"
     return world, [f"{bag.path}: poses of {body} in {poses.world} by {topic}{taken}{choice}"]
+
+
+def _with_depths(
+    images: BagImages,
+    tracker: BagSettings,
+    tree: FrameTree,
+    world: str,
+    frames: list[PosedImage],
+    times: NDArray[np.float64],
+    notes: list[str],
+    progress: Progress | None,
+) -> list[PosedImage] | None:
+    """Return the frames with points of depth images, None if the bag has none. Adds remarks for the user."""
+    if tracker.depth == "none" or (tracker.depth is None and tracker.points is not None):
+        return None
+    try:
+        topic = _depth_topic(images, tracker.depth, notes)
+        if topic is None:
+            return None
+        T_world_sensor = tree.at(world, topic.frame, topic.times, tracker.max_gap)
+        if T_world_sensor is None:
+            raise InputError(
+                f"{images.path}: no transform leads from {topic.frame!r}, the frame of {topic.name}, to {world!r}"
+            )
+        frames, note = with_depth_points(images.bag, topic, T_world_sensor, frames, times, tracker, progress)
+    except InputError as error:
+        if tracker.depth is not None:
+            raise
+        notes.append(f"{error}: depth images are not used")
+        return None
+    notes.append(note)
+    return frames
+
+
+def _depth_topic(images: BagImages, given: str | None, notes: list[str]) -> DepthTopic | None:
+    """Return the given topic of depth images, or else the first one whose camera is known."""
+    names = depth_topics(images.bag)
+    if given is not None and given not in names:
+        raise InputError(
+            f"{images.path}: has no depth images at {given}; there is {', '.join(names) or 'none'} (tracker.depth)"
+        )
+    for name in names if given is None else [given]:
+        topic = read_depth_topic(images.bag, name, images.frame_id, images.intrinsics)
+        if topic is not None:
+            others = ", ".join(other for other in names if other != name)
+            notes.extend([f"{images.path}: there are also depth images of {others} (tracker.depth)"] if others else [])
+            return topic
+    if given is not None:
+        raise InputError(f"{images.path}: no CameraInfo belongs to the depth images of {given} (tracker.depth)")
+    return None
 
 
 def _points(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -44,13 +44,17 @@ def views() -> list[View]:
 
 
 @pytest.fixture
-def opened() -> Opened:
-    """Open a bag as a run does: `opened(path, source settings, tracker settings...)`."""
+def opened() -> Iterator[Opened]:
+    """Open a bag as a run does: `opened(path, source settings, tracker settings...)`. It is closed after the test."""
+    trackers: list[ReplayedTracker] = []
 
     def opened(place: Path, source: dict | None = None, **tracker: object) -> ReplayedTracker:
         settings = {"source": {"path": place, **(source or {})}, "tracker": {"kind": "bag", **tracker}, "output": "out"}
         result = open_tracker(SceneConfig.model_validate(settings))
         assert isinstance(result, ReplayedTracker)
+        trackers.append(result)
         return result
 
-    return opened
+    yield opened
+    for tracker in trackers:
+        tracker.close()
