@@ -75,7 +75,7 @@ def corner_of(cells: NDArray[np.int32], stack: int) -> NDArray[np.int32]:
 def without_repetitions(corners: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return each of the bricks' corners (N, 3) once, in lexicographic order."""
     x, y, z = corners.astype(np.int64).T
-    key = np.unique((x << 32) | (y << 16) | z)  # ten times faster than unique rows
+    key = np.unique((x << 32) | (y << 16) | z)  # three times faster than unique rows
     return np.stack([key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF], axis=1).astype(np.int32)
 
 
