@@ -90,6 +90,15 @@ def test_the_numbers_are_those_of_the_metrics(made) -> None:
     assert f"{run.metrics['gaussians']:,}" in headline
 
 
+def test_the_headings_of_the_numbers_are_as_wide_as_their_columns(made) -> None:
+    _, _, html = made
+    head, body = re.search(r'id="numbers".*?<thead>(.*?)</thead>.*?<tbody>(.*?)</tr>', html, re.DOTALL).groups()
+    first, second = re.findall(r"<tr>(.*?)</tr>", head, re.DOTALL)
+    spans = [int(span) for span in re.findall(r'colspan="(\d+)"', first)]
+    assert sum(spans) == second.count("<th")
+    assert sum(spans) + first.count("rowspan") == body.count("<th") + body.count("<td")
+
+
 def test_the_stages_are_those_of_the_metrics_and_their_bars_as_long(made) -> None:
     run, page, html = made
     rows = {row[0]: row[1:] for row in page.tables["time"]}
