@@ -203,7 +203,7 @@ def _load() -> ModuleType:
     if chosen.saves_cache_on_reset:
         atexit.register(module.reset)
     if chosen.slow_attributes:
-        setattr(module, "data_oriented", _data_oriented)  # noqa: B010 (the type checker knows no attributes of it)
+        vars(module)["data_oriented"] = _data_oriented
     return module
 
 

@@ -18,7 +18,7 @@ from modp_ti.inputs.bags.camera_info import camera_of_info, info_beside, is_rect
 from modp_ti.inputs.bags.frame_tree import clean, seconds
 from modp_ti.inputs.bags.pictures import is_compressed, is_depth, picture_size, stored_values
 from modp_ti.inputs.captures.capture import DepthMap
-from modp_ti.inputs.captures.depth_maps import sampled_pixels
+from modp_ti.inputs.captures.depth_maps import sampled_points
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources.image_bounds import why_undecodable
@@ -78,9 +78,10 @@ def read_depth_topic(bag: Bag, topic: str, frame: str, camera: Intrinsics | None
     first = bag.first(topic)
     size, its_frame = picture_size(first) if not is_compressed(first) else None, clean(first.header.frame_id)
     its = None
-    beside = info_beside(topic, [info for info in bag.of_types(INFO) if _is_of(bag.first(info), its_frame, size)])
+    infos = {info: bag.first(info) for info in bag.of_types(INFO)}
+    beside = info_beside(topic, [info for info, message in infos.items() if _is_of(message, its_frame, size)])
     if beside is not None:
-        its = camera_of_info(bag.first(beside), is_rectified(topic), f"{bag.path}: {beside}")
+        its = camera_of_info(infos[beside], is_rectified(topic), f"{bag.path}: {beside}")
     elif camera is not None and its_frame == frame and size in (None, (camera.camera.width, camera.camera.height)):
         its = camera
     if its is None:
@@ -146,6 +147,7 @@ def with_depth_points(
         InputError: If more than a few depth images are damaged, or no frame has a point.
     """
     result, damaged = list(frames), []
+    undistorter = topic.camera.undistorter(1.0)
     for index, (frame, time) in enumerate(zip(frames, times, strict=True)):
         nearest = int(np.argmin(np.abs(topic.times - time)))
         T = T_world_sensor[nearest]
@@ -156,7 +158,8 @@ def with_depth_points(
         except ValueError as error:
             damaged.append(f"{bag.path}: unreadable image of {topic.name}: {error}")
             continue
-        in_sensor = _sampled(metres, topic.camera, index, min(tracker.max_points, MOST), tracker.max_depth)
+        depth = DepthMap(metres, metres > 0)
+        in_sensor, _ = sampled_points(depth, undistorter, index, min(tracker.max_points, MOST), tracker.max_depth)
         result[index] = frame.with_points(_seen(in_sensor @ T[:3, :3].T + T[:3, 3], frame, index))
         if progress is not None:
             progress("reading depths", index + 1, len(frames))
@@ -169,17 +172,6 @@ def with_depth_points(
         )
     bad = f"; {len(damaged)} are damaged and left out (the first: {damaged[0]})" if damaged else ""
     return result, f"{bag.path}: points of the depth images of {topic.name} for {used} of {len(frames)} images{bad}"
-
-
-def _sampled(
-    metres: NDArray[np.float32], camera: Intrinsics, index: int, limit: int, farthest: float
-) -> NDArray[np.float64]:
-    """Return points (N, 3) in the sensor's frame from all over a depth image."""
-    rows, columns = sampled_pixels(DepthMap(metres, metres > 0), index, limit, farthest)
-    (height, width), raw = metres.shape, camera.camera
-    stored = np.stack([(columns + 0.5) * raw.width / width, (rows + 0.5) * raw.height / height], axis=1)
-    z = metres[rows, columns].astype(np.float64)[:, None]
-    return np.hstack([camera.undistorter(1.0).rays(stored) * z, z])
 
 
 def _seen(xyz: NDArray[np.float64], frame: PosedImage, index: int) -> SparsePoints:

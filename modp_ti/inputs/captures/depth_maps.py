@@ -17,7 +17,7 @@ from modp_ti.inputs.sources.listed_images import decoded_as
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.undistortion import Undistorter
 
-__all__ = ["depth_points", "millimetre_png", "read_millimetres", "sampled_pixels"]
+__all__ = ["depth_points", "millimetre_png", "read_millimetres", "sampled_points"]
 
 # Where the depths of a pixel and its eight neighbours differ by more than this share, the pixel lies on an edge: the
 # sensor blends what is before and behind it.
@@ -84,28 +84,42 @@ def depth_points(
     Returns:
         The points. No two frames have one in common.
     """
-    rows, columns = sampled_pixels(depth, index, limit, farthest)
-    height, width = depth.metres.shape
     camera = captured.camera
-    stored = np.stack([(columns + 0.5) * camera.width / width, (rows + 0.5) * camera.height / height], axis=1)
-    z = depth.metres[rows, columns].astype(np.float64)
-    if depth.camera is None:
-        rays = Undistorter(camera, captured.lens).rays(stored)
-    else:
-        seen = np.stack([columns + 0.5, rows + 0.5], axis=1)
-        in_camera = depth.camera.resized(width, height).unproject(seen, z)
-        rays, stored = in_camera[:, :2] / z[:, None], camera.project(in_camera)
+    sensor = Undistorter(camera, captured.lens) if depth.camera is None else Undistorter(depth.camera)
+    in_camera, stored = sampled_points(depth, sensor, index, limit, farthest)
+    if depth.camera is not None:
+        stored = camera.project(in_camera)
     assert captured.T_camera_world is not None
     T_world_camera = inverse_se3(captured.T_camera_world)
-    xyz = np.column_stack([rays * z[:, None], z]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    xyz = in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     pixels = frame.undistorter.points(turn.pixels(stored, camera.width, camera.height))
     ids = index * IDS_PER_FRAME + np.arange(len(xyz), dtype=np.int64)
     return points_inside(xyz, pixels, ids, frame.undistorter, frame.T_camera_world)
 
 
-def sampled_pixels(
-    depth: DepthMap, index: int, limit: int, farthest: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def sampled_points(
+    depth: DepthMap, undistorter: Undistorter, index: int, limit: int, farthest: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Take confident depths from all over a depth map.
+
+    Args:
+        depth: The depth map.
+        undistorter: Holds its camera and lens, at any size.
+        index: Position of the frame, which decides the sample.
+        limit: Largest number of points.
+        farthest: Largest depth that is used [m].
+
+    Returns:
+        Points (N, 3) in the camera's frame, and their pixels (N, 2) at the size of the camera.
+    """
+    rows, columns = _sampled(depth, index, limit, farthest)
+    (height, width), camera = depth.metres.shape, undistorter.raw
+    pixels = np.stack([(columns + 0.5) * camera.width / width, (rows + 0.5) * camera.height / height], axis=1)
+    z = depth.metres[rows, columns].astype(np.float64)
+    return np.column_stack([undistorter.rays(pixels) * z[:, None], z]), pixels
+
+
+def _sampled(depth: DepthMap, index: int, limit: int, farthest: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Choose pixels (N,), (N,) by row and column: one at random in each cell of a grid of at most `limit` cells."""
     import cv2
 

@@ -45,13 +45,8 @@ def with_depths(views, delay: int = 0):
     messages = recording(views)
     for n, view in enumerate(views):
         time = START + n * STEP
-        messages.append(
-            (
-                "/depth/image",
-                time,
-                MAKE.image(time + delay, millimetres(view.T_world_camera, view.K, view.size), "16UC1"),
-            )
-        )
+        values = millimetres(view.T_world_camera, view.K, view.size)
+        messages.append(("/depth/image", time, MAKE.image(time + delay, values, "16UC1")))
     return messages
 
 
