@@ -49,6 +49,9 @@ def main() -> None:
     options.add_argument(
         "--budgets", type=int, nargs="+", default=[1, 2, 4, 8, 25], metavar="STEPS", help="steps a keyframe of its runs"
     )
+    options.add_argument(
+        "--against-budgets", type=int, nargs="+", metavar="STEPS", help="those of the other commit (default: the same)"
+    )
     options.add_argument("--runs", type=int, default=1, help="for --quality: runs of each, medians count (default 1)")
     options.add_argument("--scale", type=int, metavar="N", help="a map of N copies of the scene, side by side")
     options.add_argument("--measure", help=argparse.SUPPRESS)
@@ -59,6 +62,8 @@ def main() -> None:
     if arguments.quality:
         if arguments.output is None:
             options.error("--quality writes a plot: give a folder with -o")
+        if arguments.against_budgets and not arguments.against:
+            options.error("--against-budgets are those of another commit: give it with --against")
         measure_quality(arguments)
         return
     if arguments.scale:
@@ -80,10 +85,11 @@ def measure_quality(arguments: argparse.Namespace) -> None:
     for name, scene in scenes.items():
         Job(name, scene, arguments.output, settings).check()
     with ExitStack() as held:
-        programs = [quality.this_program()]
+        programs = {quality.this_program(): arguments.budgets}
         if arguments.against:
-            programs.append(held.enter_context(quality.against(arguments.against)))
-        runs = quality.curves(scenes, programs, arguments.budgets, arguments.runs, settings, arguments.output / "runs")
+            other = held.enter_context(quality.against(arguments.against))
+            programs[other] = arguments.against_budgets or arguments.budgets
+        runs = quality.curves(scenes, programs, arguments.runs, settings, arguments.output / "runs")
     figures = {
         scene: {program: [asdict(point) for point in points] for program, points in of.items()}
         for scene, of in runs.items()

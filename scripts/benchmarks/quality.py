@@ -112,18 +112,16 @@ def _git(*arguments: str) -> str:
 
 def curves(
     scenes: Mapping[str, Path],
-    programs: Sequence[Program],
-    budgets: Sequence[int],
+    programs: Mapping[Program, Sequence[int]],
     repeats: int,
     settings: Mapping[str, str],
     folder: Path,
 ) -> dict[str, dict[str, list[Point]]]:
-    """Run every scene at every budget with every program, interleaved, so that all see the same machine.
+    """Run every scene with every program at each of its budgets, interleaved, so that all see the same machine.
 
     Args:
         scenes: Scene files by name.
-        programs: Versions of the program.
-        budgets: Optimisation steps of a keyframe, a run for each.
+        programs: Versions of the program, each with its budgets: optimisation steps of a keyframe, a run for each.
         repeats: Runs of each, whose median processor time counts. The maps of one program are identical.
         settings: Overrides by key.
         folder: Keeps the points of finished runs of commits, which are not run again.
@@ -136,10 +134,11 @@ def curves(
     """
     result: dict[str, dict[str, list[Point]]] = {name: {p.label: [] for p in programs} for name in scenes}
     for name, scene in scenes.items():
-        for steps in budgets:
-            runs: dict[str, list[list[Point]]] = {p.label: [] for p in programs}
+        for steps in sorted(set().union(*programs.values())):
+            due = [program for program, budgets in programs.items() if steps in budgets]
+            runs: dict[str, list[list[Point]]] = {p.label: [] for p in due}
             for repeat in range(repeats):
-                for program in programs if repeat % 2 == 0 else programs[::-1]:
+                for program in due if repeat % 2 == 0 else due[::-1]:
                     kept = folder / program.label / f"{name}-{steps}-{repeat}.json"
                     print(f"{name}, {steps} steps a keyframe, {program.label} ...", file=sys.stderr, flush=True)
                     runs[program.label].append(_points(program, scene, steps, settings, kept))

@@ -45,38 +45,42 @@ def test_programs_run_interleaved_and_finished_runs_of_commits_are_kept(
     tmp_path: Path, make_metrics: Callable[..., dict], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: list[str] = []
-    speeds = {"new": iter([30.0, 10.0, 20.0]), "old+": iter([60.0, 60.0, 60.0])}
+    speeds = {"new": iter([30.0, 10.0, 20.0]), "old+": iter([60.0] * 6)}
 
     def run(program: Program, job: Job) -> float:
         started.append(program.label)
         # Only the older version knows the setting.
-        assert job.overrides.get("mapping.optimise.last_steps") == {"new": None, "old+": "4"}[program.label]
+        steps = job.overrides["mapping.optimise.steps"]
+        assert job.overrides.get("mapping.optimise.last_steps") == {"new": None, "old+": steps}[program.label]
         job.folder.mkdir(parents=True)
-        metrics = make_metrics(20.0 + int(job.overrides["mapping.optimise.steps"]), refined=30.0)
+        metrics = make_metrics(20.0 + int(steps), refined=30.0)
         (job.folder / "metrics.json").write_text(json.dumps(metrics))
         return next(speeds[program.label])
 
     monkeypatch.setattr(quality, "_run", run)
     scene = tmp_path / "scene.yaml"
     scene.write_text("output: out")
-    programs = []
-    for label, setting in (("new", "last_passes: int = Field("), ("old+", "last_steps: int = Field(")):
+    programs = {}
+    for label, budgets, setting in (
+        ("new", [4], "last_passes: int = Field("),
+        ("old+", [8, 4], "last_steps: int = Field("),
+    ):
         settings = tmp_path / label / "pipelines" / "settings.py"
         settings.parent.mkdir(parents=True)
         settings.write_text(setting)
-        programs.append(Program(label, tmp_path / label))
+        programs[Program(label, tmp_path / label)] = budgets
 
     def measure() -> dict[str, dict[str, list[Point]]]:
-        return quality.curves({"room": scene}, programs, [4], 3, {}, tmp_path / "runs")
+        return quality.curves({"room": scene}, programs, 3, {}, tmp_path / "runs")
 
     curves = measure()
-    assert started == ["new", "old+", "old+", "new", "new", "old+"]
+    assert started == ["new", "old+", "old+", "new", "new", "old+"] + ["old+"] * 3
     assert [p.seconds for p in curves["room"]["new"]] == [pytest.approx(11.0), pytest.approx(17.0)]  # of 20 s
-    assert [p.psnr for p in curves["room"]["old+"]] == [24.0, 30.0]
+    assert [p.psnr for p in curves["room"]["old+"]] == [24.0, 30.0, 28.0, 30.0]
     started.clear()
-    speeds["old+"] = iter([60.0, 60.0, 60.0])
+    speeds["old+"] = iter([60.0] * 6)
     assert measure() == curves
-    assert started == ["old+"] * 3  # a changed working tree may have changed again
+    assert started == ["old+"] * 6  # a changed working tree may have changed again
 
 
 def test_the_report_compares_the_programs_at_the_same_quality(tmp_path: Path) -> None:
