@@ -31,6 +31,7 @@ class FinishedMap:
         exposures: Exposure (3, 4) by frame index, for the frames that have one.
         scene_depth: Depth of keyframes without tracked points [scene units].
         poses: Refined T_camera_world (4, 4) by frame index, where it is not that of the frame.
+        masks: `Keyframe.transient` (h, w) by frame index, where there is one.
     """
 
     gaussians: Mapping[str, NDArray]
@@ -39,6 +40,7 @@ class FinishedMap:
     exposures: Mapping[int, NDArray[np.float64]]
     scene_depth: float
     poses: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    masks: Mapping[int, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
@@ -77,6 +79,8 @@ def take_in_frames(mapper: OnlineMap, finished: FinishedMap) -> None:
             if frame.index in finished.poses:
                 view.T_camera_world = finished.poses[frame.index]
             view.exposure = finished.exposures.get(frame.index, unexposed)
+            if frame.index in finished.masks:
+                mapper.keyframes.mask(view, finished.masks[frame.index])
             if len(view.points) == 0:
                 view.median_depth = finished.scene_depth
     if len(mapper.keyframes) == 0:

@@ -135,6 +135,8 @@ class OnlineMapper(OnlineMap):
             self.hidden.sweep(plan.swept, self.near)
             if self.transients is not None:
                 self.transients.after_keyframe(self.near)
+            if self.changes is not None:
+                self.changes.after_keyframe(self.near)
         return psnr, plan.steps
 
     def _draw_level(self, view: Keyframe) -> int:
@@ -251,7 +253,7 @@ class OnlineMapper(OnlineMap):
         """Make a part of the passes of `finish`."""
         places = part.places
         if self.settled == part.first:
-            self.mask_transients(places)
+            self.mask_contradicted(places)
         views = np.resize(places[np.argsort(places * GOLDEN_RATIO % 1.0)], part.end - part.first)
         count, psnr = self.settings.views.per_step, None
         while self.settled < part.end:

@@ -28,6 +28,7 @@ from pipelines.select.keyframes import KeyframeSelector
 from pipelines.select.views import LocalGlobalViews, ViewSelection
 from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
+from pipelines.transients.changes import ChangeSweep, EarlierVisit
 from pipelines.transients.sweep import TransientSweep
 
 __all__ = ["OnlineMap"]
@@ -50,6 +51,7 @@ class OnlineMap(Pipeline):
         frame_count: Number of frames processed so far.
         settled: Number of views that `finish` has optimised since the last frame.
         transients: Masks what moves; None if the settings disable it.
+        changes: Masks what has changed since an earlier visit; None for the map of one visit.
     """
 
     can_be_refined: ClassVar[bool] = True
@@ -86,6 +88,7 @@ class OnlineMap(Pipeline):
         self.transients = None
         if settings.transients:
             self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
+        self.changes: ChangeSweep | None = None
         self.pace = pace or CompletePace(settings)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self.corrector = MapCorrector(self.keyframes, self.densifier, self.paging)
@@ -116,15 +119,28 @@ class OnlineMap(Pipeline):
         """
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
 
-    def mask_transients(self, places: NDArray[np.int64]) -> None:
-        """Mask what moves in keyframes, and remove its Gaussians. Does nothing if the settings disable it.
+    def mask_contradicted(self, places: NDArray[np.int64]) -> None:
+        """Mask what moves in keyframes, and what has changed since an earlier visit, and remove its Gaussians.
+
+        Does nothing if the settings disable the first, and there was no earlier visit.
 
         Args:
             places: Places of the keyframes in the store.
         """
-        if self.transients is not None:
-            with self.stopwatch.measure("remove"):
-                self.transients.sweep([self.keyframes[place] for place in places.tolist()], self.near)
+        views = [self.keyframes[place] for place in places.tolist()]
+        with self.stopwatch.measure("remove"):
+            if self.transients is not None:
+                self.transients.sweep(views, self.near)
+            if self.changes is not None:
+                self.changes.sweep(views, self.near)
+
+    def watch_changes(self, earlier: EarlierVisit) -> None:
+        """Mask from now on, in the keyframes of an earlier visit, what has changed since.
+
+        Args:
+            earlier: The map of the earlier visit.
+        """
+        self.changes = ChangeSweep(earlier, self.gaussians, self.keyframes, self.renderer, self.paging)
 
     def caught(self) -> Safeguards:
         """Return the safeguards' counts so far. Waits for the device."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -48,9 +49,13 @@ def pinhole(width: int, height: int) -> PinholeCamera:
 
 
 class Room:
-    """Walls, two boxes, a sphere and a cylinder, each with its own texture."""
+    """Walls, two boxes, a sphere and a cylinder, each with its own texture.
 
-    def __init__(self) -> None:
+    Args:
+        without: Numbers of the pieces that are not there: 2 is the high box, 3 the sphere.
+    """
+
+    def __init__(self, without: Collection[int] = ()) -> None:
         import open3d as o3d  # takes seconds, which the collection of the tests would wait for
 
         self._tensor = o3d.core.Tensor
@@ -63,8 +68,9 @@ class Room:
             (make.create_cylinder(0.2, 0.5, resolution=60), np.array([-0.7, 0.9, 0.95])),
         ]
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        for mesh, place in pieces:
-            self._scene.add_triangles(mesh.translate(place))
+        for number, (mesh, place) in enumerate(pieces):
+            outside = np.array([0.0, 0.0, -10.0]) if number in without else 0.0
+            self._scene.add_triangles(mesh.translate(place + outside))
         rng = np.random.Generator(np.random.PCG64(11))  # the same room under `--spread` too
         self._base = rng.uniform(0.35, 0.75, (len(pieces), 3))
         # Values at the corners of a periodic lattice, for each of the textures' two cell sizes.

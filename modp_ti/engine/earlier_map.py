@@ -40,6 +40,13 @@ class EarlierMap:
             InputError: If the map does not fit the settings.
         """
 
+    def recall(self, mapper: Mapper) -> None:
+        """Give a restored mapper what it needs of the earlier map beside its own state.
+
+        Args:
+            mapper: The mapper of a resumed run.
+        """
+
     @property
     def seconds(self) -> float:
         """Time that the frames of this recording took that are in the earlier map [s]."""

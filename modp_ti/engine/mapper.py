@@ -32,6 +32,7 @@ from pipelines.refinement import Schedule
 from pipelines.render.renderer import RenderedView
 from pipelines.settings import MappingSettings, RefineSettings
 from pipelines.state import MapState
+from pipelines.transients.changes import EarlierVisit
 
 __all__ = ["Mapper"]
 
@@ -214,6 +215,11 @@ class Mapper:
             raise ValueError("an offline map cannot go on with a finished one")
         self.pipeline.go_on_with(replace(finished, frames=self._noted(finished.frames)))
         self.finished = True
+
+    def watch_changes(self, earlier: EarlierVisit) -> None:
+        """Mask from now on, in the keyframes of an earlier visit, what has changed since."""
+        assert isinstance(self.pipeline, OnlineMapper), "`go_on_with` refuses other maps"
+        self.pipeline.watch_changes(earlier)
 
     def merge(self, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
         """Put the maps of the parts of a recording into this new mapper, see `pipelines.merging.merge`.

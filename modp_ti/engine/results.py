@@ -35,8 +35,8 @@ __all__ = ["Results", "metrics_of", "summary_of"]
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
 MAPS = ("online", "refined", "offline")
-# What is only written for a finished map, after its scores.
-FIGURES = ("metrics.json", "scores.csv", "report.html", "renders")
+# What not every map has, or is only written after its scores.
+NOT_ALWAYS = ("metrics.json", "scores.csv", "report.html", "renders", "exposure.json", "masks")
 
 
 class Results:
@@ -61,13 +61,13 @@ class Results:
     def writing_map(self) -> Iterator[None]:
         """Move the files that are written inside this context to the output folder together, if no error occurred.
 
-        Scores, report and renders of an earlier run are deleted from there, as they are not those of this map. It
+        Files of an earlier run that this map may not have are deleted from there. It
         raises InputError if the files cannot be written.
         """
         with appearing(self.config.output) as self.folder:
             yield
             dump_scene(self.config, self.folder / "config.yaml")
-            for name in FIGURES:
+            for name in NOT_ALWAYS:
                 earlier = self.config.output / name
                 if earlier.is_dir():
                     shutil.rmtree(earlier)

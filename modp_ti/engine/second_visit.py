@@ -19,6 +19,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.joined_tracker import JoinedTracker, Placement, prefix_for, shift_after
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.outputs.formats.exposure import read_exposures
+from modp_ti.outputs.formats.keyframe_masks import read_masks
 from modp_ti.outputs.locating.locator import Locator
 from modp_ti.outputs.locating.world_alignment import (
     AGREEING,
@@ -32,6 +33,7 @@ from modp_ti.outputs.playback.finished_frames import FinishedFrames
 from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.progress import ProgressLine
 from pipelines.finished_map import FinishedMap
+from pipelines.transients.changes import EarlierVisit
 
 __all__ = ["SecondVisit"]
 
@@ -65,6 +67,7 @@ class SecondVisit(EarlierMap):
         self._run = open_run(config.onto)
         self._earlier = FinishedFrames(self._run, line.prepare)
         self._exposures = read_exposures(self._run.folder / "exposure.json")
+        self._masks = read_masks(self._run.folder / "masks")
         self._alignment: WorldAlignment
 
     def join(self, tracker: Tracker) -> Tracker:
@@ -129,7 +132,12 @@ class SecondVisit(EarlierMap):
 
         record = self._run.record
         finished = FinishedMap(
-            self._run.gaussians, frames(), set(record.keyframes), self._exposures, record.scene_depth
+            self._run.gaussians,
+            frames(),
+            set(record.keyframes),
+            self._exposures,
+            record.scene_depth,
+            masks=self._masks,
         )
         try:
             mapper.go_on_with(finished)
@@ -137,6 +145,10 @@ class SecondVisit(EarlierMap):
             raise InputError(
                 f"{self._run.folder}: its map does not fit these settings ({error}); map both with the same ones"
             ) from None
+        self.recall(mapper)
+
+    def recall(self, mapper: Mapper) -> None:
+        mapper.watch_changes(EarlierVisit(self._run.gaussians, len(self._run)))
 
 
 def _settled(

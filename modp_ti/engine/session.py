@@ -190,6 +190,7 @@ class _Session:
         if resumed is not None:
             with self.line.working(f"reading again what {resumed.path} was made of"):
                 replay(resumed, self.mapper, arriving, checkpointer.digest)
+            self.earlier.recall(self.mapper)
             checkpointer.go_on_from(resumed)
             return
         if checkpointer.path.exists():

@@ -77,6 +77,7 @@ def refine_region_of(job: RegionJob, report: Report) -> RegionResult:
     from fields.runtime.backend import initialise
     from modp_ti.engine.build import build_mapper
     from modp_ti.engine.run_clock import peak_memory_mb
+    from modp_ti.outputs.formats.keyframe_masks import read_masks
     from modp_ti.outputs.playback.finished_frames import frames_of
     from modp_ti.outputs.playback.finished_run import open_run
     from pipelines.finished_map import FinishedMap
@@ -93,7 +94,12 @@ def refine_region_of(job: RegionJob, report: Report) -> RegionResult:
     mapper = build_mapper(config.model_copy(update={"seed": seed}), run.cameras[0].resized(*run.size)).pipeline
     assert isinstance(mapper, OnlineMapper), "`refine` refuses other maps"
     finished = FinishedMap(
-        job.gaussians, frames_of(run, job.views), set(run.record.keyframes), job.exposures, run.record.scene_depth
+        job.gaussians,
+        frames_of(run, job.views),
+        set(run.record.keyframes),
+        job.exposures,
+        run.record.scene_depth,
+        masks=read_masks(run.folder / "masks"),
     )
     try:
         region = refine_region(

@@ -102,7 +102,7 @@ def refine_region(
     shares = _shares(mapper)
     if shares.any():
         if span.first:  # masks are found before the first step only
-            mapper.mask_transients(np.arange(len(mapper.keyframes)))
+            mapper.mask_contradicted(np.arange(len(mapper.keyframes)))
         held = settings.model_copy(update={"poses": False})
         refine(mapper, held, progress, span.first, span.schedule, shares)
     kept = mapper.gaussians.anchors() == OWN

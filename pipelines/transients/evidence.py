@@ -57,6 +57,13 @@ class CoarseView:
     valid: NDArray[np.bool_]
     wrong: float
 
+    def surface(self, cells: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the points (N, 3) of the surface in the world frame at some cells (h, w), which must have a depth."""
+        row, column = np.nonzero(cells)
+        there = self.camera.unproject(np.stack([column + 0.5, row + 0.5], axis=1), self.depth[row, column])
+        T_world_camera = inverse_se3(self.T_camera_world)
+        return there @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+
 
 def coarse_view(
     render: RenderedView,
@@ -154,16 +161,13 @@ def moving(view: CoarseView, others: Sequence[CoarseView], kept: bool) -> tuple[
     """
     certain = np.zeros(view.depth.shape, dtype=bool)
     likely = certain.copy()
-    row, column = np.nonzero(view.valid & (view.depth > 0))
-    pixels = np.stack([column + 0.5, row + 0.5], axis=1)
-    T_world_camera = inverse_se3(view.T_camera_world)
-    there = view.camera.unproject(pixels, view.depth[row, column])
-    ballot = votes(there @ T_world_camera[:3, :3].T + T_world_camera[:3, 3], others)
-    difference = view.difference[row, column]
-    certain[row, column] = (difference >= view.wrong) & ballot.mostly_right
-    likely[row, column] = (difference >= 0.5 * view.wrong) & ballot.mostly_right
+    cells = view.valid & (view.depth > 0)
+    ballot = votes(view.surface(cells), others)
+    difference = view.difference[cells]
+    certain[cells] = (difference >= view.wrong) & ballot.mostly_right
+    likely[cells] = (difference >= 0.5 * view.wrong) & ballot.mostly_right
     if kept:
         ghost = np.zeros_like(certain)
-        ghost[row, column] = (difference < view.wrong) & ballot.mostly_wrong
+        ghost[cells] = (difference < view.wrong) & ballot.mostly_wrong
         certain |= ghost
     return certain, likely | certain

@@ -146,6 +146,7 @@ def _video(file: Path) -> None:
 
 def _run(file: Path) -> None:
     from modp_ti.outputs.formats.exposure import read_exposures
+    from modp_ti.outputs.formats.keyframe_masks import read_masks
     from modp_ti.outputs.formats.scores_csv import read_scores
     from modp_ti.outputs.playback.finished_run import open_run
 
@@ -154,6 +155,8 @@ def _run(file: Path) -> None:
         read_exposures(file)
     elif file.name == "scores.csv":
         read_scores(file)
+    elif file.parent.name == "masks":
+        read_masks(file.parent)
     else:
         open_run(folder)
 
@@ -236,7 +239,7 @@ def _tracker_server(file: Path) -> None:
 
 
 RUN_FILES = (
-    *("out/trajectory.txt", "out/frames.json", "out/exposure.json", "out/scores.csv"),
+    *("out/trajectory.txt", "out/frames.json", "out/exposure.json", "out/scores.csv", "out/masks/000000.png"),
     *(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D")),
 )
 

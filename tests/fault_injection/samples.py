@@ -130,6 +130,8 @@ def _write_run(folder: Path) -> None:
     matrix = np.eye(3, 4).tolist()
     frames = [{"index": i, "timestamp": i / 30, "keyframe": True, "matrix": matrix} for i in range(FRAMES)]
     write_text(folder, "out/exposure.json", [json.dumps({"frames": frames})])
+    mask = np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8)
+    write_bytes(folder, "out/masks/000000.png", cv2.imencode(".png", mask)[1].tobytes())
     scores = ["index,name,held_out,stage,psnr,ssim,lpips,detail"]
     write_text(
         folder, "out/scores.csv", scores + [f"{i},{name},0,online,30.5,0.9,,0.8" for i, name in enumerate(NAMES)]

@@ -12,9 +12,9 @@ from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
 
 
-def fresh_mapper(settings: MappingSettings = SETTINGS, seed: int = 1) -> OnlineMapper:
+def fresh_mapper(settings: MappingSettings = SETTINGS, seed: int = 1, size: tuple[int, int] = (64, 48)) -> OnlineMapper:
     initialise("cpu")  # a process has room for one map
-    return OnlineMapper(settings, 64, 48, seed=seed)
+    return OnlineMapper(settings, *size, seed=seed)
 
 
 def finished_mapper(frames: int) -> OnlineMapper:

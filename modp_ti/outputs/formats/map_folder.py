@@ -17,6 +17,7 @@ from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.formats.colmap_model import write_colmap
 from modp_ti.outputs.formats.exposure import write_exposures
 from modp_ti.outputs.formats.frames_json import write_frames
+from modp_ti.outputs.formats.keyframe_masks import write_masks
 from modp_ti.outputs.formats.splats_ply import write_splats
 from modp_ti.outputs.formats.trajectory import write_trajectory
 
@@ -62,7 +63,9 @@ def write_map(
     near: float,
     undistorter: Undistorter | None = None,
 ) -> None:
-    """Write `splats.ply`, `trajectory.txt`, `frames.json`, `colmap/` and, with estimated exposures, `exposure.json`.
+    """Write `splats.ply`, `trajectory.txt`, `frames.json` and `colmap/`.
+
+    `exposure.json` is added where exposures are estimated, and `masks/` where keyframes are masked.
 
     Args:
         folder: An existing folder.
@@ -84,3 +87,7 @@ def write_map(
         exposures = [exposure for exposure in version.exposures if exposure is not None]
         estimated = {keyframe.index for keyframe in keyframes}
         write_exposures(folder / "exposure.json", frames.index, frames.timestamp, exposures, estimated)
+    places = {index: place for place, index in enumerate(frames.index)}
+    masks = {places[view.index]: view.transient for view in keyframes if view.transient is not None}
+    if masks:
+        write_masks(folder / "masks", masks)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose
 from modp_ti.engine.snapshots.file import FILE
+from modp_ti.outputs.formats.keyframe_masks import read_masks
 from modp_ti.outputs.formats.scores_csv import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.finished_run import open_run
@@ -126,15 +126,19 @@ def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, second: 
 
 
 def test_a_third_visit_that_is_killed_goes_on_as_one_in_peace(second: Path, tmp_path: Path) -> None:
-    """It finds the images of both earlier visits, locates the recording again, and comes to the same place."""
-    scene = Path(shutil.copy(second.parent / "scene.yaml", tmp_path))
-    for name in ("images", "sparse"):
-        (tmp_path / name).symlink_to(second.parent / name)
+    """It finds the images of both earlier visits, locates the recording again, and comes to the same place.
+
+    The high box is gone, so that keyframes of the earlier visits are masked.
+    """
+    scene = second_scene(Room(without=[2]), tmp_path)
     options = ["--onto", str(second), "--set", "snapshot_every=2"]
     assert run(scene, *options).returncode == 0
     peace = (tmp_path / "out").rename(tmp_path / "peace")
     names = open_run(second).names
     assert open_run(peace).names == names + [f"visit3/{name.removeprefix('visit2/')}" for name in names[FIRST:]]
+
+    masks = read_masks(peace / "masks")
+    assert masks and all(place < len(names) for place in masks)
 
     out = tmp_path / "out"
     stop_midway([str(scene), *options], out, lambda: position(out / FILE)[0] > len(names), signal.SIGKILL)
@@ -142,6 +146,9 @@ def test_a_third_visit_that_is_killed_goes_on_as_one_in_peace(second: Path, tmp_
     assert result.returncode == 0
     for name in ("splats.ply", "trajectory.txt", "scores.csv"):
         assert (out / name).read_bytes() == (peace / name).read_bytes(), name
+    for place, mask in read_masks(out / "masks").items():
+        np.testing.assert_array_equal(mask, masks.pop(place))
+    assert not masks
 
 
 def test_a_recording_of_another_place_is_refused_in_one_line(first: Path, tmp_path: Path) -> None:
