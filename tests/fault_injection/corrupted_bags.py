@@ -15,6 +15,7 @@ import numpy as np
 
 from tests.fault_injection.corruptions import Corruption, changed
 from tests.fault_injection.small_bag import write_small_bag
+from tests.fault_injection.small_recording import HEIGHT, WIDTH
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -27,12 +28,12 @@ NAN = float("nan")
 BOMB = 1 << 25  # bytes that a bomb unpacks to
 
 
-def altered(topic: str, change: Callable[[Any], Any], form: str = "mcap") -> Corruption:
+def altered(topic: str, change: Callable[[Any], Any], depths: bool = False) -> Corruption:
     """Write the bag with the messages of a topic changed; those that become None are left out."""
 
     def corrupt(file: Path) -> None:
         file.unlink()
-        write_small_bag(file, form, lambda its, message: change(message) if its == topic else message)
+        write_small_bag(file, "mcap", lambda its, message: change(message) if its == topic else message, depths=depths)
 
     return corrupt
 
@@ -161,6 +162,44 @@ MESSAGES: dict[str, Corruption] = {
     "points of nothing": altered("/map", fields(width=0, row_step=0, data=np.zeros(0, np.uint8))),
 }
 
+
+def depths(change: Callable[[Any], Any]) -> Corruption:
+    """Change the depth images of a bag that has them instead of points."""
+    return altered("/depth", change, depths=True)
+
+
+def metres(value: float) -> Callable[[Any], Any]:
+    """Replace all depths by one, in metres."""
+
+    def change(message: Any) -> Any:
+        data = np.full(message.width * message.height, value, "<f4").view(np.uint8)
+        return replace(message, encoding="32FC1", step=4 * message.width, data=data)
+
+    return change
+
+
+DEPTHS: dict[str, Corruption] = {
+    "no depth images": depths(lambda _: None),
+    "depths of an unknown encoding": depths(fields(encoding="32FC2")),
+    "depths of a colour image": depths(fields(encoding="rgb8")),
+    "depths of four times the bytes": depths(fields(encoding="32FC1")),
+    "depth images without data": depths(fields(data=np.zeros(0, np.uint8))),
+    "depth images of 60000x60000": depths(fields(width=60_000, height=60_000, step=120_000)),
+    "depth images without a size": depths(fields(width=0)),
+    "depth images of another size": depths(fields(height=12)),
+    "a step of depths that is too small": depths(fields(step=3)),
+    "depths of an unknown frame": depths(named("elsewhere")),
+    "depths of another day": depths(later),
+    "depths of zero": depths(fields(data=np.zeros(2 * WIDTH * HEIGHT, np.uint8))),
+    "NaN for depths": depths(metres(NAN)),
+    "infinite depths": depths(metres(np.inf)),
+    "negative depths": depths(metres(-3.0)),
+    "depths of 1e30": depths(metres(1e30)),
+    "no camera of the depths": altered("/camera_info", lambda _: None, depths=True),
+    "no poses of the depths": altered("/odom", lambda _: None, depths=True),
+    "no place of the depths' sensor": altered("/tf_static", lambda _: None, depths=True),
+}
+
 MCAP: dict[str, Corruption] = {
     "a profile of ROS 1": changed(lambda data: data.replace(b"ros2", b"ros1", 1)),
     "a header of 2^62 bytes": put(9, "<Q", 1 << 62),
@@ -194,5 +233,5 @@ SQLITE3: dict[str, Corruption] = {
     "a bomb": in_database("UPDATE messages SET data = ?", zstd.compress(bytes(BOMB))),
 }
 
-CORRUPTED_BAGS = {"mcap": MCAP | MESSAGES, "ros1": ROS1, "sqlite3": SQLITE3}
-"""Corruptions by the form of the bag."""
+CORRUPTED_BAGS = {"mcap": MCAP | MESSAGES, "ros1": ROS1, "sqlite3": SQLITE3, "depth": DEPTHS}
+"""Corruptions by the sample of a bag."""

@@ -104,7 +104,7 @@ def _cases() -> list[Case]:
         for file, corruptions in files.items():
             add(kind, file, anything(*_harmless(file)) | corruptions)
     for form, corruptions in CORRUPTED_BAGS.items():
-        add(f"bag_{form}", BAGS[form], anything() | corruptions)
+        add(f"bag_{form}", BAGS.get(form, BAGS["mcap"]), anything() | corruptions)
     for reader, file in SPLAT_FILES.items():
         # Half of a .splat, and 64 bytes before it, are whole Gaussians again; archives may begin with anything.
         whole = {"splat": ("cut in half", "noise before it"), "sog": ("noise before it",)}.get(reader, ())

@@ -268,7 +268,10 @@ READERS: dict[str, Reader] = {
         Reader("weights", "weights", ("older.pth", "weights.pth"), _weights),
         *(Reader(kind, kind, SAMPLES[kind][0].files, _open) for kind in CAPTURES),
         # Those of sqlite3 are larger than what the fuzzer tries.
-        *(Reader(f"bag_{form}", f"bag_{form}", SAMPLES[f"bag_{form}"][0].files, _open) for form in ("ros1", "mcap")),
+        *(
+            Reader(f"bag_{form}", f"bag_{form}", SAMPLES[f"bag_{form}"][0].files, _open)
+            for form in ("ros1", "mcap", "depth")
+        ),
         Reader("tracker_server", "tracker_server", ("wire",), _tracker_server),
     )
 }

@@ -196,6 +196,11 @@ def _write_capture(kind: str, folder: Path) -> None:
     scene_file(folder, f"kind: {kind}", f"path: {place}")
 
 
+def _write_bag_with_depths(folder: Path) -> None:
+    write_small_bag(folder / BAGS["mcap"], "mcap", depths=True)
+    scene_file(folder, "kind: bag, depth: /depth", f"path: {BAGS['mcap']}")
+
+
 def _write_bag(form: str, folder: Path) -> None:
     write_small_bag(folder / BAGS[form], form)
     scene_file(folder, "kind: bag, points: /map", f"path: {BAGS[form]}")
@@ -289,6 +294,7 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
         *((Sample(kind, files), partial(_write_capture, kind)) for kind, files in CAPTURES.items()),
         *((Sample(f"bag_{form}", (BAGS[form],)), partial(_write_bag, form)) for form in FORMS),
+        (Sample("bag_depth", (BAGS["mcap"],)), _write_bag_with_depths),
         *(
             (Sample(form, (file,), ("convert", file, "written.ply", "--quiet")), partial(_write_splats, file))
             for form, file in SPLATS.items()
