@@ -133,10 +133,7 @@ class OnlineMapper(OnlineMap):
         psnr = self.optimise(plan.steps, level)
         with self.stopwatch.measure("remove"):
             self.hidden.sweep(plan.swept, self.near)
-            if self.transients is not None:
-                self.transients.after_keyframe(self.near)
-            if self.changes is not None:
-                self.changes.after_keyframe(self.near)
+        self.mask_latest()
         return psnr, plan.steps
 
     def _draw_level(self, view: Keyframe) -> int:

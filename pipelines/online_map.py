@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
+from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
 from pipelines.blocks.paging import Paging
@@ -29,7 +30,7 @@ from pipelines.select.views import LocalGlobalViews, ViewSelection
 from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
 from pipelines.transients.changes import ChangeSweep, EarlierVisit
-from pipelines.transients.sweep import TransientSweep
+from pipelines.transients.sweep import YOUNG, TransientSweep, latest
 
 __all__ = ["OnlineMap"]
 
@@ -120,19 +121,28 @@ class OnlineMap(Pipeline):
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
 
     def mask_contradicted(self, places: NDArray[np.int64]) -> None:
-        """Mask what moves in keyframes, and what has changed since an earlier visit, and remove its Gaussians.
+        """Mask in keyframes what moves, and what has changed since an earlier visit, and remove its Gaussians.
 
         Does nothing if the settings disable the first, and there was no earlier visit.
 
         Args:
             places: Places of the keyframes in the store.
         """
-        views = [self.keyframes[place] for place in places.tolist()]
+        self._mask([self.keyframes[place] for place in places.tolist()], 0)
+
+    def mask_latest(self) -> None:
+        """Do so in the latest keyframes, if enough have come since the last time.
+
+        The last few have been optimised too little, and are only asked about the others.
+        """
+        self._mask(latest(self.keyframes), YOUNG)
+
+    def _mask(self, views: Sequence[Keyframe], young: int) -> None:
         with self.stopwatch.measure("remove"):
-            if self.transients is not None:
-                self.transients.sweep(views, self.near)
+            if self.transients is not None and views:
+                self.transients.sweep(views, self.near, young)
             if self.changes is not None:
-                self.changes.sweep(views, self.near)
+                self.changes.sweep(views[: len(views) - young], self.near)
 
     def watch_changes(self, earlier: EarlierVisit) -> None:
         """Mask from now on, in the keyframes of an earlier visit, what has changed since.

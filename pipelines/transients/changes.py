@@ -16,7 +16,7 @@ from pipelines.blocks.paging import Paging
 from pipelines.render.renderer import Renderer
 from pipelines.transients.evidence import SAME_DEPTH, CoarseView, votes
 from pipelines.transients.masks import soft_mask
-from pipelines.transients.sweep import EVERY, WINDOW, YOUNG, compared
+from pipelines.transients.sweep import compared
 
 __all__ = ["ChangeSweep", "EarlierVisit"]
 
@@ -62,15 +62,6 @@ class ChangeSweep:
         self.keyframes = keyframes
         self.renderer = renderer
         self.paging = paging
-
-    def after_keyframe(self, near: float) -> None:
-        """Compare the latest keyframes with the earlier map, if enough have come since the last time.
-
-        Args:
-            near: Depth below which nothing is drawn [scene units].
-        """
-        if len(self.keyframes.selected) % EVERY == 0:
-            self.sweep(list(self.keyframes)[-WINDOW:-YOUNG], near)
 
     def sweep(self, views: Sequence[Keyframe], near: float) -> None:
         """Mask in the keyframes of the earlier visit what these views show to have changed.

@@ -17,7 +17,7 @@ from pipelines.render.renderer import RenderedView, Renderer
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 from pipelines.transients.masks import soft_mask
 
-__all__ = ["TransientSweep", "compared", "neighbours", "place_of", "without"]
+__all__ = ["YOUNG", "TransientSweep", "compared", "latest", "neighbours", "place_of", "without"]
 
 # While frames arrive, the last WINDOW keyframes are compared after every EVERY keyframes. The last YOUNG of them have
 # been optimised too little, and are only asked about the others.
@@ -53,6 +53,11 @@ def compared(
     return coarse_view(render, image.rgba, image.camera, T_camera_world)
 
 
+def latest(keyframes: KeyframeStore) -> list[Keyframe]:
+    """Return the latest keyframes if enough have come since the last sweep, none otherwise."""
+    return list(keyframes)[-WINDOW:] if len(keyframes.selected) % EVERY == 0 else []
+
+
 def neighbours(place: int, count: int) -> list[int]:
     """Return the places of the neighbours of a view among `count` keyframes; `place` may lie between two of them."""
     both = {place + sign * distance for distance in DISTANCES for sign in (-1, 1)}
@@ -75,15 +80,6 @@ class TransientSweep:
         self.keyframes = keyframes
         self.renderer = renderer
         self.paging = paging
-
-    def after_keyframe(self, near: float) -> None:
-        """Sweep over the latest keyframes, if enough have come since the last time.
-
-        Args:
-            near: Depth below which nothing is drawn [scene units].
-        """
-        if len(self.keyframes.selected) % EVERY == 0:
-            self.sweep(list(self.keyframes)[-WINDOW:], near, young=YOUNG)
 
     def sweep(self, views: Sequence[Keyframe], near: float, young: int = 0) -> None:
         """Mask what moves in keyframes, and remove the Gaussians that most of them contradict.
