@@ -31,7 +31,7 @@ from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig, SourceSettings
 from modp_ti.files import readable
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import open_source
+from modp_ti.inputs.opening import open_source
 from modp_ti.outputs.formats.trajectory import read_trajectory
 
 SCALE, HOLDOUT = 0.5, 8

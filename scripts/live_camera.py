@@ -131,7 +131,7 @@ def load(show: Show) -> tuple[list[bytes], list[float]]:
     import cv2
 
     from modp_ti.config.settings import SourceSettings
-    from modp_ti.inputs.sources import open_source
+    from modp_ti.inputs.opening import open_source
     from modp_ti.inputs.sources.listed_images import ListedImages
 
     stop = None if show.frames is None else show.start + show.frames

@@ -1,4 +1,4 @@
-"""Poses in text files: lines in TUM format, and quaternions."""
+"""Poses in files: lines in TUM format, quaternions and matrices."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from fields.geometry.se3 import inverse_poses, matrices_from_unit_quaternions
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import NumberRows, read_number_rows
 
-__all__ = ["FARTHEST", "poses_of_quaternions", "read_tum_rows", "tum_poses"]
+__all__ = ["FARTHEST", "checked_pose", "poses_of_quaternions", "read_tum_rows", "tum_poses"]
 
 FARTHEST = 1e12
 """Largest valid coordinate [scene units]. Squared coordinates must fit the map's float32."""
 
 # Largest deviation of a quaternion's length from 1. Rounding in text files stays below it.
 MAX_LENGTH_ERROR = 1e-2
+# Largest deviation of R^T R from the identity. Rounding in text files stays below it.
+MAX_ROTATION_DEFECT = 1e-2
 
 
 def read_tum_rows(path: Path, setting: str = "tracker.path", few: float = 0.0, least: int = 1) -> NumberRows:
@@ -59,3 +61,37 @@ def poses_of_quaternions(
     poses[:, :3, :3] = matrices_from_unit_quaternions((quaternion / length[:, None])[:, [3, 0, 1, 2]])
     poses[:, :3, 3] = translation
     return poses
+
+
+def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    """Validate a pose (4, 4) and return the nearest rigid motion.
+
+    The rotation is projected onto SO(3) by SVD; the translation is kept.
+
+    Args:
+        matrix: Pose (4, 4).
+        what: Start of the error message, such as file and line.
+
+    Raises:
+        InputError: If the matrix contains NaN, Inf or values beyond `FARTHEST`, or is not a rigid motion.
+    """
+    rotation, translation = matrix[:3, :3], matrix[:3, 3]
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{what}: the pose holds NaN or infinite numbers")
+    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
+        raise InputError(f"{what}: the last row of the pose must be 0 0 0 1")
+    if np.abs(matrix).max() > FARTHEST:
+        raise InputError(f"{what}: the pose holds numbers beyond {FARTHEST:g}; the file is damaged")
+    defect = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if defect > MAX_ROTATION_DEFECT:
+        raise InputError(
+            f"{what}: the pose is no rigid motion (R^T R differs from the identity by {defect:.2g}); "
+            "give a rotation without scale or shear"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise InputError(f"{what}: the pose mirrors (determinant -1); its axes are not those of a camera")
+    u, _, vt = np.linalg.svd(rotation)
+    pose = np.eye(4)
+    pose[:3, :3] = u @ vt
+    pose[:3, 3] = translation
+    return pose

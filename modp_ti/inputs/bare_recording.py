@@ -17,7 +17,7 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bags import SUFFIXES, has_poses
 from modp_ti.inputs.captures import ARCHIVES, KINDS
-from modp_ti.inputs.sources import recognised_kind
+from modp_ti.inputs.opening import recognised_kind
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES
 
 __all__ = ["is_recording", "recorded_scene", "streamed_scene"]

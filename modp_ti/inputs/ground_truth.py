@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.association import MAX_DIFFERENCE, associate
 from modp_ti.inputs.protocol import Before
-from modp_ti.inputs.trackers.trajectory import MAX_DIFFERENCE, TimedPoses, associate, read_trajectory_file
+from modp_ti.inputs.trackers.trajectory import TimedPoses, read_trajectory_file
 
 __all__ = ["open_ground_truth", "true_poses"]
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import FEW, InputError, UnreadableImageError
-from modp_ti.files.trajectory import FARTHEST
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 
@@ -20,15 +19,11 @@ __all__ = [
     "PosedImage",
     "ReplayedTracker",
     "Unreadable",
-    "checked_pose",
     "is_held_out",
     "points_inside",
     "readable_sizes",
     "tracked_frame",
 ]
-
-# Largest deviation of R^T R from the identity. Rounding in text files stays below it.
-MAX_ROTATION_DEFECT = 1e-2
 
 
 @dataclass(frozen=True)
@@ -209,40 +204,6 @@ def is_held_out(index: int, source: SourceSettings) -> bool:
         source: Settings of the images.
     """
     return source.holdout is not None and index // source.panorama.count % source.holdout == 0
-
-
-def checked_pose(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
-    """Validate a pose (4, 4) and return the nearest rigid motion.
-
-    The rotation is projected onto SO(3) by SVD; the translation is kept.
-
-    Args:
-        matrix: Pose (4, 4).
-        what: Start of the error message, such as file and line.
-
-    Raises:
-        InputError: If the matrix contains NaN, Inf or values beyond `FARTHEST`, or is not a rigid motion.
-    """
-    rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{what}: the pose holds NaN or infinite numbers")
-    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
-        raise InputError(f"{what}: the last row of the pose must be 0 0 0 1")
-    if np.abs(matrix).max() > FARTHEST:
-        raise InputError(f"{what}: the pose holds numbers beyond {FARTHEST:g}; the file is damaged")
-    defect = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if defect > MAX_ROTATION_DEFECT:
-        raise InputError(
-            f"{what}: the pose is no rigid motion (R^T R differs from the identity by {defect:.2g}); "
-            "give a rotation without scale or shear"
-        )
-    if np.linalg.det(rotation) < 0:
-        raise InputError(f"{what}: the pose mirrors (determinant -1); its axes are not those of a camera")
-    u, _, vt = np.linalg.svd(rotation)
-    pose = np.eye(4)
-    pose[:3, :3] = u @ vt
-    pose[:3, 3] = translation
-    return pose
 
 
 def points_inside(

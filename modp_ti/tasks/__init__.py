@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from modp_ti.tasks.attempts import Retried, Stopping, Watched, run_tasks
-from modp_ti.tasks.engine import Ended, Engine, Running, open_engine
+from modp_ti.tasks.engine import Ended, Engine, Running
+from modp_ti.tasks.opening import open_engine
 from modp_ti.tasks.task import Answer, End, Report, Resources, Task
 
 __all__ = [

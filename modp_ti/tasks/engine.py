@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
-from modp_ti.files.errors import InputError
 from modp_ti.tasks.task import Answer, Resources, Work
 
-__all__ = ["Ended", "Engine", "Running", "open_engine"]
+__all__ = ["Ended", "Engine", "Running"]
 
 
 @dataclass(frozen=True)
@@ -73,30 +71,3 @@ class Engine(AbstractContextManager["Engine"], Protocol):
     def stop(self) -> None:
         """Ask all calls to end, as Ctrl-C would; queued ones do not begin. `events` tells how each has ended."""
         ...
-
-
-def open_engine(kind: str, address: str | None = None, jobs: int | None = None, logs: Path | None = None) -> Engine:
-    """Open an engine.
-
-    Args:
-        kind: "local" for processes on this machine, "ray" for a Ray cluster.
-        address: Address of the Ray cluster. None for the one that `RAY_ADDRESS` names or that runs on this machine;
-            without either, one is started here.
-        jobs: Largest number of calls at a time, for "local"; None for as many as the cores allow.
-        logs: Folder for what the processes of "local" print, `NAME.log` for each call; None discards it. Ray has logs
-            of its own.
-
-    Raises:
-        InputError: If the engine is not installed or cannot be reached, or an option is of the other kind.
-    """
-    if kind == "local":
-        from modp_ti.tasks.local import LocalEngine
-
-        if address is not None:
-            raise InputError("--address is for --engine ray")
-        return LocalEngine(jobs, logs)
-    from modp_ti.tasks.ray_engine import RayEngine
-
-    if jobs is not None:
-        raise InputError("--jobs is for --engine local: with ray, --cpus, --gpus and --memory say what fits a machine")
-    return RayEngine(address)

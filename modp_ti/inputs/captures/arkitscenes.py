@@ -9,10 +9,10 @@ import numpy as np
 from fields.geometry.se3 import exp_se3
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
+from modp_ti.inputs.association import associate
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame, opencv_pose, plausible_camera
 from modp_ti.inputs.captures.depth_maps import millimetre_png
 from modp_ti.inputs.captures.tables import read_numbers
-from modp_ti.inputs.trackers.trajectory import associate
 
 __all__ = ["is_arkitscenes", "read_arkitscenes"]
 

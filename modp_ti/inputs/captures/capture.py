@@ -14,7 +14,7 @@ from fields.geometry.se3 import inverse_se3
 from modp_ti.files import LARGEST
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
-from modp_ti.inputs.replay import checked_pose
+from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.intrinsics import require_plausible
 

@@ -12,10 +12,10 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.files.reading import readable
 from modp_ti.files.trajectory import poses_of_quaternions
+from modp_ti.inputs.association import associate
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame, checked_numbers, opencv_pose, plausible_camera
 from modp_ti.inputs.captures.tables import read_lines, read_numbers
 from modp_ti.inputs.sources.distortion import Distortion
-from modp_ti.inputs.trackers.trajectory import associate
 
 __all__ = ["is_euroc", "read_euroc"]
 

@@ -15,9 +15,10 @@ from modp_ti.inputs.klt.calibration import ADVICE, TYPICAL_FOCAL, estimated_intr
 from modp_ti.inputs.klt.pose_graph import solver_is_there
 from modp_ti.inputs.klt.selected_images import available, followed_scale, read_image, require_size
 from modp_ti.inputs.klt.tracker import KltTracker
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import readable_sizes
-from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source, require_intrinsics
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, require_intrinsics
 from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 __all__ = ["open_klt"]

@@ -14,8 +14,7 @@ from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files import LARGEST
 from modp_ti.files.errors import InputError
-from modp_ti.files.trajectory import FARTHEST
-from modp_ti.inputs.replay import checked_pose
+from modp_ti.files.trajectory import FARTHEST, checked_pose
 from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
 

@@ -12,9 +12,9 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import AriaSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.multiview.triangulation import triangulated_frames
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
-from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.trackers.aria_mps import (
     CameraMounts,
     DeviceTrajectory,

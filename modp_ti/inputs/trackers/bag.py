@@ -13,12 +13,12 @@ from modp_ti.inputs.bags.bag import CLOUD, POSES
 from modp_ti.inputs.bags.clouds import world_points
 from modp_ti.inputs.bags.depth_images import DepthTopic, depth_topics, read_depth_topic, with_depth_points
 from modp_ti.inputs.bags.frame_tree import FrameTree, clean, read_frame_tree
+from modp_ti.inputs.bags.images import BagImages
 from modp_ti.inputs.bags.pose_topics import read_pose_topic
 from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
-from modp_ti.inputs.sources import open_source
-from modp_ti.inputs.sources.bag import BagImages
 from modp_ti.inputs.trackers.given_poses import posed_images, selected_frames, solving, spread_points
 
 __all__ = ["open_bag"]

@@ -10,9 +10,10 @@ from modp_ti.files.errors import FEW, InputError
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame
 from modp_ti.inputs.captures.depth_maps import depth_points
 from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
-from modp_ti.inputs.sources import ImageSource, Undistorter, open_source
+from modp_ti.inputs.sources import ImageSource, Undistorter
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.trackers.given_poses import checked_reader, missing_frames_note, selected_frames, solving
 from modp_ti.inputs.trackers.stored_cameras import turn_of_camera, turned_note

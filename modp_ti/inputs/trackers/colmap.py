@@ -13,8 +13,10 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose, points_inside
-from modp_ti.inputs.sources import Distortion, Undistorter, open_source
+from modp_ti.files.trajectory import checked_pose
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker, points_inside
+from modp_ti.inputs.sources import Distortion, Undistorter
 from modp_ti.inputs.sources.distortion import colmap_intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn

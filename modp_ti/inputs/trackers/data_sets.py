@@ -13,9 +13,11 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ReplicaSettings, SevenScenesSettings
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import read_number_rows
+from modp_ti.files.trajectory import checked_pose
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.replay import ReplayedTracker, checked_pose
-from modp_ti.inputs.sources import ImageSource, open_source
+from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.inputs.sources import ImageSource
 from modp_ti.inputs.trackers.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
 
 __all__ = ["open_replica", "open_sevenscenes"]

@@ -14,8 +14,9 @@ from modp_ti.config.tracker_settings import ModpSettings
 from modp_ti.files import LARGEST, open_file, readable
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import read_number_rows
-from modp_ti.inputs.replay import ReplayedTracker, checked_pose
-from modp_ti.inputs.sources import open_source
+from modp_ti.files.trajectory import checked_pose
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers.given_poses import found_file, matched_entries, posed_images, read_entries
 from modp_ti.inputs.trackers.point_cloud import projected_points
 

@@ -18,9 +18,10 @@ from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL
 from modp_ti.inputs.multiview.features import detect_features
 from modp_ti.inputs.multiview.image_pairs import image_pairs
 from modp_ti.inputs.multiview.structure import MatchedImage, reconstructed
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import ReplayedTracker, Unreadable
-from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, open_source
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics
 from modp_ti.inputs.trackers.colmap import open_colmap
 from modp_ti.inputs.trackers.given_poses import selected_frames
 

@@ -12,8 +12,9 @@ from fields.frames.tracked_frame import SparsePoints
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import StellaVslamSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, points_inside
-from modp_ti.inputs.sources import ImageSource, Intrinsics, open_source
+from modp_ti.inputs.sources import ImageSource, Intrinsics
 from modp_ti.inputs.trackers.given_poses import found_file, posed_images
 from modp_ti.inputs.trackers.point_cloud import visible_points
 from modp_ti.inputs.trackers.stella_map import StellaKeyframe, StellaMap, read_stella_map

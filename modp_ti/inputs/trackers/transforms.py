@@ -17,10 +17,12 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files import is_file
 from modp_ti.files.errors import InputError
+from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.captures.capture import OPENCV_OPENGL
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, checked_pose
-from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter, open_source
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker
+from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.sources.undistortion import undistorter_beside

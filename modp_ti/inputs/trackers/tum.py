@@ -7,9 +7,9 @@ from pathlib import Path
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import OrbSlam3Settings, TumSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.trackers.given_poses import found_file, replay_poses
 from modp_ti.inputs.trackers.trajectory import read_trajectory_file, rows_at_frames
 

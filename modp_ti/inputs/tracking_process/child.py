@@ -19,13 +19,14 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
-from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout
 from modp_ti.inputs.tracking_process.messages import (
     CameraRevised,
     Delivered,
     Ended,
-    FrameRecord,
     Job,
     Opened,
     Preparing,

@@ -14,7 +14,7 @@ import numpy as np
 from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
-from modp_ti.inputs.tracking_process.messages import FrameRecord
+from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 
 __all__ = ["DeliveredLog"]
 

@@ -6,7 +6,6 @@ import mmap
 import os
 import tempfile
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.sources import Picture
-
-if TYPE_CHECKING:
-    from modp_ti.inputs.tracking_process.messages import FrameRecord
+from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 
 __all__ = ["CountsBoard", "FrameRing", "SlotLayout", "anonymous_memory"]
 

@@ -7,7 +7,8 @@ from threading import Condition
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.inputs.tracking_process.messages import CameraRevised, Ended, FrameRecord
+from modp_ti.inputs.tracking_process.frame_record import FrameRecord
+from modp_ti.inputs.tracking_process.messages import CameraRevised, Ended
 
 __all__ = ["LIMIT", "ROOM", "Outbox"]
 

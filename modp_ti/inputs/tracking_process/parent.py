@@ -21,8 +21,9 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.files.child_environment import child_environment
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.live_counts import LiveCounts
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter, open_source
+from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import StoredFrames
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog

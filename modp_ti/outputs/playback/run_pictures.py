@@ -14,7 +14,8 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import FrameReader, Picture, Undistorter, open_source
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run

@@ -14,7 +14,8 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings, TransformsSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.replay import checked_pose, points_inside
+from modp_ti.files.trajectory import checked_pose
+from modp_ti.inputs.replay import points_inside
 from modp_ti.inputs.sources import Undistorter
 from modp_ti.inputs.trackers.colmap import open_colmap
 from modp_ti.inputs.trackers.transforms import open_transforms

@@ -14,7 +14,7 @@ from modp_ti.inputs.bags import has_poses, is_bag
 from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
 from modp_ti.inputs.inspection.survey import survey
-from modp_ti.inputs.sources import open_source
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.trackers import bag as bag_tracker
 from tests.bags import BODY_CAMERA, FORMS, OPTICAL, START, STEP, Messages, recording, write_bag
 

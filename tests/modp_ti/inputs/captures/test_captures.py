@@ -17,8 +17,8 @@ from modp_ti.inputs.captures import KINDS, recognised_capture
 from modp_ti.inputs.inspection.conventions import STATED
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
 from modp_ti.inputs.inspection.survey import survey
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.sources import open_source
 from modp_ti.inputs.trackers import captures, open_tracker
 from tests.captures import OPENGL, WRITERS, View, zipped
 

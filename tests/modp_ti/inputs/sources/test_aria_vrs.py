@@ -15,7 +15,8 @@ import pytest
 
 from modp_ti.config.settings import SourceSettings, VrsSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import FrameReader, open_source
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import FrameReader
 
 needs_library = pytest.mark.skipif(
     importlib.util.find_spec("projectaria_tools") is None, reason="projectaria-tools is not installed"

@@ -13,7 +13,7 @@ import yaml
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SourceSettings
-from modp_ti.inputs.sources import open_source, recognised_kind
+from modp_ti.inputs.opening import open_source, recognised_kind
 
 PAGE = Path(__file__).resolve().parents[4] / "docs" / "sources.md"
 EXAMPLES = dict(re.findall(r"^## ([^\n]+)\n\n```yaml\n(.*?)```", PAGE.read_text(), re.DOTALL | re.MULTILINE))

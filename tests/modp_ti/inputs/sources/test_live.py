@@ -19,7 +19,8 @@ from fields.runtime import disk_room
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
-from modp_ti.inputs.sources import live, open_source
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import live
 from modp_ti.inputs.sources.live import LiveSource
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.patience import PATIENCE

@@ -13,7 +13,8 @@ from PIL import Image, ImageOps
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import Distortion, ImageFolder, open_source
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import Distortion, ImageFolder
 from modp_ti.inputs.sources.orientation import Turn, turn_of_exif
 
 STORED = cv2.resize(np.random.default_rng(4).integers(0, 255, (4, 6, 3), dtype=np.uint8), (48, 32))

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from modp_ti.config.settings import SceneConfig, SourceSettings
-from modp_ti.inputs.sources import ImageFolder, open_source
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import ImageFolder
 from modp_ti.inputs.sources.paced import PacedSource
 
 

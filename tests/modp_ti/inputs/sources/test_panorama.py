@@ -13,7 +13,7 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.camera_settings import PanoramaSettings
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import open_source
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources.panorama import Projection, faces_of, projection_of
 from tests.panoramas import equirectangular_rays, fisheye_rays
 

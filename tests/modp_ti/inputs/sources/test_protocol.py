@@ -11,7 +11,8 @@ import pytest
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs import captures
-from modp_ti.inputs.sources import _OPENERS, ImageFolder, ImageSource, open_source
+from modp_ti.inputs.opening import _OPENERS, open_source
+from modp_ti.inputs.sources import ImageFolder, ImageSource
 
 
 @pytest.fixture

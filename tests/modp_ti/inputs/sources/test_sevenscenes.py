@@ -8,7 +8,8 @@ import pytest
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import open_source, require_intrinsics
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import require_intrinsics
 
 
 def sequence(folder, *names):

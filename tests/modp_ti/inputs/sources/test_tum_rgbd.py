@@ -8,7 +8,7 @@ import pytest
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import open_source
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
 
 IMAGE = np.zeros((480, 640, 3), np.uint8)

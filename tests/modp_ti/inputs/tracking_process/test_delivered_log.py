@@ -10,7 +10,7 @@ import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
-from modp_ti.inputs.tracking_process.messages import FrameRecord
+from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from tests.modp_ti.inputs.tracking_process.frames import random_frame
 
 

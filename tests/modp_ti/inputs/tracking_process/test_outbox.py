@@ -10,7 +10,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.tracking_process import outbox as module
-from modp_ti.inputs.tracking_process.messages import FrameRecord
+from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from modp_ti.inputs.tracking_process.outbox import Outbox
 from tests.modp_ti.inputs.tracking_process.frames import assert_same, random_frame
 from tests.patience import PATIENCE

@@ -19,7 +19,8 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
-from modp_ti.inputs.sources import FrameReader, open_source
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.trackers import open_tracker
 from modp_ti.inputs.tracking_process import TrackingProcess, child
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded

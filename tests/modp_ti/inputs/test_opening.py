@@ -9,7 +9,8 @@ import pytest
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources import ImageFolder, open_source, recognised_kind, require_intrinsics
+from modp_ti.inputs.opening import open_source, recognised_kind
+from modp_ti.inputs.sources import ImageFolder, require_intrinsics
 
 
 def image(file, width=64, height=48):

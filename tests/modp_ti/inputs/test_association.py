@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modp_ti.inputs.trackers.trajectory import associate
+from modp_ti.inputs.association import associate
 
 
 def by_hand(a, b, max_difference):
