@@ -30,7 +30,7 @@ from pipelines.select.views import LocalGlobalViews, ViewSelection
 from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
 from pipelines.transients.changes import ChangeSweep, EarlierVisit
-from pipelines.transients.sweep import YOUNG, TransientSweep, latest
+from pipelines.transients.sweep import EVERY, YOUNG, TransientSweep, latest
 
 __all__ = ["OnlineMap"]
 
@@ -128,21 +128,24 @@ class OnlineMap(Pipeline):
         Args:
             places: Places of the keyframes in the store.
         """
-        self._mask([self.keyframes[place] for place in places.tolist()], 0)
+        views = [self.keyframes[place] for place in places.tolist()]
+        self._mask(views, views)
 
     def mask_latest(self) -> None:
         """Do so in the latest keyframes, if enough have come since the last time.
 
         The last few have been optimised too little, and are only asked about the others.
         """
-        self._mask(latest(self.keyframes), YOUNG)
+        views = latest(self.keyframes)
+        self._mask(views, views[-2 * EVERY : -YOUNG], YOUNG)
 
-    def _mask(self, views: Sequence[Keyframe], young: int) -> None:
+    def _mask(self, views: Sequence[Keyframe], witnesses: Sequence[Keyframe], young: int = 0) -> None:
+        """Mask what moves in `views`, of which the last `young` stay as they are, and what `witnesses` show changed."""
         with self.stopwatch.measure("remove"):
             if self.transients is not None and views:
                 self.transients.sweep(views, self.near, young)
             if self.changes is not None:
-                self.changes.sweep(views[: len(views) - young], self.near)
+                self.changes.sweep(witnesses, self.near)
 
     def watch_changes(self, earlier: EarlierVisit) -> None:
         """Mask from now on, in the keyframes of an earlier visit, what has changed since.

@@ -17,7 +17,7 @@ from pipelines.render.renderer import RenderedView, Renderer
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 from pipelines.transients.masks import soft_mask
 
-__all__ = ["YOUNG", "TransientSweep", "compared", "latest", "neighbours", "place_of", "without"]
+__all__ = ["EVERY", "YOUNG", "TransientSweep", "compared", "latest", "neighbours", "place_of", "without"]
 
 # While frames arrive, the last WINDOW keyframes are compared after every EVERY keyframes. The last YOUNG of them have
 # been optimised too little, and are only asked about the others.
