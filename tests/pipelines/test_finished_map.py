@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +57,19 @@ def test_the_map_is_the_finished_one(finished: Finished) -> None:
     assert mapper.optimiser.compare(store[0], store.scene_depth).psnr == pytest.approx(finished.psnr, abs=0.1)
     # The errors are those of the map, and not those of keyframes that nothing has optimised.
     assert store.errors().max() < 2.0 * finished.errors.max()
+
+
+def test_what_the_finished_run_has_masked_stays_masked(finished: Finished) -> None:
+    mask = np.full((12, 16), 255, dtype=np.uint8)
+    mask[4:8] = 0
+    masked = list(finished.map.keyframes)[1]
+    mapper = fresh_mapper()
+    mapper.go_on_with(replace(finished.map, masks={masked: mask}))
+    for view in mapper.keyframes:
+        assert (view.transient is mask) == (view.index == masked)
+        rows = (view.rgba[..., 3] == 0).all(axis=1)
+        assert rows[18:30].all() == (view.index == masked)
+        assert not rows[:14].any()
 
 
 def test_every_gaussian_has_the_first_keyframe_that_shows_it_as_anchor(finished: Finished) -> None:
