@@ -61,8 +61,8 @@ class Results:
     def writing_map(self) -> Iterator[None]:
         """Move the files that are written inside this context to the output folder together, if no error occurred.
 
-        Files of an earlier run that this map may not have are deleted from there. It
-        raises InputError if the files cannot be written.
+        Files of an earlier run that this map may not have are deleted from there. It raises InputError if the files
+        cannot be written.
         """
         with appearing(self.config.output) as self.folder:
             yield
