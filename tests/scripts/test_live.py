@@ -385,7 +385,9 @@ def test_a_tracker_at_the_socket_loses_nothing(tmp_path: Path) -> None:
         "output:  out\n"
     )
     settings = ["--set", "mapping.optimise.steps=1", "--set", "export.report=false"]
-    options = ["--rate", "10", "--seconds", "0", "--cold", "-o", str(tmp_path / "live")]
+    # A mapper that is given no time for a keyframe reaches 14.9 dB. With kernels that are compiled before, and at this
+    # rate, it reached 32 dB on an idle core and 21.6 beside four busy processes on two cores.
+    options = ["--rate", "4", "--seconds", "0", "-o", str(tmp_path / "live")]
     command = [sys.executable, str(SCRIPT), str(scene), *options, *settings]
     result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert result.returncode == 0, result.stderr
