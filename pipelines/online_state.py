@@ -91,8 +91,12 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     if len(mapper.gaussians) and mapper.gaussians.anchors().max() >= len(mapper.densifier.anchors):
         raise ValueError("a Gaussian has an anchor that the state does not contain")
     if mapper.densifier.voxels is not None:
-        mapper.densifier.voxels.settle(state.numbers["coarsest"], state.numbers["origin"])
-        mapper.densifier.voxels.restore(**state.group("voxels"))
+        coarsest, origin = state.numbers["coarsest"], np.array(state.numbers["origin"])
+        if marks := state.group("voxels"):
+            mapper.densifier.voxels.settle(coarsest, origin)
+            mapper.densifier.voxels.restore(**marks)
+        else:  # those of an earlier version had another layout
+            mapper.densifier.restart_voxels(coarsest, origin, *mapper.paging.placed())
     previous = state.group("previous")
     mapper.selector.previous = int(previous["index"]) if previous else None
     if previous and mapper.selector.previous not in mapper.trajectory:

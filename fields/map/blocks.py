@@ -13,7 +13,7 @@ from fields.geometry.camera import PinholeCamera
 __all__ = ["Blocks", "Boxes", "box_of", "divide", "extent_of", "planes_of", "seen"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Boxes:
     """The smallest boxes, with sides along the axes, around each block's Gaussians.
 

@@ -1,9 +1,9 @@
 """The layout of the occupancy voxels' bricks, and `Bricks`, the storage of their words.
 
-A brick holds four levels of the same place: 16^3 cells of the finest of them, then 8^3, 4^3 and 2^3, with one bit per
-cell, in words of 4^3 cells. The last word is only one eighth full. A depth counts levels above the finest, and four
-depths make a stack. The bricks of further stacks follow along the first axis, so that the corner of a brick, three
-integers, tells its stack as well.
+A brick holds three levels of the same place: 8^3 cells of the finest of them, then 4^3 and 2^3, with one bit per cell,
+in words of 4^3 cells. The last word is only one eighth full. A depth counts levels above the finest, and three depths
+make a stack. The bricks of further stacks follow along the first axis, so that the corner of a brick, three integers,
+tells its stack as well.
 """
 # pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportOptionalCall=false
 
@@ -18,6 +18,7 @@ from fields.runtime.engine import ti
 
 __all__ = [
     "BRICKS",
+    "BRICK_BYTES",
     "BRICK_LEVELS",
     "SIDE",
     "WORDS",
@@ -28,12 +29,14 @@ __all__ = [
     "without_repetitions",
 ]
 
-BRICK_LEVELS = 4
+BRICK_LEVELS = 3
 BRICK = 2**BRICK_LEVELS
-FIRST_WORD = (0, 64, 72, 73)
-WORDS = 74
+FIRST_WORD = (0, 8, 9)
+WORDS = 10
+# Bytes that a brick takes, with its share of the nodes above it or of the hash table: 230 to 445 in a sparse tree.
+BRICK_BYTES = 256
 # Bricks per axis, for each stack.
-BRICKS = 1 << 15
+BRICKS = 1 << 16
 SIDE = BRICK * BRICKS
 
 
@@ -42,18 +45,20 @@ def depth_reached(cell, level, levels):
     """Depth of the first level from `level` up that covers a cell; `levels` if none does."""
     depth = levels - 1 - level
     reach = ti.max(cell, -1 - cell).max()
-    # The four levels of a brick cover the same range.
-    while depth < levels and (reach >> (depth & -BRICK_LEVELS)) >= SIDE // 2:
-        depth = (depth & -BRICK_LEVELS) + BRICK_LEVELS
+    # The levels of a brick cover the same range.
+    first = depth - ti.raw_mod(depth, BRICK_LEVELS)
+    while depth < levels and (reach >> first) >= SIDE // 2:
+        first += BRICK_LEVELS
+        depth = first
     return depth
 
 
 @ti.func
 def place_of(cell, depth):
     """Place of a cell at a depth: the corner of its brick, and its word and bit there."""
-    # Shifts, since floor division of signed integers takes many instructions.
-    stack = depth >> 2
-    within = depth & (BRICK_LEVELS - 1)
+    # Shifts and raw division, since floor division of signed integers takes many instructions.
+    stack = ti.raw_div(depth, BRICK_LEVELS)
+    within = depth - stack * BRICK_LEVELS
     brick = (cell >> ((stack + 1) * BRICK_LEVELS)) + BRICKS // 2
     inside = (cell >> depth) & ((BRICK >> within) - 1)
     first = 0
@@ -104,7 +109,7 @@ class Bricks(ABC):
 
     @abstractmethod
     def read(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
-        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 74)."""
+        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 10)."""
 
     @abstractmethod
     def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
@@ -146,7 +151,7 @@ class Bricks(ABC):
         depth = self.levels - 1 - level
         reach = np.maximum(cells, -1 - cells).max(axis=1)
         for _ in range(self.stacks):
-            stack = depth & -BRICK_LEVELS
-            beyond = (depth < self.levels) & ((reach >> stack) >= SIDE // 2)
-            depth = np.where(beyond, stack + BRICK_LEVELS, depth)
+            first = depth - depth % BRICK_LEVELS
+            beyond = (depth < self.levels) & ((reach >> first) >= SIDE // 2)
+            depth = np.where(beyond, first + BRICK_LEVELS, depth)
         return depth

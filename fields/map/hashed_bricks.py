@@ -48,7 +48,7 @@ class HashedBricks(Bricks):
         self._halves.fill(0)
 
     def read(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
-        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 74)."""
+        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 10)."""
         halves = self._halves.to_numpy()[: self._count]
         words = halves[:, 0::2] | halves[:, 1::2].astype(np.uint64) << np.uint64(32)
         return self._corners.to_numpy()[: self._count], words

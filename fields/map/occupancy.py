@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fields.map.bricks import BRICK_LEVELS, BRICKS, SIDE, WORDS, Bricks, corner_of
+from fields.map.bricks import BRICK_BYTES, BRICK_LEVELS, BRICKS, SIDE, WORDS, Bricks, corner_of
 from fields.map.hashed_bricks import HashedBricks
 from fields.map.sparse_bricks import SparseBricks
 from fields.runtime.backend import has_sparse_fields, program
 
 __all__ = ["OccupancyVoxels"]
 
-MAX_LEVELS = 16
+MAX_LEVELS = 15
 # Cell indices are clipped to this before the conversion to integers. It is out of range at every level.
 FARTHEST = 2.0**31 - 1.0
 
@@ -86,8 +86,8 @@ class OccupancyVoxels:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the allocated bricks."""
-        return self._bricks.count * WORDS * 8
+        """Bytes of the allocated bricks, see `BRICK_BYTES`."""
+        return self._bricks.count * BRICK_BYTES
 
     def marks(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
         """Return all marks, for `restore`.
@@ -165,7 +165,7 @@ class OccupancyVoxels:
         for stack in range(self._bricks.stacks):
             coarsest = np.full(len(cells), max(self.levels - BRICK_LEVELS * (stack + 1), 0), dtype=np.int32)
             new = np.flatnonzero((stack >= asked) & ~self._bricks.query(cells, coarsest))
-            cost[new[np.unique(corner_of(cells[new], stack), axis=0, return_index=True)[1]]] += WORDS * 8
+            cost[new[np.unique(corner_of(cells[new], stack), axis=0, return_index=True)[1]]] += BRICK_BYTES
         return cost
 
     def admit(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.bool_]:

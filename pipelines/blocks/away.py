@@ -111,7 +111,8 @@ class BlocksOnDisk:
             self._put(place, box, viewers, self.sweep)
 
     def _put(self, stored: StoredBlock, box: Boxes, viewers: NDArray[np.int64], sweep: int) -> BlockOnDisk:
-        block = BlockOnDisk(self._added, stored, box, viewers, sweep)
+        # A copy: a view would keep the boxes of all blocks that were considered with it.
+        block = BlockOnDisk(self._added, stored, Boxes(box.low.copy(), box.high.copy()), viewers, sweep)
         self._blocks[self._added] = block
         self._added += 1
         self._boxes = None

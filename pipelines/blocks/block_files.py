@@ -23,7 +23,7 @@ class BlockError(ValueError):
     """Raised if a file of a block is missing or damaged. The message has one line."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class StoredBlock:
     """Where a block is stored.
 

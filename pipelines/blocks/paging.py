@@ -13,6 +13,7 @@ from fields.map.blocks import Blocks, Boxes, divide, extent_of, seen
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
+from fields.runtime.heap import give_back_heap
 from pipelines.blocks.away import BlocksOnDisk, planes_of_views
 from pipelines.blocks.groups import grouped
 from pipelines.memory_budget import OBSERVATION, MemoryBudget
@@ -31,7 +32,7 @@ TOGETHER = 1.5
 # around the camera are drawn in this way, and those of distant places are not.
 MISSING = 0.5
 # Bytes of voxels that a new Gaussian takes, rounded up.
-VOXELS_EACH = 80
+VOXELS_EACH = 128
 
 
 class Paging:
@@ -243,6 +244,7 @@ class Paging:
             for place in sorted(images):
                 self.away.store_images(self.keyframes[place])
             self.away.forget_pages()
+            give_back_heap()
         except OSError as error:
             self.problem = f"blocks of the map cannot be kept on disk: {error.strerror}"
 

@@ -26,7 +26,7 @@ __all__ = ["FILE", "OLDEST", "VERSION", "read_arrays", "write_arrays"]
 FILE = "snapshot.npz"
 # Version of the arrays and the JSON. Versions before `OLDEST` and newer ones are refused, as they hold the state of
 # different code; `Snapshot.read` converts those in between.
-VERSION = 3
+VERSION = 4
 OLDEST = 2
 ABOUT = "about"
 KINDS = "biuf"

@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-__all__ = ["convert_version_2"]
+__all__ = ["convert_version_2", "convert_version_3"]
 
 
 def convert_version_2(arrays: dict[str, NDArray], numbers: dict[str, Any]) -> None:
@@ -21,3 +21,12 @@ def convert_version_2(arrays: dict[str, NDArray], numbers: dict[str, Any]) -> No
     arrays["tracked.index"], arrays["tracked.held_out"] = arrays["frames.index"], arrays["frames.held_out"]
     gate = numbers["map"]["gate"]
     gate["before"] = [None if pair is None else pair[0] for pair in gate["before"]]
+
+
+def convert_version_3(arrays: dict[str, NDArray]) -> None:
+    """Convert arrays of version 3 in place.
+
+    Its marks of voxels have another layout. Without marks, those of the Gaussians are made again.
+    """
+    for name in ("voxels.places", "voxels.words"):
+        arrays.pop(name, None)

@@ -17,7 +17,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
 from modp_ti.engine.snapshots.file import read_arrays, write_arrays
-from modp_ti.engine.snapshots.old_versions import convert_version_2
+from modp_ti.engine.snapshots.old_versions import convert_version_2, convert_version_3
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
@@ -124,6 +124,8 @@ class Snapshot:
         try:
             if about["version"] == 2:
                 convert_version_2(arrays, about["numbers"])
+            if about["version"] <= 3:
+                convert_version_3(arrays)
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
         except (IndexError, KeyError, TypeError, ValueError) as error:
             raise _unfit(path, error) from None
