@@ -31,11 +31,11 @@ class OccupancyVoxels:
     over the levels, from the coarsest on, is therefore the bit of the finest level used. Marking goes from that level
     to the coarser ones and stops at the first cell that is already marked.
 
-    The bits are stored in bricks of 592 bytes, each of which holds four levels of the same place: as the leaves of a
+    The bits are stored in bricks of 80 bytes, each of which holds three levels of the same place: as the leaves of a
     sparse SNode hierarchy on the CPU and CUDA (`SparseBricks`), and in a hash table on devices without sparse fields
     (`HashedBricks`). Memory is proportional to the occupied bricks. 300,000 points on the walls of a room 80 coarsest
-    cells wide take 20 MB down to the fourth of eight levels, which the mapper uses, and 260 MB down to the eighth,
-    where no two points share a brick.
+    cells wide take 22 MB down to the fifth of eight levels, and 148 MB down to the eighth, where no two points share a
+    brick. The mapper mostly asks for the fourth and the fifth.
 
     Args:
         coarsest: Size of the coarsest cell [scene units], S_init of the paper.

@@ -50,7 +50,7 @@ def mapped(memory: float | None, frames: int = FRAMES) -> Mapped:
         [view.index for view in mapper.keyframes],
         mapper.caught(),
         mapper.budget.held(),
-        len(mapper.gaussians) * 240 + images + points + bricks * 592,
+        len(mapper.gaussians) * 240 + images + points + bricks * 256,
         mapper.renderer.view_renders,
     )
 

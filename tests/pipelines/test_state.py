@@ -116,3 +116,16 @@ def test_a_state_that_does_not_fit_is_refused(states: dict[str, MapState], name:
     arrays = {n: a for n, a in state.arrays.items() if n != name} | ({} if value is None else {name: value})
     with pytest.raises((KeyError, ValueError, IndexError)):
         restored(MapState(arrays, state.numbers), EXPOSED)
+
+
+def test_without_marks_the_voxels_are_those_of_the_gaussians(states: dict[str, MapState]) -> None:
+    state = states["5"]
+    arrays = {name: array for name, array in state.arrays.items() if not name.startswith("voxels.")}
+    assert len(arrays) == len(state.arrays) - 2
+    mapper = restored(MapState(arrays, state.numbers), EXPOSED)
+    position, spacing = mapper.gaussians.to_numpy()["position"], arrays["anchors.spacing"][mapper.gaussians.anchors()]
+    voxels = mapper.densifier.voxels
+    assert voxels.query(position, spacing).all()
+    elsewhere = position + np.array([0.0, 0.0, 2.0 * voxels.coarsest])
+    assert not voxels.query(elsewhere, spacing).all()
+    assert mapper.state().numbers == state.numbers

@@ -24,8 +24,8 @@ ARRAYS = {
 }
 
 
-def write_version_2(folder: Path, monkeypatch: pytest.MonkeyPatch, arrays: dict, before: object) -> Path:
-    monkeypatch.setattr(snapshot_file, "VERSION", 2)
+def write(folder: Path, monkeypatch: pytest.MonkeyPatch, arrays: dict, before: object, version: int = 2) -> Path:
+    monkeypatch.setattr(snapshot_file, "VERSION", version)
     position = {"events": 3, "digest": 5, "finished": False, "refined": 0}
     numbers = {"map": {"gate": {"before": before}}}
     write_arrays(folder / FILE, arrays, {"settings": {}, "position": position, "numbers": numbers})
@@ -34,7 +34,7 @@ def write_version_2(folder: Path, monkeypatch: pytest.MonkeyPatch, arrays: dict,
 
 
 def test_version_2_has_one_trajectory_of_all_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_version_2(tmp_path, monkeypatch, ARRAYS, [[2, POSES[2].tolist()], None])
+    path = write(tmp_path, monkeypatch, ARRAYS, [[2, POSES[2].tolist()], None])
     snapshot = Snapshot.read(path)
     trajectory = Trajectory()
     trajectory.restore(snapshot.map.group("tracked"))
@@ -43,12 +43,20 @@ def test_version_2_has_one_trajectory_of_all_frames(tmp_path: Path, monkeypatch:
     assert snapshot.numbers["map"]["gate"]["before"] == [2, None]
 
 
+def test_version_3_leaves_its_marks_of_voxels_to_the_gaussians(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    marks = {"voxels.places": np.zeros((1, 4), np.int32), "voxels.words": np.ones(1, np.uint64)}
+    gaussians = {"gaussians.opacity_logit": np.zeros(4, np.float32)}
+    snapshot = Snapshot.read(write(tmp_path, monkeypatch, gaussians | marks, [], version=3))
+    assert list(snapshot.arrays) == ["gaussians.opacity_logit"] and snapshot.map.group("voxels") == {}
+    assert snapshot.numbers["map"]["gate"]["before"] == []
+
+
 @pytest.mark.parametrize(("missing", "before"), [("frames.T_tracked", []), ("", [[]]), ("", None), ("", [3])])
 def test_a_damaged_one_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str, before: object
 ) -> None:
     arrays = {name: array for name, array in ARRAYS.items() if name != missing}
-    path = write_version_2(tmp_path, monkeypatch, arrays, before)
+    path = write(tmp_path, monkeypatch, arrays, before)
     with pytest.raises(InputError, match="the parts of the snapshot do not fit together") as refused:
         Snapshot.read(path)
     assert "\n" not in str(refused.value)
