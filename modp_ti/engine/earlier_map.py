@@ -10,6 +10,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.inputs.protocol import Tracker
+from pipelines.settings import RefineSettings
 
 __all__ = ["EarlierMap"]
 
@@ -46,6 +47,10 @@ class EarlierMap:
         Args:
             mapper: The mapper of a resumed run.
         """
+
+    def refinement(self, settings: RefineSettings) -> RefineSettings:
+        """Return the settings of the refinement of the run's map, given those of the run. Call `join` before."""
+        return settings
 
     @property
     def seconds(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -271,7 +272,7 @@ class _Session:
             checkpointer.after_mapping()
             checkpointer.online = versions[config.mode]
             try:
-                self._refine(config.refine)
+                self._refine(self.earlier.refinement(config.refine))
             except RunStopped:
                 raise self.unfinished.interrupted() from None
             versions["refined"] = self.mapper.version()
@@ -284,13 +285,12 @@ class _Session:
         self.line.start("refining", steps, done, lambda step: step * scores, prepares=True)
         schedule = self.conductor.schedule(settings)
         try:
-            self.mapper.refine(settings.steps, settings, self._refined, done, schedule)
+            self.mapper.refine(settings.steps, settings, partial(self._refined, steps), done, schedule)
         finally:
             self.line.stop()
 
-    def _refined(self, step: int, psnr: float) -> None:
-        """Callback after a step of refinement."""
-        steps = self.config.refine.steps if self.config.refine.seconds is None else None
+    def _refined(self, steps: int | None, step: int, psnr: float) -> None:
+        """Callback after a step of a refinement of so many steps, None for one by the clock."""
         self.record.steps.append(StepNote(step, psnr))
         self.checkpointer.after_step(step, steps)
         self._after_step("refining", step, steps, psnr)

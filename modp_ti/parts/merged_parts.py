@@ -21,6 +21,7 @@ from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.parts.cutting import Part
 from modp_ti.parts.part_scenes import part_config, parts_of
 from pipelines.merging.merge import MappedPart
+from pipelines.settings import RefineSettings
 
 __all__ = ["MergedParts"]
 
@@ -62,6 +63,15 @@ class MergedParts(EarlierMap):
         self._posed = [frame.name for frame in tracker.frames]
         self._names = [name for name in self._posed if name in read]
         return tracker
+
+    def refinement(self, settings: RefineSettings) -> RefineSettings:
+        """Add the steps that the keyframes did not get in their parts, in views."""
+        mapping, budget = self._config.mapping, self._config.mapping.optimise.budget
+        left = mapping.optimise.steps - part_config(self._config, self._parts[0]).mapping.optimise.steps
+        counts = [len(run.record.keyframes) for run in self._runs]
+        keyframes = sum(count if budget is None else min(count, budget) for count in counts)
+        further = keyframes * left * mapping.views.per_step // settings.views
+        return settings.model_copy(update={"steps": settings.steps + further})
 
     @property
     def seconds(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 
 from fields.map.covisibility import SeenPoints
@@ -15,6 +16,9 @@ __all__ = ["FOLDER", "part_config", "part_scenes", "parts_of"]
 
 # Folder of the parts in the output folder.
 FOLDER = "parts"
+# Share of the steps of a keyframe that it gets in its part. The refinement of the merged map gets the others: a part
+# optimises what the merged map takes from another one as well, and the seams need the steps.
+IN_PART = 0.5
 
 
 def parts_of(tracker: Tracker, config: SceneConfig) -> list[Part]:
@@ -51,9 +55,13 @@ def part_scenes(tracker: Tracker, config: SceneConfig) -> list[Scene]:
 def part_config(config: SceneConfig, part: Part) -> SceneConfig:
     """Return the settings of the run of a part. Refinement, scores and reports are for the merged map."""
     source = config.source.model_copy(update={"part": (part.frames.start, part.frames.stop)})
+    optimise = config.mapping.optimise
+    if config.refine.wanted and config.refine.seconds is None:
+        optimise = optimise.model_copy(update={"steps": math.ceil(IN_PART * optimise.steps)})
     return config.model_copy(
         update={
             "source": source,
+            "mapping": config.mapping.model_copy(update={"optimise": optimise}),
             "parts": None,
             "output": config.output / FOLDER / str(part.number),
             "refine": config.refine.model_copy(update={"steps": 0, "seconds": None}),
