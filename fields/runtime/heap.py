@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from contextlib import suppress
 
 __all__ = ["give_back_heap"]
 
@@ -14,6 +15,5 @@ def give_back_heap() -> None:
     glibc keeps freed arrays of up to 32 MB for later ones. Between allocations that stay, these add up.
     """
     if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # absent in musl
-        if trim is not None:
-            trim(0)
+        with suppress(AttributeError):  # musl has no such function
+            ctypes.CDLL(None).malloc_trim(0)

@@ -19,7 +19,7 @@ from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.parts.cutting import Part
-from modp_ti.parts.part_scenes import part_config, parts_of
+from modp_ti.parts.part_scenes import part_config, parts_of, steps_in_part
 from pipelines.merging.merge import MappedPart
 from pipelines.settings import RefineSettings
 
@@ -67,7 +67,7 @@ class MergedParts(EarlierMap):
     def refinement(self, settings: RefineSettings) -> RefineSettings:
         """Add the steps that the keyframes did not get in their parts, in views."""
         mapping, budget = self._config.mapping, self._config.mapping.optimise.budget
-        left = mapping.optimise.steps - part_config(self._config, self._parts[0]).mapping.optimise.steps
+        left = mapping.optimise.steps - steps_in_part(self._config)
         counts = [len(run.record.keyframes) for run in self._runs]
         keyframes = sum(count if budget is None else min(count, budget) for count in counts)
         further = keyframes * left * mapping.views.per_step // settings.views

@@ -12,7 +12,7 @@ from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.parts.cutting import Part, cut
 
-__all__ = ["FOLDER", "part_config", "part_scenes", "parts_of"]
+__all__ = ["FOLDER", "part_config", "part_scenes", "parts_of", "steps_in_part"]
 
 # Folder of the parts in the output folder.
 FOLDER = "parts"
@@ -55,9 +55,7 @@ def part_scenes(tracker: Tracker, config: SceneConfig) -> list[Scene]:
 def part_config(config: SceneConfig, part: Part) -> SceneConfig:
     """Return the settings of the run of a part. Refinement, scores and reports are for the merged map."""
     source = config.source.model_copy(update={"part": (part.frames.start, part.frames.stop)})
-    optimise = config.mapping.optimise
-    if config.refine.wanted and config.refine.seconds is None:
-        optimise = optimise.model_copy(update={"steps": math.ceil(IN_PART * optimise.steps)})
+    optimise = config.mapping.optimise.model_copy(update={"steps": steps_in_part(config)})
     return config.model_copy(
         update={
             "source": source,
@@ -69,3 +67,9 @@ def part_config(config: SceneConfig, part: Part) -> SceneConfig:
             "export": config.export.model_copy(update={"images": False, "report": False}),
         }
     )
+
+
+def steps_in_part(config: SceneConfig) -> int:
+    """Return the steps of a keyframe in its part: all of them without a refinement of so many steps."""
+    steps = config.mapping.optimise.steps
+    return math.ceil(IN_PART * steps) if config.refine.wanted and config.refine.seconds is None else steps

@@ -23,10 +23,14 @@ def convert_version_2(arrays: dict[str, NDArray], numbers: dict[str, Any]) -> No
     gate["before"] = [None if pair is None else pair[0] for pair in gate["before"]]
 
 
-def convert_version_3(arrays: dict[str, NDArray]) -> None:
-    """Convert arrays of version 3 in place.
+def convert_version_3(arrays: dict[str, NDArray], numbers: dict[str, Any]) -> None:
+    """Convert arrays and numbers of version 3 in place.
 
-    Its marks of voxels have another layout. Without marks, those of the Gaussians are made again.
+    Its marks of voxels have another layout, so that those of the Gaussians are made again.
+
+    Raises:
+        KeyError, TypeError: If the snapshot is incomplete.
     """
     for name in ("voxels.places", "voxels.words"):
         arrays.pop(name, None)
+    numbers["map"]["voxels_made_again"] = True

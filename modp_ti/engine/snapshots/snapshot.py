@@ -125,7 +125,7 @@ class Snapshot:
             if about["version"] == 2:
                 convert_version_2(arrays, about["numbers"])
             if about["version"] <= 3:
-                convert_version_3(arrays)
+                convert_version_3(arrays, about["numbers"])
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
         except (IndexError, KeyError, TypeError, ValueError) as error:
             raise _unfit(path, error) from None

@@ -48,7 +48,7 @@ def test_version_3_leaves_its_marks_of_voxels_to_the_gaussians(tmp_path: Path, m
     gaussians = {"gaussians.opacity_logit": np.zeros(4, np.float32)}
     snapshot = Snapshot.read(write(tmp_path, monkeypatch, gaussians | marks, [], version=3))
     assert list(snapshot.arrays) == ["gaussians.opacity_logit"] and snapshot.map.group("voxels") == {}
-    assert snapshot.numbers["map"]["gate"]["before"] == []
+    assert snapshot.numbers["map"] == {"gate": {"before": []}, "voxels_made_again": True}
 
 
 @pytest.mark.parametrize(("missing", "before"), [("frames.T_tracked", []), ("", [[]]), ("", None), ("", [3])])
