@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from fields.map.gaussian_arrays import read_numbers, read_values, write_integers, write_reals, write_values
-from fields.runtime.backend import growing, refuse_too_many_fields
+from fields.runtime.backend import growing, place, refuse_too_many_fields
 from fields.runtime.engine import ti
 
 __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
@@ -78,16 +78,13 @@ class GaussianField:
         blocks = growing(builder, self.capacity // BLOCK)
         # One dense child per access pattern, so that culling does not load Adam's moments into the cache.
         geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
-        blocks.dense(ti.i, BLOCK).place(*geometry)
-        blocks.dense(ti.i, BLOCK).place(*(f.grad for f in geometry))
-        blocks.dense(ti.i, BLOCK).place(
-            self.position_m, self.position_v, self.log_scale_m, self.log_scale_v,
-            self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v,
-        )  # fmt: skip
-        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh)
-        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh.grad)
-        blocks.dense(ti.i, BLOCK).dense(ti.j, self.sh_count).place(self.sh_m, self.sh_v)
-        blocks.dense(ti.i, BLOCK).place(self.steps, self.anchor, self.touched, self.coverage)
+        place(geometry, blocks, BLOCK)
+        place([f.grad for f in geometry], blocks, BLOCK)
+        place([getattr(self, name + moment) for name in _NAMES[:4] for moment in MOMENTS], blocks, BLOCK)
+        place([self.sh], blocks, BLOCK, self.sh_count)
+        place([self.sh.grad], blocks, BLOCK, self.sh_count)
+        place([self.sh_m, self.sh_v], blocks, BLOCK, self.sh_count)
+        place([self.steps, self.anchor, self.touched, self.coverage], blocks, BLOCK)
         builder.dense(ti.i, 2).place(self._caught)
         builder.finalize()
         refuse_too_many_fields(self._caught)
