@@ -11,6 +11,7 @@ from fields.frames.camera_revision import CameraRevision
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.inputs.multiview.point_solving import placed_anew
 from modp_ti.inputs.multiview.reprojection import Observations
+from modp_ti.inputs.rows_of_ids import RowsOfIds
 from pipelines.memory_budget import OBSERVATION
 
 __all__ = ["TrackedPoints"]
@@ -38,10 +39,10 @@ class TrackedPoints:
         self.rows: list[NDArray[np.int32]] = []
         self.pixels: list[NDArray[np.float32]] = []
         self._held_out: list[bool] = []
-        self._row_of: dict[int, int] = {}
+        self._row_of = RowsOfIds()
         self._xyz = np.zeros((0, 3))
-        self._colours = np.zeros((0, 4))  # sums of red, green and blue, and the number of samples
-        self._last = np.zeros((0, 1), dtype=np.int64)  # the last frame that observed the point
+        self._colours = np.zeros((0, 4), dtype=np.uint32)  # sums of red, green and blue, and the number of samples
+        self._last = np.zeros((0, 1), dtype=np.int32)  # the last frame that observed the point
         self._observations = 0
 
     def __len__(self) -> int:
@@ -55,16 +56,15 @@ class TrackedPoints:
     def add(self, frame: TrackedFrame) -> None:
         """Record the observations of the next frame. A point takes the position given by the latest frame."""
         points = frame.points
-        of = self._row_of
-        rows = np.array([of.setdefault(i, len(of)) for i in points.ids.tolist()], dtype=np.int32)
-        self._grow(len(of))
+        rows = self._row_of.take(points.ids).astype(np.int32)
+        self._grow(len(self))
         self._xyz[rows] = points.xyz
         self._last[rows, 0] = len(self.rows)
         if not frame.held_out:
             column, row = np.floor(points.pixels).astype(int).T
             rgba = frame.rgba[row, column]
             seen = rgba[:, 3] > 0
-            np.add.at(self._colours, rows[seen], np.c_[rgba[seen, :3], np.ones(seen.sum())])
+            np.add.at(self._colours, rows[seen], np.c_[rgba[seen, :3], np.ones(seen.sum(), dtype=np.uint32)])
         self._append(rows, points.pixels.astype(np.float32), frame.held_out)
 
     def leave_out(self, frame: TrackedFrame) -> None:
@@ -97,7 +97,7 @@ class TrackedPoints:
         if len(moving):
             S = np.stack([motions[frame] for frame in frames.tolist()])[np.searchsorted(frames, last[moving])]
             places[moving] = np.einsum("nij,nj->ni", S[:, :3, :3], places[moving]) + S[:, :3, 3]
-        rows = np.array([self._row_of.get(i, -1) for i in ids.tolist()], dtype=np.int64)
+        rows = self._row_of.find(ids)
         places[rows[rows >= 0]] = xyz[rows >= 0]
 
     def revise_camera(self, revision: CameraRevision) -> None:
@@ -145,8 +145,10 @@ class TrackedPoints:
         self.pixels = np.split(state["pixels"], cuts) if frames else []
         self._held_out = list(held_out)
         self._observations = seen
-        self._row_of = {i: row for row, i in enumerate(state["ids"].tolist())}
-        self._xyz, self._colours, self._last = state["xyz"], state["colours"], state["last"]
+        self._row_of = RowsOfIds(state["ids"])
+        self._xyz = state["xyz"]
+        # Earlier snapshots hold these as larger numbers.
+        self._colours, self._last = state["colours"].astype(np.uint32), state["last"].astype(np.int32)
 
     def _grow(self, count: int) -> None:
         if count <= len(self._xyz):
@@ -161,7 +163,7 @@ class TrackedPoints:
     @property
     def ids(self) -> NDArray[np.int64]:
         """Tracker ids (P,) of the points."""
-        return np.fromiter(self._row_of, np.int64, len(self))
+        return self._row_of.ids
 
     @property
     def xyz(self) -> NDArray[np.float64]:
