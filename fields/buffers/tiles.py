@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from fields.runtime.backend import sparse
 from fields.runtime.engine import ti
 
 __all__ = ["GROUP", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
@@ -61,11 +62,11 @@ class TilePairs:
         builder.dense(ti.ij, (chunks, max_tiles)).place(self.histogram)
         builder.dense(ti.i, max_tiles * GROUP).place(self.staged)
         builder.dense(ti.i, chunks + 1).place(self.chunk_pairs)
-        blocks = builder.pointer(ti.i, max_pairs // BLOCK)
+        blocks = sparse(builder, ti.i, (max_pairs // BLOCK,))
         blocks.dense(ti.i, BLOCK).place(self.slot, self.rows)
         blocks.dense(ti.i, BLOCK).place(self.position)
         blocks.dense(ti.i, BLOCK).place(self.gradient)
-        segments = builder.pointer(ti.i, chunks * self.segment // BLOCK)
+        segments = sparse(builder, ti.i, (chunks * self.segment // BLOCK,))
         segments.dense(ti.i, BLOCK).place(self.emitted_tile, self.emitted_rows)
         self.last_placed = self.emitted_rows
 

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.bricks import BRICK_LEVELS, BRICKS, WORDS, Bricks, depth_reached, place_of, without_repetitions
-from fields.runtime.backend import on_gpu, refuse_too_many_fields
+from fields.runtime.backend import on_gpu, refuse_too_many_fields, sparse
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
@@ -44,9 +44,9 @@ class SparseBricks(Bricks):
         self.words = ti.field(ti.u64)
         outer, *inner = POINTERS
         builder = ti.FieldsBuilder()
-        self._nodes = [builder.pointer(ti.ijk, (outer * self.stacks, outer, outer))]
+        self._nodes = [sparse(builder, ti.ijk, (outer * self.stacks, outer, outer))]
         for fan_out in inner:
-            self._nodes.append(self._nodes[-1].pointer(ti.ijk, (fan_out,) * 3))
+            self._nodes.append(sparse(self._nodes[-1], ti.ijk, (fan_out,) * 3))
         self._bricks = self._nodes[-1]
         self._bricks.dense(ti.l, WORDS).place(self.words)
         self._next = ti.field(ti.i32)

@@ -27,6 +27,7 @@ __all__ = [
     "place",
     "program",
     "refuse_too_many_fields",
+    "sparse",
     "torch_device",
     "without_waiting",
 ]
@@ -34,9 +35,11 @@ __all__ = [
 answer_quickly()  # at import, since most of the time that it saves goes into the definitions of kernels
 
 MAX_SNODES = engine().max_snodes
+MAX_SPARSE = engine().max_sparse
 # The engine's own memory pool on a CUDA device, for the nodes of sparse fields [GB]. Only the voxels use it; dense
 # fields and PyTorch use the remaining memory.
 SPARSE_POOL = 1.0
+_sparse: list[ti.SNode] = []  # the sparse SNodes since the engine was started
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
@@ -131,6 +134,7 @@ def _start_on(device: str, options: dict) -> str | None:
 
 
 def _start(arch: object, options: dict) -> None:
+    _sparse.clear()
     forget_arrays()
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=arch, **options)
@@ -206,7 +210,24 @@ def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:
     On the CPU, the node is sparse, so that memory follows what is written. On a GPU it is dense, because the allocator
     of sparse nodes would run inside the kernels of a step, and Vulkan and Metal have none.
     """
-    return builder.dense(ti.i, blocks) if on_gpu() else builder.pointer(ti.i, blocks)
+    return builder.dense(ti.i, blocks) if on_gpu() else sparse(builder, ti.i, (blocks,))
+
+
+def sparse(parent: ti.FieldsBuilder | ti.SNode, axes: list, shape: Sequence[int]) -> ti.SNode:
+    """Create a sparse SNode below another one.
+
+    Args:
+        parent: The other one.
+        axes: Its axes.
+        shape: Its size along them.
+
+    Raises:
+        RuntimeError: If there are more than the engine supports in a process.
+    """
+    if not on_gpu() and MAX_SPARSE is not None and len(_sparse) >= MAX_SPARSE:
+        raise _too_many()
+    _sparse.append(parent.pointer(axes, shape))
+    return _sparse[-1]
 
 
 def place(fields: Sequence[ti.Field], blocks: ti.SNode, *shape: int) -> None:
@@ -238,7 +259,11 @@ def refuse_too_many_fields(last_placed: ti.ScalarField | ti.MatrixField) -> None
         RuntimeError: If there are more SNodes than the engine supports in a process.
     """
     if MAX_SNODES is not None and last_placed.snode.ptr.id >= MAX_SNODES:
-        raise RuntimeError(
-            f"more maps and renderers than one {engine().title} process holds; call initialise() before making "
-            "another, which frees those made so far"
-        )
+        raise _too_many()
+
+
+def _too_many() -> RuntimeError:
+    return RuntimeError(
+        f"more maps and renderers than one {engine().title} process holds; call initialise() before making "
+        "another, which frees those made so far"
+    )

@@ -59,6 +59,7 @@ class Engine:
         max_gaussians: Largest pool of Gaussians.
         max_gaussians_offline: The same for the offline mapper, whose Gaussians are larger.
         max_snodes: Number of SNodes of a process, which the engine does not check; None for no limit.
+        max_sparse: Number of sparse SNodes of a process on the CPU, which the engine does not check; None for no limit.
         max_rasterizers: Number of sets of fields that `rasterize` may keep.
         program: Attribute of the runtime that holds the running program.
         compiled_kernels: Attribute of a kernel that holds its compiled instances.
@@ -79,6 +80,7 @@ class Engine:
     max_gaussians: int
     max_gaussians_offline: int
     max_snodes: int | None
+    max_sparse: int | None
     max_rasterizers: int
     program: str
     compiled_kernels: str
@@ -127,6 +129,8 @@ TAICHI = Engine(
     max_gaussians=1_500_000,
     max_gaussians_offline=1_000_000,
     max_snodes=1024,
+    # With 18, of two maps or a map and two renderers with Gaussians, memory was written over; with 16 it was not.
+    max_sparse=16,
     max_rasterizers=2,  # with a third set of fields, the process crashed on the CPU
     program="prog",
     compiled_kernels="compiled_kernels",
@@ -151,6 +155,7 @@ QUADRANTS = Engine(
     max_gaussians=INDEXED,
     max_gaussians_offline=INDEXED,
     max_snodes=None,
+    max_sparse=None,
     max_rasterizers=16,
     program="_prog",
     compiled_kernels="materialized_kernels",
