@@ -75,7 +75,7 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
         if frame.index in rows.rows:
             rows.put(frame, mapper.keyframes)
             if frame.index in on_disk:
-                mapper.paging.away.store_images(mapper.keyframes[-1])
+                mapper.paging.away.store_keyframe(mapper.keyframes[-1])
     if len(mapper.keyframes) != len(rows.rows):
         raise ValueError(f"{len(mapper.keyframes)} of the {len(rows.rows)} keyframes are among the frames")
     mapper.keyframes.take_in_depths()

@@ -1,5 +1,5 @@
 """`GaussianField`: the Gaussians of a map, in a pool that grows without recompiling kernels."""
-# pyright: reportCallIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 from collections.abc import Sequence
 

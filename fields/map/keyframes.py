@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.camera_revision import CameraRevision
 from fields.frames.pyramid import ImageLevel
-from fields.frames.tracked_frame import TrackedFrame
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.se3 import interpolate_se3
 from fields.map.keyframe import Keyframe, median_depth_of, nbytes_of
 from fields.map.running_median import RunningMedian
@@ -129,17 +129,29 @@ class KeyframeStore:
         keyframe.mask(transient)
         self.nbytes += keyframe.nbytes
 
-    def move_images(self, keyframe: Keyframe, stored: Callable[[Sequence[ImageLevel]], list[ImageLevel]]) -> None:
-        """Replace the images of a keyframe of the store by equal ones.
+    def move_to_disk(self, keyframe: Keyframe, stored: Callable[[list[NDArray]], list[NDArray]]) -> None:
+        """Replace the images of a keyframe of the store, and its points, by memory-mapped ones.
+
+        Nothing is done if its images lie on disk already. Points count in `nbytes` all the same, since a correction
+        brings them back.
 
         Args:
             keyframe: The keyframe.
-            stored: Returns such images for images, in order.
+            stored: Returns such arrays for arrays, in order.
         """
+        images = [*keyframe.pyramid, *keyframe.unmasked]
+        here = [place for place, image in enumerate(images) if not image.on_disk]
+        if not here:
+            return
         self.nbytes -= keyframe.nbytes
+        points = keyframe.points
+        # The points first: their numbers have to lie at multiples of their size.
+        xyz, pixels, ids, *moved = stored([points.xyz, points.pixels, points.ids, *(images[i].rgba for i in here)])
+        for place, rgba in zip(here, moved, strict=True):
+            images[place] = ImageLevel(rgba, images[place].camera, on_disk=True)
         count = len(keyframe.pyramid)
-        moved = stored([*keyframe.pyramid, *keyframe.unmasked])
-        keyframe.pyramid, keyframe.unmasked = tuple(moved[:count]), tuple(moved[count:])
+        keyframe.points = SparsePoints(xyz, pixels, ids)
+        keyframe.pyramid, keyframe.unmasked = tuple(images[:count]), tuple(images[count:])
         keyframe.rgba = keyframe.pyramid[0].rgba
         self.nbytes += keyframe.nbytes
 

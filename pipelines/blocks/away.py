@@ -21,8 +21,9 @@ __all__ = ["BlockOnDisk", "BlocksOnDisk", "planes_of_views"]
 REACH = 8.0
 
 
-# Number of blocks whose viewers are determined together, which bounds the memory that this takes.
+# Number of blocks that are looked at together, which bounds the memory that this takes.
 CHUNK = 256
+ALL = slice(None)
 
 
 @dataclass(slots=True)
@@ -32,14 +33,12 @@ class BlockOnDisk:
     Attributes:
         number: Unique number.
         stored: Where it is.
-        box: A box around it.
         viewers: Places (V,) of the keyframes that see it.
         sweep: Number of the sweep in which its coverages were measured.
     """
 
     number: int
     stored: StoredBlock
-    box: Boxes
     viewers: NDArray[np.int64]
     sweep: int
 
@@ -47,7 +46,7 @@ class BlockOnDisk:
 class BlocksOnDisk:
     """The blocks of a map that lie on disk, in the order in which they went there.
 
-    A keyframe that sees a block on disk misses its Gaussians (`Keyframe.missing`), and its images lie on disk as well.
+    A keyframe that sees a block on disk misses its Gaussians (`Keyframe.missing`), and lies on disk as well.
 
     Args:
         gaussians: The resident Gaussians.
@@ -66,7 +65,12 @@ class BlocksOnDisk:
         self._added = 0
         self._planes: list[tuple[NDArray[np.float64], float, NDArray[np.float64]]] = []  # pose, far and planes
         self.sweep = 0
-        self._boxes: Boxes | None = None  # of the blocks, once they are asked for
+        # Numbers, boxes and counts of the blocks in arrays, and what came and went since these were made.
+        self._numbers = np.zeros(0, dtype=np.int64)
+        self._boxes = Boxes.joined([])
+        self._counts = np.zeros(0, dtype=np.int64)
+        self._came: list[tuple[BlockOnDisk, Boxes]] = []
+        self._gone: list[int] = []
 
     def __len__(self) -> int:
         return len(self._blocks)
@@ -77,14 +81,30 @@ class BlocksOnDisk:
     @property
     def boxes(self) -> Boxes:
         """The boxes (B,) around the blocks."""
-        if self._boxes is None:
-            self._boxes = Boxes.joined([block.box for block in self._blocks.values()])
+        self._take_in()
         return self._boxes
 
     @property
     def counts(self) -> NDArray[np.int64]:
         """Number (B,) of Gaussians of each block."""
-        return np.array([block.stored.count for block in self._blocks.values()], dtype=np.int64)
+        self._take_in()
+        return self._counts
+
+    def at(self, places: NDArray[np.int64]) -> list[BlockOnDisk]:
+        """Return blocks by their places in the order."""
+        self._take_in()
+        return [self._blocks[number] for number in self._numbers[places].tolist()]
+
+    def _take_in(self) -> None:
+        """Update the arrays. Of a large map, it would take long to make them anew for every view."""
+        if not (self._came or self._gone):
+            return
+        stays = ~np.isin(self._numbers, self._gone)
+        came = [(block, box) for block, box in self._came if block.number in self._blocks]
+        self._numbers = np.append(self._numbers[stays], [block.number for block, _ in came]).astype(np.int64)
+        self._counts = np.append(self._counts[stays], [block.stored.count for block, _ in came]).astype(np.int64)
+        self._boxes = Boxes.joined([self._boxes[stays], *(box for _, box in came)])
+        self._came, self._gone = [], []
 
     def read(self, block: BlockOnDisk) -> NDArray[np.void]:
         """Return the records of a block, memory-mapped.
@@ -111,27 +131,26 @@ class BlocksOnDisk:
             self._put(place, box, viewers, self.sweep)
 
     def _put(self, stored: StoredBlock, box: Boxes, viewers: NDArray[np.int64], sweep: int) -> BlockOnDisk:
-        # A copy: a view would keep the boxes of all blocks that were considered with it.
-        block = BlockOnDisk(self._added, stored, Boxes(box.low.copy(), box.high.copy()), viewers, sweep)
+        block = BlockOnDisk(self._added, stored, viewers, sweep)
         self._blocks[self._added] = block
         self._added += 1
-        self._boxes = None
+        self._came.append((block, box))
         for place in viewers.tolist():
             self.keyframes[place].missing += stored.count
         return block
 
-    def store_images(self, keyframe: Keyframe) -> None:
-        """Move the images of a keyframe to disk. Raises OSError if there is no room."""
-        self.keyframes.move_images(keyframe, self._files.store_images)
+    def store_keyframe(self, keyframe: Keyframe) -> None:
+        """Move the images and points of a keyframe to disk. Raises OSError if there is no room."""
+        self.keyframes.move_to_disk(keyframe, self._files.store)
 
     def forget_pages(self) -> None:
-        """Give back the memory of images on disk that have been read."""
+        """Give back the memory of keyframes on disk that have been read."""
         self._files.forget_pages()
 
     def forget(self, block: BlockOnDisk) -> None:
         """Remove a block and its file."""
         del self._blocks[block.number]
-        self._boxes = None
+        self._gone.append(block.number)
         self._files.forget(block.stored)
         for place in block.viewers.tolist():
             self.keyframes[place].missing -= block.stored.count
@@ -171,10 +190,16 @@ class BlocksOnDisk:
         self.add([(records, box, self.viewers(box)[0])])
         self.gaussians.remove(np.arange(len(self.gaussians)) < first)
 
-    def resident_records(self, first: int = 0) -> NDArray[np.void]:
-        """Return the complete state of the resident Gaussians from `first` on as records."""
+    def resident_records(self, first: int = 0, members: NDArray[np.int64] | slice = ALL) -> NDArray[np.void]:
+        """Return the complete state of resident Gaussians as records.
+
+        Args:
+            first: Place from which on they are considered.
+            members: Places of those that are returned, counted from there.
+        """
         state = self.gaussians.to_numpy(first) | self.gaussians.history(first)
-        return records_of(state | {"coverage": self.gaussians.coverages(first)})
+        state["coverage"] = self.gaussians.coverages(first)
+        return records_of({name: array[members] for name, array in state.items()})
 
     def remove_hidden(self, min_coverage: float, young: int, left_out: Iterable[Keyframe]) -> None:
         """Remove Gaussians whose coverage was too small in the present sweep.
@@ -185,15 +210,26 @@ class BlocksOnDisk:
             left_out: Keyframes that the sweep has left out. What they see stays.
         """
         spared = {view.index for view in left_out}
-        for block in self:
-            if block.sweep != self.sweep or spared & {self.keyframes[place].index for place in block.viewers.tolist()}:
+        measured = [
+            block
+            for block in self
+            if block.sweep == self.sweep
+            and not spared & {self.keyframes[place].index for place in block.viewers.tolist()}
+        ]
+        for first in range(0, len(measured), CHUNK):
+            smaller, gone = [], []
+            for block in measured[first : first + CHUNK]:
+                records = self.read(block)
+                kept = records[(records["coverage"] >= min_coverage) | (records["anchor"] >= young)]
+                if len(kept) < len(records):
+                    gone.append(block)
+                    if len(kept):
+                        smaller.append((kept, _box(kept), block.viewers))
+            try:
+                self.add(smaller)
+            except OSError:  # no room on the disk: these blocks stay as they are
                 continue
-            records = self.read(block)
-            keep = (records["coverage"] >= min_coverage) | (records["anchor"] >= young)
-            if not keep.all():
-                kept = records[keep]
-                if len(kept):
-                    self.add([(kept, _box(kept), block.viewers)])
+            for block in gone:
                 self.forget(block)
 
     def viewers(self, boxes: Boxes) -> list[NDArray[np.int64]]:
@@ -214,10 +250,9 @@ class BlocksOnDisk:
         """
         keyframe = self.keyframes[place]
         if self._blocks:
-            blocks = list(self)
-            for number in np.flatnonzero(seen(planes_of_views([keyframe]), self.boxes)[0]).tolist():
-                blocks[number].viewers = np.append(blocks[number].viewers, place)
-                keyframe.missing += blocks[number].stored.count
+            for block in self.at(np.flatnonzero(seen(planes_of_views([keyframe]), self.boxes)[0])):
+                block.viewers = np.append(block.viewers, place)
+                keyframe.missing += block.stored.count
 
     def look_again(self) -> None:
         """Determine again which keyframes see which blocks, after their poses have changed."""

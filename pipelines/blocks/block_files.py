@@ -1,4 +1,4 @@
-"""`BlockFiles`: Gaussians and images of keyframes in memory-mapped files."""
+"""`BlockFiles`: Gaussians, and images and points of keyframes, in files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.pyramid import ImageLevel
 from fields.runtime.disk_room import has_room
 
 __all__ = ["BlockError", "BlockFiles", "StoredBlock", "records_of", "state_of"]
@@ -60,7 +59,7 @@ def state_of(records: NDArray[np.void]) -> dict[str, NDArray]:
 
 
 class BlockFiles:
-    """The files of blocks and of keyframes' images, in a folder of their own that is removed with this object.
+    """The files of blocks and of keyframes, in a folder of their own that is removed with this object.
 
     Args:
         folder: The folder, which appears with the first file. One that is left there from a process that was killed is
@@ -71,7 +70,7 @@ class BlockFiles:
         self._wanted = folder
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._written = 0
-        self._images: list[mmap.mmap] = []
+        self._keyframes: list[mmap.mmap] = []
         self._kind = np.dtype(np.void)  # of the records
         self._used: dict[Path, int] = {}  # number of blocks that each file still holds
 
@@ -147,43 +146,32 @@ class BlockFiles:
             del self._used[block.path]
             block.path.unlink(missing_ok=True)
 
-    def store_images(self, images: Sequence[ImageLevel]) -> list[ImageLevel]:
-        """Write images to one file, and return them memory-mapped. Those that are already on disk stay as they are.
-
-        Raises OSError as `write` does.
-        """
-        here = [image.rgba for image in images if not image.on_disk]
-        if not here:
-            return list(images)
-        size = sum(rgba.nbytes for rgba in here)
-        path = self._next("images", ".raw", size)
+    def store(self, arrays: Sequence[NDArray]) -> list[NDArray]:
+        """Write arrays of a keyframe to one file, and return them memory-mapped. Raises OSError as `write` does."""
+        size = sum(array.nbytes for array in arrays)
+        path = self._next("keyframe", ".raw", size)
         try:
             with path.open("wb") as file:
-                for rgba in here:
-                    file.write(np.ascontiguousarray(rgba).data)
+                for array in arrays:
+                    file.write(np.ascontiguousarray(array).data)
             with path.open("rb") as file:
                 # Copy-on-write, because kernels take no read-only arrays.
                 mapped = mmap.mmap(file.fileno(), size, access=mmap.ACCESS_COPY)
         except OSError:
             path.unlink(missing_ok=True)
             raise
-        self._images.append(mapped)
-        stored, start = [], 0
-        for image in images:
-            if image.on_disk:
-                stored.append(image)
-                continue
-            end = start + image.rgba.nbytes
-            rgba = np.frombuffer(mapped, dtype=np.uint8, count=end - start, offset=start).reshape(image.rgba.shape)
-            stored.append(ImageLevel(rgba, image.camera, on_disk=True))
-            start = end
-        return stored
+        self._keyframes.append(mapped)
+        first = np.cumsum([0, *(array.nbytes for array in arrays)])[:-1].tolist()
+        return [
+            np.frombuffer(mapped, array.dtype, array.size, start).reshape(array.shape)
+            for array, start in zip(arrays, first, strict=True)
+        ]
 
     def forget_pages(self) -> None:
-        """Give back the memory of images that have been read. It is taken again when they are read again."""
+        """Give back the memory of keyframes that have been read. It is taken again when they are read again."""
         if hasattr(mmap, "MADV_DONTNEED"):
-            for images in self._images:
-                images.madvise(mmap.MADV_DONTNEED)
+            for mapped in self._keyframes:
+                mapped.madvise(mmap.MADV_DONTNEED)
 
     def _next(self, kind: str, suffix: str, size: int) -> Path:
         """Return the path of a new file of so many bytes."""

@@ -201,12 +201,12 @@ class Paging:
             gaussians: Number of further Gaussians to make room for.
             nbytes: Number of other bytes to make room for.
         """
-        boxes, counts, blocks = self.away.boxes, self.away.counts, list(self.away)
+        boxes, counts = self.away.boxes, self.away.counts
         wanted = np.flatnonzero(seen(planes_of_views(views), boxes).any(axis=0))
         wanted = wanted[_by_distance(boxes[wanted], views[0])]
         self._make_room(views, int(counts[wanted].sum()) + gaussians, nbytes)
         fit = np.cumsum(counts[wanted]) + gaussians <= min(self._spare(nbytes))
-        self.away.fetch([blocks[number] for number in wanted[fit].tolist()])
+        self.away.fetch(self.away.at(wanted[fit]))
 
     def _make_room(self, views: Sequence[Keyframe], gaussians: int, nbytes: int) -> None:
         """Move blocks to disk that no view sees, the farthest from the first view first, until there is room.
@@ -226,7 +226,6 @@ class Paging:
         if memory == np.inf:
             # The number of blocks that go is known beforehand; who sees the others does not matter.
             free = free[: 1 + int(np.searchsorted(pool + np.cumsum(blocks.counts[free]), gaussians))]
-        records = self.away.resident_records()
         gone = np.zeros(len(self.gaussians), dtype=bool)
         going, images = [], set()
         for block, sees in zip(free.tolist(), self.away.viewers(blocks.boxes[free]), strict=True):
@@ -237,16 +236,24 @@ class Paging:
             pool, memory = pool + len(members), memory + len(members) + freed / self.gaussians.bytes_each
             images.update(sees.tolist())
             gone[members] = True
-            going.append((records[members], blocks.boxes[block : block + 1], sees))
+            going.append((members, blocks.boxes[block : block + 1], sees))
         try:
-            self.away.add(going)
+            self._store(going)
             self.gaussians.remove(~gone)
             for place in sorted(images):
-                self.away.store_images(self.keyframes[place])
+                self.away.store_keyframe(self.keyframes[place])
             self.away.forget_pages()
             give_back_heap()
         except OSError as error:
             self.problem = f"blocks of the map cannot be kept on disk: {error.strerror}"
+
+    def _store(self, going: Sequence[tuple[NDArray[np.int64], Boxes, NDArray[np.int64]]]) -> None:
+        """Write resident blocks to disk, given as members, box and viewers. Raises OSError if there is no room."""
+        if going:
+            records = self.away.resident_records(members=np.concatenate([members for members, _, _ in going]))
+            ends = np.cumsum([len(members) for members, _, _ in going])
+            parts = np.split(records, ends[:-1])
+            self.away.add([(part, box, sees) for part, (_, box, sees) in zip(parts, going, strict=True)])
 
 
 def _by_distance(boxes: Boxes, view: Keyframe) -> NDArray[np.int64]:

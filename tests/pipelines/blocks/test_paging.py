@@ -124,7 +124,7 @@ def test_a_correction_moves_what_lies_on_disk(taichi_on_the_cpu: None) -> None:
     assert occupied.all()
 
 
-def test_a_limit_of_memory_moves_images_to_disk(taichi_on_the_cpu: None) -> None:
+def test_a_limit_of_memory_moves_keyframes_to_disk(taichi_on_the_cpu: None) -> None:
     free = walk(mapper_of(max_gaussians=100_000), end=OUT)
     limit = 0.75 * free.budget.held()
     count = len(free.gaussians)
@@ -134,7 +134,10 @@ def test_a_limit_of_memory_moves_images_to_disk(taichi_on_the_cpu: None) -> None
     on_disk = [view for view in mapper.keyframes if view.pyramid[0].on_disk]
     assert on_disk
     for view in on_disk:
-        np.testing.assert_array_equal(view.rgba, frame(view.index, STEPS[view.index]).rgba)
+        given = frame(view.index, STEPS[view.index])
+        np.testing.assert_array_equal(view.rgba, given.rgba)
+        for name in ("xyz", "pixels", "ids"):
+            np.testing.assert_array_equal(getattr(view.points, name), getattr(given.points, name))
 
 
 def test_a_damaged_block_is_named_and_the_map_goes_on_without_it(taichi_on_the_cpu: None) -> None:
@@ -158,6 +161,24 @@ def test_a_full_disk_is_told_and_leaves_out_what_has_no_room(
     assert mapper.paging.problem == "blocks of the map cannot be kept on disk: No space left on device"
     assert len(mapper.paging.away) == 0 and len(mapper.gaussians) <= 2048
     assert mapper.caught().gaussians_without_room > 0
+
+
+def test_hidden_gaussians_on_a_full_disk_stay_where_they_are(
+    taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    away = walk(mapper_of(), end=OUT).paging.away
+    for block in away:
+        block.sweep = away.sweep
+    anchors = np.concatenate([away.read(block)["anchor"] for block in away])
+    young, count = int(np.median(anchors)), len(anchors)
+    with monkeypatch.context() as full:
+        full.setattr(disk_room, "KEPT_FREE", 1 << 60)
+        away.remove_hidden(1.0, young, [])  # nothing has been measured: all but the young are hidden
+    assert int(away.counts.sum()) == count
+    away.remove_hidden(1.0, young, [])
+    left = np.concatenate([away.read(block)["anchor"] for block in away])
+    np.testing.assert_array_equal(np.sort(left), np.sort(anchors[anchors >= young]))
+    assert 0 < len(left) == int(away.counts.sum()) < count
 
 
 def test_the_saved_map_holds_the_blocks_on_disk_whose_files_go_with_it(taichi_on_the_cpu: None, tmp_path: Path) -> None:
