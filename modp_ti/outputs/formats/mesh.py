@@ -19,6 +19,7 @@ from modp_ti.outputs.formats.glb import write_glb, write_textured_glb
 from modp_ti.outputs.formats.open3d_io import open3d, written_aside
 from modp_ti.outputs.formats.textured_mesh import TexturedMesh
 from pipelines.surface.distance_field import integrate
+from pipelines.surface.support import supporting_views
 
 if TYPE_CHECKING:
     from open3d.pybind.geometry import TriangleMesh
@@ -27,12 +28,13 @@ if TYPE_CHECKING:
 __all__ = [
     "LEAST_OPACITY",
     "MESH_SUFFIXES",
+    "TRUNCATION",
     "SurfaceView",
     "extracted",
     "fused",
     "read_mesh",
+    "supported",
     "without_edges",
-    "without_floating_parts",
     "write_mesh",
 ]
 
@@ -53,8 +55,12 @@ FREE_WEIGHT = 4.0
 # above 0.9.
 LEAST_OPACITY = 0.5
 LARGEST_STEP = 0.05
-# Connected parts with a smaller share of the total surface area are removed.
+# Vertices need this number of views that see them, at most one for every SHORT views.
+VIEWS_OF_VERTEX, SHORT = 3, 16
+# Connected parts with a smaller share of the total surface area are small. Their vertices need so many views, and at
+# most this number of views that see through them for every one that sees them.
 LEAST_PART = 0.002
+VIEWS_OF_SMALL, THROUGH_SMALL = 7, 0.5
 BLOCK = 8
 
 
@@ -161,11 +167,25 @@ def extracted(grid: VoxelBlockGrid) -> TriangleMesh:
     return mesh
 
 
-def without_floating_parts(mesh: TriangleMesh) -> TriangleMesh:
-    """Remove connected parts with less than LEAST_PART of the surface area from an Open3D TriangleMesh."""
+def supported(mesh: TriangleMesh, views: Sequence[SurfaceView], tolerance: float) -> TriangleMesh:
+    """Remove the vertices of an Open3D TriangleMesh that too few views see. The engine must have been started.
+
+    Small parts, which hang in the air as a rule, need more views than large ones.
+
+    Args:
+        mesh: The mesh.
+        views: The views that it was fused from.
+        tolerance: Largest distance of a vertex from the depth of a view that sees it [scene units].
+    """
+    placed = ((view.camera, view.T_camera_world, view.depth) for view in views)
+    seen, through = supporting_views(np.asarray(mesh.vertices), placed, tolerance)
+    sure = (seen >= VIEWS_OF_SMALL) & (through <= THROUGH_SMALL * seen)
+    triangles = np.asarray(mesh.triangles)
     of_triangle, _, areas = mesh.cluster_connected_triangles()
-    areas = np.asarray(areas)
-    mesh.remove_triangles_by_mask((areas < LEAST_PART * areas.sum())[np.asarray(of_triangle)])
+    large = (np.asarray(areas) >= LEAST_PART * np.sum(areas))[np.asarray(of_triangle)]
+    sure[triangles[large]] = True
+    # Of a short video, a surface that one frame saw is better than none.
+    mesh.remove_vertices_by_mask(~sure | (seen < min(VIEWS_OF_VERTEX, len(views) // SHORT)))
     return mesh.remove_unreferenced_vertices()
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
 from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
-from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, extracted, fused, without_floating_parts, write_mesh
+from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, TRUNCATION, extracted, fused, supported, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
 from modp_ti.outputs.formats.sog import write_sog
 from modp_ti.outputs.formats.sog_lod import write_sog_lod
@@ -165,7 +165,7 @@ def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
     with line.working("fusing depth"):
         grid = fused(views, voxel, FARTHEST * run.record.scene_depth)
     with line.working("extracting the surface"):
-        mesh = without_floating_parts(extracted(grid))
+        mesh = supported(extracted(grid), views, TRUNCATION * voxel)
     if options.texture:
         with line.working("unwrapping the surface"):
             flat = unwrapped(mesh)

@@ -13,12 +13,13 @@ import pytest
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.mesh import (
+    TRUNCATION,
     SurfaceView,
     extracted,
     fused,
     read_mesh,
+    supported,
     without_edges,
-    without_floating_parts,
     write_mesh,
 )
 from modp_ti.outputs.formats.open3d_io import open3d
@@ -74,7 +75,7 @@ def test_the_room_is_fused_to_its_true_surface(room: Room) -> None:
         surface.append((camera.unproject(pixels, z) - T[:3, 3]) @ T[:3, :3])
         depth = without_edges(z.reshape(120, 160).astype(np.float32))
         views.append(SurfaceView(camera, T, depth, grey))
-    mesh = without_floating_parts(extracted(fused(views, voxel=0.025, farthest=10.0)))
+    mesh = supported(extracted(fused(views, voxel=0.025, farthest=10.0)), views, TRUNCATION * 0.025)
     vertices, true = (
         open3d().geometry.PointCloud(open3d().utility.Vector3dVector(xyz))
         for xyz in (mesh.vertices, np.concatenate(surface))
@@ -95,15 +96,36 @@ def test_depth_is_left_out_at_the_edges_of_things() -> None:
     assert (depth[15:] == 0).all()
 
 
-def test_small_parts_on_their_own_go_and_large_ones_stay() -> None:
-    sphere = open3d().geometry.TriangleMesh.create_sphere(1.0)
-    other = open3d().geometry.TriangleMesh.create_sphere(0.5).translate((3.0, 0, 0))
-    crumb = open3d().geometry.TriangleMesh.create_sphere(0.03).translate((0, 3.0, 0))
-    mesh = without_floating_parts(sphere + other + crumb)
-    vertices = np.asarray(mesh.vertices)
-    assert vertices[:, 0].max() == pytest.approx(3.5)
-    assert vertices[:, 1].max() == pytest.approx(1.0, abs=0.02)
-    assert len(vertices) == len(sphere.vertices) + len(other.vertices)
+def views_around(mesh: o3d.geometry.TriangleMesh, count: int) -> list[SurfaceView]:
+    """Depth of a mesh from cameras on a circle around the y axis, which look at it."""
+    geometry, camera, views = open3d().t.geometry, pinhole(320, 240), []
+    scene = geometry.RaycastingScene()
+    scene.add_triangles(geometry.TriangleMesh.from_legacy(mesh))
+    for angle in np.linspace(0.0, 2.0 * np.pi, count, endpoint=False):
+        T = np.eye(4)
+        T[:3, :3] = [[np.cos(angle), 0.0, -np.sin(angle)], [0.0, 1.0, 0.0], [np.sin(angle), 0.0, np.cos(angle)]]
+        T[2, 3] = 12.0
+        rays = scene.create_rays_pinhole(camera.matrix(), T, camera.width, camera.height)
+        z = scene.cast_rays(rays)["t_hit"].numpy()  # of rays with z = 1
+        views.append(SurfaceView(camera, T, np.where(np.isfinite(z), z, 0.0), np.zeros((240, 320, 3), np.float32)))
+    return views
+
+
+def test_what_views_see_through_goes_and_what_they_see_stays() -> None:
+    create = open3d().geometry.TriangleMesh
+    sphere, wall = create.create_sphere(1.0), create.create_sphere(20.0)
+    true, ghost = (create.create_sphere(0.05).translate((0.0, y, 0.0)) for y in (2.0, -2.0))
+    views = views_around(sphere + wall + true, 16)
+    for others, highest in ((true, 2.05), (ghost, 1.0), (true + ghost, 2.05)):
+        y = np.asarray(supported(sphere + others, views, 0.1).vertices)[:, 1]
+        assert (y.min(), y.max()) == pytest.approx((-1.0, highest), abs=0.03)  # few views see the pole
+
+
+def test_of_few_views_one_is_enough_for_a_large_part_and_not_for_a_small_one() -> None:
+    create = open3d().geometry.TriangleMesh
+    sphere, crumb = create.create_sphere(1.0), create.create_sphere(0.03).translate((0.0, 2.0, 0.0))
+    mesh = supported(sphere + crumb, views_around(sphere + crumb, 3), 0.1)
+    assert len(mesh.vertices) == len(sphere.vertices)
 
 
 def test_views_of_nothing_are_refused() -> None:
