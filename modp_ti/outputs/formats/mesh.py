@@ -181,11 +181,11 @@ def supported(mesh: TriangleMesh, views: Sequence[SurfaceView], tolerance: float
     seen, through = supporting_views(np.asarray(mesh.vertices), placed, tolerance)
     sure = (seen >= VIEWS_OF_SMALL) & (through <= THROUGH_SMALL * seen)
     triangles = np.asarray(mesh.triangles)
-    of_triangle, _, areas = mesh.cluster_connected_triangles()
-    large = (np.asarray(areas) >= LEAST_PART * np.sum(areas))[np.asarray(of_triangle)]
-    sure[triangles[large]] = True
+    of_triangle, _, areas = map(np.asarray, mesh.cluster_connected_triangles())
+    sure[triangles[(areas >= LEAST_PART * areas.sum())[of_triangle]]] = True
     # Of a short video, a surface that one frame saw is better than none.
-    mesh.remove_vertices_by_mask(~sure | (seen < min(VIEWS_OF_VERTEX, len(views) // SHORT)))
+    unsure = ~sure | (seen < min(VIEWS_OF_VERTEX, len(views) // SHORT))
+    mesh.remove_vertices_by_mask(unsure.tolist())
     return mesh.remove_unreferenced_vertices()
 
 
