@@ -107,7 +107,7 @@ class BlocksOnDisk:
         self._came, self._gone = [], []
 
     def read(self, block: BlockOnDisk) -> NDArray[np.void]:
-        """Return the records of a block, memory-mapped.
+        """Return a copy of the records of a block.
 
         Raises:
             BlockError: If its file is missing or damaged. The map is then without it.
