@@ -57,6 +57,9 @@ class Mapper:
         frames: Metadata and tracked points of all frames so far, without their images.
         finished: Whether `finish` has run since the last frame was added.
 
+    Raises:
+        RuntimeError: If `initialise` has not been called, or Taichi holds another map already.
+
     Example:
         modp_ti.initialise("cpu")
         mapper = modp_ti.Mapper(width=640, height=480)
