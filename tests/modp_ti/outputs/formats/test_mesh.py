@@ -96,6 +96,17 @@ def test_depth_is_left_out_at_the_edges_of_things() -> None:
     assert (depth[15:] == 0).all()
 
 
+def test_small_parts_on_their_own_go_and_large_ones_stay() -> None:
+    sphere = open3d().geometry.TriangleMesh.create_sphere(1.0)
+    other = open3d().geometry.TriangleMesh.create_sphere(0.5).translate((3.0, 0, 0))
+    crumb = open3d().geometry.TriangleMesh.create_sphere(0.03).translate((0, 3.0, 0))
+    mesh = supported(sphere + other + crumb, [], 0.1)
+    vertices = np.asarray(mesh.vertices)
+    assert vertices[:, 0].max() == pytest.approx(3.5)
+    assert vertices[:, 1].max() == pytest.approx(1.0, abs=0.02)
+    assert len(vertices) == len(sphere.vertices) + len(other.vertices)
+
+
 def views_around(mesh: o3d.geometry.TriangleMesh, count: int) -> list[SurfaceView]:
     """Depth of a mesh from cameras on a circle around the y axis, which look at it."""
     geometry, camera, views = open3d().t.geometry, pinhole(320, 240), []
