@@ -80,7 +80,11 @@ class GaussianField:
         geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
         place(geometry, blocks, BLOCK)
         place([f.grad for f in geometry], blocks, BLOCK)
-        place([getattr(self, name + moment) for name in _NAMES[:4] for moment in MOMENTS], blocks, BLOCK)
+        moments = (
+            self.position_m, self.position_v, self.log_scale_m, self.log_scale_v,
+            self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v,
+        )  # fmt: skip
+        place(moments, blocks, BLOCK)
         place([self.sh], blocks, BLOCK, self.sh_count)
         place([self.sh.grad], blocks, BLOCK, self.sh_count)
         place([self.sh_m, self.sh_v], blocks, BLOCK, self.sh_count)

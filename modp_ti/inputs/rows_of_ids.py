@@ -25,8 +25,8 @@ class RowsOfIds:
 
     def __init__(self, ids: NDArray[np.int64] | Sequence[int] = ()) -> None:
         self._ids = np.array(ids, dtype=np.int64)
-        self._order = np.argsort(self._ids, kind="stable")
-        self._recent: dict[int, int] = {}
+        self._order = np.argsort(self._ids)
+        self._recent: dict[int, int] = {}  # rows of the ids after these
 
     def __len__(self) -> int:
         return len(self._ids) + len(self._recent)
@@ -53,5 +53,6 @@ class RowsOfIds:
         others = np.flatnonzero(rows < 0)
         rows[others] = [self._recent.setdefault(i, len(self)) for i in ids[others].tolist()]
         if len(self._recent) > max(RECENT, SHARE * len(self)):
-            self.__init__(self.ids)
+            self._ids, self._recent = self.ids, {}
+            self._order = np.argsort(self._ids)
         return rows
