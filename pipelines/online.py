@@ -132,7 +132,10 @@ class OnlineMapper(OnlineMap):
             self.densifier.add_error_pixels(image, warming_up, plan.pixels)
         psnr = self.optimise(plan.steps, level)
         with self.stopwatch.measure("remove"):
-            self.hidden.sweep(plan.swept, self.near)
+            if plan.swept is None:
+                self.hidden.sweep_when_due(self.near)
+            else:
+                self.hidden.sweep(plan.swept, self.near)
         self.mask_latest()
         return psnr, plan.steps
 

@@ -36,6 +36,7 @@ def state_of(mapper: OnlineMap) -> MapState:
     numbers: dict[str, Any] = {
         "frames": mapper.frame_count,
         "settled": mapper.settled,
+        "sweep_due": mapper.hidden.due,
         "view_renders": mapper.renderer.view_renders,
         "random": mapper.rng.bit_generator.state,
         "gate": mapper.gate.state(),
@@ -103,6 +104,7 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
         raise ValueError(f"frame {mapper.selector.previous} has no tracked pose")
     mapper.frame_count = int(state.numbers["frames"])
     mapper.settled = int(state.numbers.get("settled", 0))  # absent in snapshots of earlier commits
+    mapper.hidden.due = int(state.numbers.get("sweep_due", mapper.hidden.due))  # absent likewise
     mapper.renderer.view_renders = int(state.numbers["view_renders"])
     mapper.rng.bit_generator.state = state.numbers["random"]
     mapper.gate.restore(state.numbers["gate"])

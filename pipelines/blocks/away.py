@@ -201,26 +201,19 @@ class BlocksOnDisk:
         state["coverage"] = self.gaussians.coverages(first)
         return records_of({name: array[members] for name, array in state.items()})
 
-    def remove_hidden(self, min_coverage: float, young: int, left_out: Iterable[Keyframe]) -> None:
+    def remove_hidden(self, min_coverage: float, spared: NDArray[np.bool_]) -> None:
         """Remove Gaussians whose coverage was too small in the present sweep.
 
         Args:
             min_coverage: Smallest coverage of what stays [px].
-            young: Gaussians of this anchor and later ones stay.
-            left_out: Keyframes that the sweep has left out. What they see stays.
+            spared: Whether the Gaussians of each anchor (A,) stay.
         """
-        spared = {view.index for view in left_out}
-        measured = [
-            block
-            for block in self
-            if block.sweep == self.sweep
-            and not spared & {self.keyframes[place].index for place in block.viewers.tolist()}
-        ]
+        measured = [block for block in self if block.sweep == self.sweep]
         for first in range(0, len(measured), CHUNK):
             smaller, gone = [], []
             for block in measured[first : first + CHUNK]:
                 records = self.read(block)
-                kept = records[(records["coverage"] >= min_coverage) | (records["anchor"] >= young)]
+                kept = records[(records["coverage"] >= min_coverage) | spared[records["anchor"]]]
                 if len(kept) < len(records):
                     gone.append(block)
                     if len(kept):

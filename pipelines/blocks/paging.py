@@ -95,15 +95,6 @@ class Paging:
         anchor = [self.gaussians.anchors(), *(records["anchor"] for records in blocks)]
         return np.concatenate(position), np.concatenate(anchor)
 
-    def seen_by(self, keyframes: Sequence[Keyframe]) -> NDArray[np.bool_]:
-        """Return whether each resident Gaussian (N,) is in a block that one of the keyframes sees."""
-        found = np.zeros(len(self.gaussians), dtype=bool)
-        if keyframes:
-            blocks = self._divided()
-            for block in np.flatnonzero(seen(planes_of_views(keyframes), blocks.boxes).any(axis=0)).tolist():
-                found[blocks.of(block)] = True
-        return found
-
     # ---- while the map grows ---------------------------------------------------------------------------------
 
     def before_keyframe(self, frame: TrackedFrame) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +117,13 @@ class Densifier:
     def first_anchor_since(self, keyframe: Keyframe) -> int:
         """Return the place of the first anchor of this keyframe or of a frame after it."""
         return bisect_left(self.anchors, keyframe.index, key=lambda anchor: anchor.keyframe.index)
+
+    def anchors_at(self, keyframes: Iterable[Keyframe]) -> NDArray[np.bool_]:
+        """Return whether each anchor (A,) is one of these keyframes, or a frame after it and before the next one."""
+        selected = [keyframe.index for keyframe in self.keyframes.selected]
+        wanted = np.isin(selected, [keyframe.index for keyframe in keyframes])
+        places = np.searchsorted(selected, [anchor.keyframe.index for anchor in self.anchors], side="right") - 1
+        return wanted[places]
 
     def restart_voxels(
         self,

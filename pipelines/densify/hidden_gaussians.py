@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
 
 from fields.map.keyframe import Keyframe
 from pipelines.blocks.paging import Paging
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
+from pipelines.pace.pace import FIRST_SWEEP
 
 __all__ = ["HiddenGaussians"]
 
@@ -20,14 +23,18 @@ COARSE = 1
 class HiddenGaussians:
     """Sweeps over the keyframes, a few at a time or all at once, and then removes what hardly showed in any of them.
 
-    A sweep spares the Gaussians that were placed in the `YOUNG` keyframes before it or while it went on. A sweep in
-    parts leaves out keyframes that see much of what lies on disk, and spares what they see.
+    A sweep spares the Gaussians that were placed in the `YOUNG` keyframes before it or while it went on. It leaves out
+    keyframes that see much of what lies on disk, and spares what they placed, so that its time does not grow with a map
+    that is larger than memory.
 
     Args:
         contribution: Measures how much of each Gaussian shows.
         densifier: Owner of the map's Gaussians and keyframes.
         paging: Keeps the part of the map that is on disk.
         min_contribution: Coverage in the keyframe that shows most of a Gaussian, below which it is removed [px].
+
+    Attributes:
+        due: Number of keyframes at which `sweep_when_due` sweeps next.
     """
 
     def __init__(
@@ -37,9 +44,27 @@ class HiddenGaussians:
         self._densifier = densifier
         self._paging = paging
         self._min_contribution = min_contribution
+        self.due = FIRST_SWEEP
         self._swept = 0
         self._left_out: list[Keyframe] = []
         self._young: Keyframe
+
+    def sweep_when_due(self, near: float) -> None:
+        """Sweep over all keyframes that are near, if half as many have come since the last such sweep.
+
+        Args:
+            near: Depth below which nothing is drawn [scene units].
+        """
+        selected = self._densifier.keyframes.selected
+        while self.due < len(selected):  # they came with a finished map
+            self.due += -(-self.due // 2)
+        if self.due > len(selected) or self._min_contribution == 0.0:
+            return
+        self._begin()
+        views = self._near(selected)
+        self.due += -(-max(len(views), FIRST_SWEEP) // 2)
+        self._measure(views, near, 0)
+        self._remove(self._min_contribution, self._densifier.first_anchor_since(selected[-YOUNG:][0]))
 
     def sweep(self, count: int, near: float) -> None:
         """Measure the next keyframes. After the last one, Gaussians are removed, and the next sweep begins.
@@ -51,14 +76,10 @@ class HiddenGaussians:
         store = self._densifier.keyframes
         if count == 0 or not store.selected or self._min_contribution == 0.0:
             return
-        whole = count >= len(store.selected)
         if self._swept == 0:
             self._begin()
-            self._young = store.selected[-min(YOUNG, len(store.selected))]
-        views = store.selected[self._swept : self._swept + count]
-        far = [] if whole else [view for view in views if view.missing > store.most_missing]
-        self._left_out += far
-        self._measure([view for view in views if view not in far] if far else views, near, 0 if whole else COARSE)
+            self._young = store.selected[-YOUNG:][0]
+        self._measure(self._near(store.selected[self._swept : self._swept + count]), near, COARSE)
         self._swept += count
         if self._swept >= len(store.selected):
             self._swept = 0
@@ -81,6 +102,12 @@ class HiddenGaussians:
         self._paging.away.sweep += 1
         self._left_out = []
 
+    def _near(self, views: Sequence[Keyframe]) -> list[Keyframe]:
+        """Return the views that are near. The others are left out."""
+        most = self._densifier.keyframes.most_missing
+        self._left_out += [view for view in views if view.missing > most]
+        return [view for view in views if view.missing <= most]
+
     def _measure(self, views: Iterable[Keyframe], near: float, level: int) -> None:
         """Measure views, each with all that it sees."""
 
@@ -92,8 +119,10 @@ class HiddenGaussians:
         self.contribution.measure(complete(), near, level)
 
     def _remove(self, min_contribution: float, young: int) -> None:
-        """Remove what hardly showed, unless it was placed by the anchor `young` or later, or may show elsewhere."""
+        """Remove what hardly showed, but not what the anchor `young`, a later one, or one that was left out placed."""
         gaussians = self._densifier.gaussians
-        spared = (gaussians.anchors() >= young) | self._paging.seen_by(self._left_out)
-        gaussians.remove((gaussians.coverages() >= min_contribution) | spared)
-        self._paging.away.remove_hidden(min_contribution, young, self._left_out)
+        spared = self._densifier.anchors_at(self._left_out)
+        spared[young:] = True
+        spared = np.append(spared, False)  # for Gaussians without an anchor, whose place is -1
+        gaussians.remove((gaussians.coverages() >= min_contribution) | spared[gaussians.anchors()])
+        self._paging.away.remove_hidden(min_contribution, spared)

@@ -11,8 +11,8 @@ __all__ = ["FIRST_SWEEP", "CompletePace", "Pace", "Plan"]
 
 # Number of keyframes that are assumed before the first one, in the estimate of how many there will be.
 BEFORE = 4
-# Number of keyframes at which Gaussians that hardly show are removed first, and the factor to the next number.
-FIRST_SWEEP, UNTIL_NEXT = 64, 1.5
+# Number of keyframes from which on Gaussians that hardly show are removed.
+FIRST_SWEEP = 64
 # Steps that every keyframe gets, however long the recording is.
 LEAST_STEPS = 2
 
@@ -25,12 +25,13 @@ class Plan:
         pixels: Share of `densify.pixels` whose depth is estimated, from 0 to 1.
         steps: Number of optimisation steps.
         swept: Number of keyframes in which it is then measured how much of each Gaussian shows, for the removal of
-            those that hardly show in any (`HiddenGaussians`).
+            those that hardly show in any (`HiddenGaussians`). None for all that are near, each time that half as many
+            have come again.
     """
 
     pixels: float
     steps: int
-    swept: int = 0
+    swept: int | None = 0
 
 
 class Pace(Protocol):
@@ -72,7 +73,7 @@ class CompletePace:
     """Gives every keyframe the work of the settings, however long it takes.
 
     Gaussians that hardly show are removed each time that the number of keyframes has grown by a half, so that rendering
-    all keyframes for it takes a few views per keyframe, however many there are.
+    all keyframes for it takes a few views per keyframe, however many there are (`HiddenGaussians.sweep_when_due`).
 
     The keyframes of a long recording share the steps of `optimise.budget` keyframes evenly. Their number is expected
     from those so far: with k keyframes in the first f of n frames, n k / f. Nothing else is remembered, so that a
@@ -92,7 +93,7 @@ class CompletePace:
 
     def plan(self, level: int, keyframes: int, frames: int) -> Plan:
         steps = round(self.share(keyframes, frames) * self._settings.optimise.steps)
-        return Plan(1.0, steps, keyframes if _is_due(keyframes) else 0)
+        return Plan(1.0, steps, swept=None)
 
     def steps_after_correction(self, keyframes: int, frames: int) -> int:
         return round(self.share(keyframes, frames) * self._settings.corrections.steps)
@@ -108,11 +109,3 @@ class CompletePace:
         # As if a few keyframes at the largest distance came first: the first frames tell little.
         rate = (keyframes + BEFORE) / (frames + BEFORE * self._settings.keyframes.max_gap)
         return min(1.0, max(budget / (rate * self._frames), LEAST_STEPS / steps))
-
-
-def _is_due(keyframes: int) -> bool:
-    """Whether Gaussians that hardly show are removed after this number of keyframes."""
-    at = float(FIRST_SWEEP)
-    while round(at) < keyframes:
-        at *= UNTIL_NEXT
-    return round(at) == keyframes

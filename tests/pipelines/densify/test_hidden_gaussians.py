@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
+
 from fields.runtime.backend import initialise
+from pipelines.densify.hidden_gaussians import HiddenGaussians
 from pipelines.online import OnlineMapper
 from pipelines.pace import CompletePace, Plan
 from pipelines.settings import MappingSettings
@@ -76,3 +81,66 @@ def test_a_map_is_never_swept_where_the_settings_say_so(taichi_on_the_cpu: None)
     mapper.process(frame(2))
     assert count_behind(mapper, 100.0) == 5
     assert mapper.renderer.view_renders - renders <= 1 + SETTINGS.views.per_step
+
+
+def sweeps(missing: list[int], already: int = 0) -> dict[int, list[int]]:
+    """The keyframes that are swept when each comes, of a growing map without Gaussians.
+
+    Args:
+        missing: Gaussians on disk that each keyframe sees, of which 10 are few.
+        already: Number of keyframes that come with a finished map.
+    """
+    store = SimpleNamespace(selected=[], most_missing=10)
+    none = np.zeros(0, dtype=np.int32)
+    gaussians = SimpleNamespace(anchors=lambda: none, coverages=lambda: none, remove=lambda kept: 0)
+    densifier = SimpleNamespace(
+        keyframes=store,
+        gaussians=gaussians,
+        first_anchor_since=lambda keyframe: 0,
+        anchors_at=lambda keyframes: none.astype(bool),
+    )
+    away = SimpleNamespace(sweep=0, remove_hidden=lambda *_: None)
+    paging = SimpleNamespace(away=away, gather=lambda views: None)
+    measured: list[int] = []
+    contribution = SimpleNamespace(
+        begin=measured.clear, measure=lambda views, near, level: measured.extend(view.number for view in views)
+    )
+    hidden = HiddenGaussians(contribution, densifier, paging, 0.5)  # pyright: ignore[reportArgumentType]
+    found = {}
+    for number, count in enumerate(missing):
+        store.selected.append(SimpleNamespace(number=number, missing=count))
+        if number >= already:
+            measured.clear()
+            hidden.sweep_when_due(0.1)
+            if measured:
+                found[number + 1] = list(measured)
+    return found
+
+
+def test_all_keyframes_are_swept_each_time_that_the_keyframes_are_half_as_many_again() -> None:
+    assert sweeps([0] * 400) == {n: list(range(n)) for n in (64, 96, 144, 216, 324)}
+
+
+def test_far_keyframes_are_left_out_and_make_sweeps_no_rarer() -> None:
+    """Of 100 keyframes, all but the first five see more than few of what lies on disk; the others come after them."""
+    found = sweeps([10] * 5 + [11] * 95 + [0] * 200)
+    assert list(found) == [64, 96, 128, 160, 193, 242]
+    assert found[160] == [*range(5), *range(100, 160)]
+
+
+def test_what_a_keyframe_that_is_left_out_has_placed_stays(taichi_on_the_cpu: None) -> None:
+    initialise("cpu")
+    mapper = OnlineMapper(SETTINGS, 64, 48, seed=1, pace=Sweeping(0))
+    for i in range(13):
+        mapper.process(frame(i))
+    first, second = [mapper.densifier.first_anchor_since(mapper.keyframes[i]) for i in range(2)]
+    add_behind(mapper, 100.0, anchor=first)
+    add_behind(mapper, 200.0, anchor=second)
+    mapper.keyframes[0].missing = mapper.keyframes.most_missing + 1
+    mapper.hidden.due = len(mapper.keyframes.selected)
+    mapper.hidden.sweep_when_due(mapper.near)
+    assert [count_behind(mapper, 100.0), count_behind(mapper, 200.0)] == [5, 0]
+
+
+def test_keyframes_of_a_finished_map_count_as_swept() -> None:
+    assert list(sweeps([0] * 330, already=100)) == [144, 216, 324]

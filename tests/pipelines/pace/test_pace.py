@@ -11,15 +11,8 @@ from pipelines.settings import CorrectionSettings, MappingSettings, OptimiseSett
 def test_the_complete_pace_gives_what_the_settings_say() -> None:
     pace = CompletePace(MappingSettings(optimise=OptimiseSettings(steps=7), corrections=CorrectionSettings(steps=3)))
     assert pace.takes_keyframe()
-    assert pace.plan(level=2, keyframes=1, frames=1) == Plan(1.0, 7)
+    assert pace.plan(level=2, keyframes=1, frames=1) == Plan(1.0, 7, swept=None)
     assert pace.steps_after_correction(keyframes=1, frames=1) == 3
-
-
-def test_all_keyframes_are_swept_each_time_that_the_keyframes_are_half_as_many_again() -> None:
-    pace = CompletePace(MappingSettings())
-    assert {n: swept for n in range(1, 400) if (swept := pace.plan(0, n, n).swept)} == {
-        n: n for n in (64, 96, 144, 216, 324)
-    }
 
 
 @pytest.mark.parametrize(("every", "steps"), [(1, 4), (3, 12), (5, 20)])
