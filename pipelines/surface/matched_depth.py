@@ -121,9 +121,8 @@ class DepthMatcher:
         smooth = cv2.resize(smooth, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         # One step moves a pixel by about one pixel in the most distant neighbour.
         step = 1.0 / max(float(np.linalg.norm(warp[:2, 3])) for warp in warps)
-        after = [other > index for other in self.neighbours[index]]
         start = np.ascontiguousarray(smooth, dtype=np.float32)
-        return self._sweep.sweep(view.grey, [other.grey for other in others], warps, after, start, step, reach)
+        return self._sweep.sweep(view.grey, [other.grey for other in others], warps, start, step, reach)
 
 
 def _half(view: DepthView) -> DepthView:

@@ -20,10 +20,10 @@ LEAST_VARIANCE = 1e-5
 # Costs are 1 - ZNCC. Penalties: a change by one step between adjacent pixels; a larger change, which decreases with
 # their grey difference on the scale GREY_EDGE; and the distance from the start, relative to the sweep's range. The last
 # one only breaks ties: with 0.05, whole regions stayed at the map's depth.
-SMALL_JUMP, LARGE_JUMP, GREY_EDGE = 0.1, 0.8, 0.05
+SMALL_JUMP, LARGE_JUMP, GREY_EDGE = 0.05, 0.6, 0.05
 START_WEIGHT = 0.002
-# Least number of neighbours on one side that may decide alone.
-LEAST_SIDE = 2.0
+# Least number of neighbours on one side that may decide alone, and on the other one.
+LEAST_SIDE = 4.0
 # Grey value outside of an image.
 OUTSIDE = -99.0
 # Eight rows per chunk, see `fields.runtime.parallel`.
@@ -37,8 +37,9 @@ class PlaneSweep:
     """Sweeps inverse depth around a start for each pixel [Collins 1996], and smooths the costs [Hirschmueller 2008].
 
     Windows of 3x3 pixels are compared by ZNCC. A surface behind an edge is hidden from the neighbours on one side, so
-    the cost is the smaller one of the means over the neighbours before and after the view. Costs are summed along rows
-    and columns.
+    the cost is the least of the means over all neighbours and over those of each side, by the direction in which they
+    see a pixel move with its depth: two sides for each diagonal of the four quadrants around the main direction.
+    Costs are summed along rows and columns.
 
     Args:
         pixels: Most pixels of a view.
@@ -49,8 +50,8 @@ class PlaneSweep:
         # Powers of two, so that most sizes share the kernels of the offline cache.
         samples = 1 << (pixels * steps - 1).bit_length()
         self.carried = ti.field(ti.f32, samples)
-        self.total = ti.field(ti.f32, 2 * samples)
-        self.count = ti.field(ti.f32, 2 * samples)
+        self.total = ti.field(ti.f32, 4 * samples)  # by quadrant
+        self.count = ti.field(ti.f32, 4 * samples)
         self.cost = ti.field(ti.f32, samples)
         self.paths = ti.field(ti.f32, samples)
         self.line = ti.field(ti.f32, 2 * MAX_STEPS * 4096)
@@ -60,7 +61,6 @@ class PlaneSweep:
         grey: NDArray[np.float32],
         others: Sequence[NDArray[np.float32]],
         warps: Sequence[NDArray[np.float32]],
-        after: Sequence[bool],
         inverse: NDArray[np.float32],
         step: float,
         reach: int,
@@ -71,7 +71,6 @@ class PlaneSweep:
             grey: (H, W) image of the view in [0, 1].
             others: (H, W) images of the neighbours.
             warps: (3, 4) warp to each neighbour, see `plane_warp`.
-            after: Whether each neighbour comes after the view.
             inverse: (H, W) inverse depth to start from.
             step: Step of inverse depth.
             reach: Number of steps to either side.
@@ -82,10 +81,10 @@ class PlaneSweep:
         variance = np.maximum(cv2.blur(grey * grey, (3, 3)) - mean * mean, 0.0)
         scale = (1.0 / np.sqrt(variance + LEAST_VARIANCE)).astype(np.float32)
         spread = 1 if on_gpu() else SPREAD
-        self._clear(2 * steps * height * width)
-        for other, warp, later in zip(others, warps, after, strict=True):
+        self._clear(4 * steps * height * width)
+        for other, warp, quadrant in zip(others, warps, _quadrants(warps), strict=True):
             self._carry(other, warp, inverse, step, reach)
-            self._compare(grey, mean, scale, int(later), steps)
+            self._compare(grey, mean, scale, quadrant, steps)
         self._combine(reach, height, width)
         self._smooth(grey, steps, spread)
         found = np.empty_like(grey)
@@ -129,14 +128,14 @@ class PlaneSweep:
                 self.carried[i * width + x] = value
 
     @ti.kernel
-    def _compare(self, grey: IMAGE, mean: IMAGE, scale: IMAGE, side: ti.i32, steps: ti.i32):
-        """Add 1 - ZNCC of the 3x3 windows of the view and of `carried` to the total of a side."""
+    def _compare(self, grey: IMAGE, mean: IMAGE, scale: IMAGE, quadrant: ti.i32, steps: ti.i32):
+        """Add 1 - ZNCC of the 3x3 windows of the view and of `carried` to the total of a quadrant."""
         height, width = grey.shape[0], grey.shape[1]
         for i in range(steps * height):
             d, y = i // height, i % height
             up, down = ti.max(y - 1, 0), ti.min(y + 1, height - 1)
             a, b, c = (d * height + up) * width, i * width, (d * height + down) * width
-            to = side * steps * height * width + b
+            to = quadrant * steps * height * width + b
             # Sums over the window's columns: of the neighbour, of its square, of its product with the view.
             left, middle = ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0])
             for x in range(width + 1):
@@ -160,18 +159,21 @@ class PlaneSweep:
 
     @ti.kernel
     def _combine(self, reach: ti.i32, height: ti.i32, width: ti.i32):
-        """cost[y, x, d] from the totals of both sides; 1 where no neighbour sees the pixel."""
+        """cost[y, x, d] from the totals of the quadrants; 1 where no neighbour sees the pixel."""
         steps, pixels = 2 * reach + 1, height * width
         for i in range(pixels):
             for d in range(steps):
-                first, second = d * pixels + i, (steps + d) * pixels + i
-                m, n = self.count[first], self.count[second]
-                s, t = self.total[first], self.total[second]
+                n, total = ti.Vector([0.0, 0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0, 0.0])
+                for q in ti.static(range(4)):
+                    at = (q * steps + d) * pixels + i
+                    n[q], total[q] = self.count[at], self.total[at]
                 cost = 1.0
-                if m + n > 0.0:
-                    cost = (s + t) / (m + n)
-                if m >= LEAST_SIDE and n >= LEAST_SIDE:
-                    cost = ti.min(s / m, t / n)
+                if n.sum() > 0.0:
+                    cost = total.sum() / n.sum()
+                for q in ti.static(range(4)):
+                    side = n[q] + n[(q + 1) % 4]
+                    if side >= LEAST_SIDE and n.sum() - side >= LEAST_SIDE:
+                        cost = ti.min(cost, (total[q] + total[(q + 1) % 4]) / side)
                 self.cost[i * steps + d] = cost + START_WEIGHT * ti.abs(d - reach) / reach
                 self.paths[i * steps + d] = 0.0
 
@@ -231,3 +233,15 @@ class PlaneSweep:
             curvature = ti.max(left + right - 2.0 * middle, 1e-6)
             offset = ti.min(ti.max((left - right) / (2.0 * curvature), -0.5), 0.5)
             found[y, x] = inverse[y, x] + step * (best + offset - reach)
+
+
+def _quadrants(warps: Sequence[NDArray[np.float32]]) -> list[int]:
+    """Return the quadrant, 0 to 3, of the direction in which each neighbour sees a pixel move with its inverse depth.
+
+    Quadrants 0 and 2 lie around the main direction of all neighbours.
+    """
+    moves = np.array([warp[:2, 3] for warp in warps], dtype=np.float64)
+    moves /= np.maximum(np.linalg.norm(moves, axis=1, keepdims=True), 1e-9)
+    along = np.linalg.svd(moves)[2][0]
+    angles = np.arctan2(moves @ (-along[1], along[0]), moves @ along)
+    return (np.floor(angles / (np.pi / 2) + 0.5).astype(int) % 4).tolist()

@@ -60,7 +60,7 @@ VIEWS_OF_VERTEX, SHORT = 3, 16
 # Connected parts with a smaller share of the total surface area are small. Their vertices need so many views, and at
 # most this number of views that see through them for every one that sees them.
 LEAST_PART = 0.002
-VIEWS_OF_SMALL, THROUGH_SMALL = 7, 0.5
+VIEWS_OF_SMALL, THROUGH_SMALL = 6, 0.5
 BLOCK = 8
 
 

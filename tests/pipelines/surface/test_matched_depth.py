@@ -49,6 +49,29 @@ def test_a_depth_that_is_wrong_everywhere_is_put_right(wrong: float) -> None:
     assert (error(depth, true[4]) < 0.03).mean() > 0.9
 
 
+def test_the_background_right_beside_an_object_is_found_on_all_its_sides() -> None:
+    """A square before a wall, seen by cameras above, below and beside each other, in a map in which it is too large."""
+    rng = np.random.default_rng(0)
+    waves, phases = rng.normal(0, 12, (40, 2)), rng.uniform(0, 2 * np.pi, 40)
+    row, column = np.mgrid[:96, :128] + 0.5
+    rays = np.stack([(column - 64.0) / 100.0, (row - 48.0) / 100.0], axis=2)
+    reach = [-0.3, -0.2, -0.1, 0.1, 0.2, 0.3]
+    seen = []
+    for x, y in [(0.0, 0.0), *((step, 0.0) for step in reach), *((0.0, step) for step in reach)]:
+        T = np.eye(4)
+        T[:2, 3] = -x, -y
+        is_square = (np.abs((x, y) + 2.0 * rays) < 0.4).all(axis=2)
+        z = np.where(is_square, 2.0, 3.0)
+        places = (x, y) + z[..., None] * rays + 5.0 * is_square[..., None]
+        pattern = np.sin(places @ waves.T + phases).mean(axis=2)
+        depth = np.where((np.abs((x, y) + 2.0 * rays) < 0.5).all(axis=2), 2.0, 3.0).astype(np.float32)
+        seen.append(DepthView(CAMERA, T, (0.5 + pattern).astype(np.float32), depth))
+    found = DepthMatcher(seen).matched(0)
+    beside = (seen[0].depth == 2.0) & (np.abs(2.0 * rays).max(axis=2) > 0.44)
+    for side in (rays[..., 0] < -0.2, rays[..., 0] > 0.2, rays[..., 1] < -0.2, rays[..., 1] > 0.2):
+        assert (np.abs(found - 3.0) < 0.1)[beside & side].mean() > 0.9
+
+
 def test_where_pictures_say_nothing_the_map_stands() -> None:
     seen, true = views(contrast=0.0)
     depth = DepthMatcher(seen).matched(4)
