@@ -50,8 +50,8 @@ class PlaneSweep:
         # Powers of two, so that most sizes share the kernels of the offline cache.
         samples = 1 << (pixels * steps - 1).bit_length()
         self.carried = ti.field(ti.f32, samples)
-        self.total = ti.field(ti.f32, 4 * samples)  # by quadrant
-        self.count = ti.field(ti.f32, 4 * samples)
+        self.total = ti.field(ti.f32, 4 * samples)  # of each quadrant
+        self.count = ti.field(ti.i32, samples)  # of the neighbours in each quadrant, a byte for each
         self.cost = ti.field(ti.f32, samples)
         self.paths = ti.field(ti.f32, samples)
         self.line = ti.field(ti.f32, 2 * MAX_STEPS * 4096)
@@ -81,7 +81,7 @@ class PlaneSweep:
         variance = np.maximum(cv2.blur(grey * grey, (3, 3)) - mean * mean, 0.0)
         scale = (1.0 / np.sqrt(variance + LEAST_VARIANCE)).astype(np.float32)
         spread = 1 if on_gpu() else SPREAD
-        self._clear(4 * steps * height * width)
+        self._clear(steps * height * width)
         for other, warp, quadrant in zip(others, warps, _quadrants(warps), strict=True):
             self._carry(other, warp, inverse, step, reach)
             self._compare(grey, mean, scale, quadrant, steps)
@@ -94,8 +94,9 @@ class PlaneSweep:
     @ti.kernel
     def _clear(self, samples: ti.i32):
         for i in range(samples):
-            self.total[i] = 0.0
-            self.count[i] = 0.0
+            self.count[i] = 0
+            for q in ti.static(range(4)):
+                self.total[q * samples + i] = 0.0
 
     @ti.kernel
     def _carry(
@@ -135,7 +136,7 @@ class PlaneSweep:
             d, y = i // height, i % height
             up, down = ti.max(y - 1, 0), ti.min(y + 1, height - 1)
             a, b, c = (d * height + up) * width, i * width, (d * height + down) * width
-            to = quadrant * steps * height * width + b
+            to = quadrant * steps * height * width
             # Sums over the window's columns: of the neighbour, of its square, of its product with the view.
             left, middle = ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0])
             for x in range(width + 1):
@@ -152,8 +153,8 @@ class PlaneSweep:
                         spread = ti.max(total[1] - total[0] * total[0], 0.0) + LEAST_VARIANCE
                         together = total[2] - total[0] * mean[y, x - 1]
                         cost = 1.0 - together * scale[y, x - 1] / ti.sqrt(spread)
-                        self.total[to + x - 1] = self.total[to + x - 1] + cost
-                        self.count[to + x - 1] = self.count[to + x - 1] + 1.0
+                        self.total[to + b + x - 1] = self.total[to + b + x - 1] + cost
+                        self.count[b + x - 1] = self.count[b + x - 1] + (1 << 8 * quadrant)
                     left = middle
                 middle = column
 
@@ -165,8 +166,8 @@ class PlaneSweep:
             for d in range(steps):
                 n, total = ti.Vector([0.0, 0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0, 0.0])
                 for q in ti.static(range(4)):
-                    at = (q * steps + d) * pixels + i
-                    n[q], total[q] = self.count[at], self.total[at]
+                    n[q] = ti.cast((self.count[d * pixels + i] >> 8 * q) & 255, ti.f32)
+                    total[q] = self.total[(q * steps + d) * pixels + i]
                 cost = 1.0
                 if n.sum() > 0.0:
                     cost = total.sum() / n.sum()
