@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.timing import peak_memory_mb, resident_mb
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import load_scene
@@ -63,7 +63,7 @@ def measure_world(scene: str, copies: int, settings: list[str], folder: str) -> 
                 "gaussians": paging.count,
                 "resident": len(mapper.pipeline.gaussians),
                 "blocks_on_disk": len(paging.away),
-                "resident_mb": _resident_mb(),
+                "resident_mb": resident_mb(),
             }
         )
         print(f"copy {copy + 1} of {copies}: {rows[-1]}", file=sys.stderr, flush=True)
@@ -78,7 +78,7 @@ def measure_world(scene: str, copies: int, settings: list[str], folder: str) -> 
         "frames": len(mapper.frames),
         "finishing_seconds": finishing,
         "gaussians": mapper.pipeline.gaussian_count,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": peak_memory_mb(),
         "guards": mapper.pipeline.caught().counts(),
     }
 
@@ -112,9 +112,3 @@ def _held_out(mapper: Mapper, tracker: Any, copies: int, steps: NDArray[np.float
         scores = evaluate(mapper.pipeline, frames, {"online": version}, None, lambda *_: None)
         means.append(float(np.mean([score.psnr for score in scores])))
     return means
-
-
-def _resident_mb() -> float:
-    """Return the memory of this process now [MB]."""
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * resource.getpagesize() / 1e6

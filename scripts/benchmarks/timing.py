@@ -1,4 +1,4 @@
-"""Timing of calls on Taichi's current device, and the peak memory of a process."""
+"""Timing of calls on Taichi's current device, and the memory of a process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from fields.runtime.engine import ti
 
-__all__ = ["milliseconds", "peak_memory_mb", "seconds", "stage_milliseconds"]
+__all__ = ["milliseconds", "peak_memory_mb", "resident_mb", "seconds", "stage_milliseconds"]
 
 
 def seconds(call: Callable[[], object], wait: Callable[[], object] = ti.sync) -> float:
@@ -44,3 +44,12 @@ def milliseconds(call: Callable[[], object], repeats: int) -> float:
 def peak_memory_mb() -> float:
     """Return the peak host memory of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def resident_mb() -> float:
+    """Return the host memory of this process now [MB], NaN on systems other than Linux."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * resource.getpagesize() / 1e6
+    except OSError:
+        return float("nan")

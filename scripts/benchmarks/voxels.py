@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 
-from benchmarks.timing import seconds
+from benchmarks.timing import resident_mb, seconds
 from fields.map.occupancy import OccupancyVoxels
 from fields.runtime.backend import initialise
 
@@ -33,21 +31,12 @@ def measure_voxels(device: str, threads: int, level: int) -> dict[str, float]:
         return voxels
 
     voxels = compiled()
-    before = _resident_mb()
+    before = resident_mb()
     for batch in points:
         times["query"].append(seconds(lambda batch=batch: voxels.query(batch, size)))
         times["update"].append(seconds(lambda batch=batch: voxels.update(batch, size)))
-    megabytes = _resident_mb() - before
+    megabytes = resident_mb() - before
     voxels = compiled()
     for batch in points:
         times["admit"].append(seconds(lambda batch=batch: voxels.admit(batch, size)))
     return {name: 1e3 * float(np.median(of)) for name, of in times.items()} | {"megabytes": megabytes}
-
-
-def _resident_mb() -> float:
-    """Return the current resident memory of this process [MB], NaN on systems other than Linux."""
-    try:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except OSError:
-        return float("nan")
