@@ -113,12 +113,14 @@ class DepthMatcher:
             plane_warp(view.camera, view.T_camera_world, other.camera, other.T_camera_world).astype(np.float32)
             for other in others
         ]
+        size = view.grey.shape[::-1]
+        if size[0] < inverse.shape[1]:
+            inverse = cv2.resize(inverse, size, interpolation=cv2.INTER_AREA)
         # Smoothing except at edges, so that a window is warped as one piece of surface.
         smooth = cv2.medianBlur(inverse, 3)
         smooth = cv2.bilateralFilter(smooth, -1, 0.03 * float(np.median(smooth)), 6)
-        size = view.grey.shape[::-1]
-        shrinks = size[0] < smooth.shape[1]
-        smooth = cv2.resize(smooth, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        if size[0] > smooth.shape[1]:
+            smooth = cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR)
         # One step moves a pixel by about one pixel in the most distant neighbour.
         step = 1.0 / max(float(np.linalg.norm(warp[:2, 3])) for warp in warps)
         start = np.ascontiguousarray(smooth, dtype=np.float32)
