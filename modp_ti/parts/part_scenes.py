@@ -18,7 +18,7 @@ __all__ = ["FOLDER", "part_config", "part_scenes", "parts_of", "steps_in_part"]
 FOLDER = "parts"
 # Share of the steps of a keyframe that it gets in its part. The refinement of the merged map gets the others: a part
 # optimises what the merged map takes from another one as well, and the seams need the steps.
-IN_PART = 0.5
+IN_PART = 0.25
 
 
 def parts_of(tracker: Tracker, config: SceneConfig) -> list[Part]:

@@ -115,7 +115,7 @@ class DepthMatcher:
         ]
         size = view.grey.shape[::-1]
         if size[0] < inverse.shape[1]:
-            inverse = cv2.resize(inverse, size, interpolation=cv2.INTER_AREA)
+            inverse = np.asarray(cv2.resize(inverse, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
         # Smoothing except at edges, so that a window is warped as one piece of surface.
         smooth = cv2.medianBlur(inverse, 3)
         smooth = cv2.bilateralFilter(smooth, -1, 0.03 * float(np.median(smooth)), 6)
