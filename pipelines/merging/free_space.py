@@ -15,7 +15,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import ti
 from pipelines.render.renderer import Renderer
 
-__all__ = ["FreeSpace", "SurfaceView"]
+__all__ = ["FreeSpace", "ShownSurface"]
 
 # A Gaussian is before a surface if its depth is less than this share of the surface's.
 BEFORE = 0.85
@@ -24,7 +24,7 @@ LEAST_OPACITY = 0.5
 
 
 @dataclass(frozen=True)
-class SurfaceView:
+class ShownSurface:
     """The surface that a map shows in one of its own keyframes.
 
     Attributes:
@@ -59,12 +59,12 @@ class FreeSpace:
         self.projected = renderer.projected
         self._near = near
 
-    def surface(self, number: int, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> SurfaceView:
+    def surface(self, number: int, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> ShownSurface:
         """Return what the loaded map, which has this number, shows in a keyframe."""
         view = self.renderer.render(camera, T_camera_world, self._near)
-        return SurfaceView(number, camera, T_camera_world, view.expected_depth(LEAST_OPACITY))
+        return ShownSurface(number, camera, T_camera_world, view.expected_depth(LEAST_OPACITY))
 
-    def floating(self, numbers: NDArray[np.integer], views: Sequence[SurfaceView]) -> NDArray[np.bool_]:
+    def floating(self, numbers: NDArray[np.integer], views: Sequence[ShownSurface]) -> NDArray[np.bool_]:
         """Return which of the loaded Gaussians (N,) float before the surfaces of other maps.
 
         Args:
@@ -79,7 +79,7 @@ class FreeSpace:
             elsewhere[index] += np.where(is_before, 0.0, weight)
         return before > elsewhere
 
-    def _shown(self, view: SurfaceView) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    def _shown(self, view: ShownSurface) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
         """Return the indices (M,) of the Gaussians in a view, and the sums (M,) of alpha T and of alpha T z / D."""
         renderer, has_surface = self.renderer, view.depth > 0
         renderer.forward(view.camera, view.T_camera_world, self._near)

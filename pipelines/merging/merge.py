@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
 from pipelines.finished_map import FinishedMap, take_in_frames, take_in_gaussians
-from pipelines.merging.free_space import FreeSpace, SurfaceView
+from pipelines.merging.free_space import FreeSpace, ShownSurface
 from pipelines.merging.gauge import colour_changes, exposed_in, recoloured
 from pipelines.merging.ownership import Shown, owned
 from pipelines.online_map import OnlineMap
@@ -81,7 +81,7 @@ def _kept(mapper: OnlineMap, parts: Sequence[MappedPart]) -> list[NDArray[np.boo
     """Return which Gaussians (N,) of each part are kept: what it owns, and no keyframe of another part sees through."""
     space = FreeSpace(mapper.renderer, mapper.near)
     shown: list[Shown] = []
-    views: list[SurfaceView] = []
+    views: list[ShownSurface] = []
     for number, part in enumerate(parts):
         own = [view for view in mapper.keyframes if view.index in part.own]
         shown.append(_shown(mapper, part, own))

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, inverse_se3
-from pipelines.merging.free_space import BEFORE, FreeSpace, SurfaceView
+from pipelines.merging.free_space import BEFORE, FreeSpace, ShownSurface
 from pipelines.render.renderer import Renderer
 from tests.pipelines import reference
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
@@ -18,7 +18,7 @@ State = dict[str, NDArray[np.float64]]
 SIZE = (CAMERA.height, CAMERA.width)
 
 
-def shown(state: State, view: SurfaceView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def shown(state: State, view: ShownSurface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sums (N,) of alpha T and of alpha T z / D over the pixels with a surface, by the plain renderer."""
     splats = reference.project(state, CAMERA, view.T_camera_world, NEAR)
     weight, weighted_ratio = np.zeros(len(state["position"])), np.zeros(len(state["position"]))
@@ -40,7 +40,7 @@ def test_the_rule_is_that_of_the_plain_twin(renderers: Callable[..., Renderer], 
     for number in range(3):
         depth = np.where(rng.random(SIZE) < 0.2, 0.0, rng.uniform(3.0, 6.0, SIZE))
         pose = exp_se3(0.1 * rng.normal(size=6)) @ POSE
-        views.append(SurfaceView(number, CAMERA, pose, depth))
+        views.append(ShownSurface(number, CAMERA, pose, depth))
     before, elsewhere, unsure = np.zeros(150), np.zeros(150), np.zeros(150, dtype=bool)
     for view in views:
         weight, weighted_ratio = shown(state, view)
@@ -90,6 +90,6 @@ def test_fog_before_a_wall_floats_unless_the_map_that_shows_the_wall_has_it(
 def test_what_another_map_does_not_see_does_not_float(renderers: Callable[..., Renderer]) -> None:
     renderer, state = renderers(), wall_and_fog()
     renderer.gaussians.load(state)
-    nothing = SurfaceView(0, CAMERA, POSE, np.zeros(SIZE))
-    away = SurfaceView(0, CAMERA, exp_se3([0.0, 0.0, 0.0, 0.0, np.pi, 0.0]) @ POSE, np.full(SIZE, 4.0))
+    nothing = ShownSurface(0, CAMERA, POSE, np.zeros(SIZE))
+    away = ShownSurface(0, CAMERA, exp_se3([0.0, 0.0, 0.0, 0.0, np.pi, 0.0]) @ POSE, np.full(SIZE, 4.0))
     assert not FreeSpace(renderer, NEAR).floating(np.ones(401, dtype=int), [nothing, away]).any()
