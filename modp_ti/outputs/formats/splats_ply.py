@@ -12,6 +12,7 @@ from modp_ti.files import read_bytes
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
 from modp_ti.files.ply import parse_ply_header
+from modp_ti.outputs.formats.splat_packing import logits
 
 __all__ = ["read_splats", "write_splats"]
 
@@ -98,8 +99,10 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     if missing or rest not in (0, 9, 24, 45):
         raise InputError(f"{file}: not 3DGS splats; {missing[0] if missing else f'{rest} f_rest'} does not fit")
 
-    def columns(*wanted: str) -> NDArray[np.float32]:
+    def columns(*wanted: str, limitless: bool = False) -> NDArray[np.float32]:
         values = np.ascontiguousarray(table[:, [column[name] for name in wanted]])
+        if limitless:
+            values = np.where(np.isinf(values), logits(values > 0), values).astype(np.float32)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):
             raise InputError(f"{file}: Gaussian {bad[0]} holds NaN or infinite numbers; the file is damaged")
@@ -113,6 +116,7 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
         "position": columns("x", "y", "z"),
         "log_scale": columns("scale_0", "scale_1", "scale_2"),
         "quaternion": columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        "opacity_logit": columns("opacity")[:, 0],
+        # Other programs write an infinite logit for an opacity that eight bits hold as 0 or 1.
+        "opacity_logit": columns("opacity", limitless=True)[:, 0],
         "sh": sh,
     }

@@ -47,6 +47,19 @@ def test_no_gaussians_make_a_file_that_is_read_back(tmp_path: Path) -> None:
     assert read_splats(tmp_path / "splats.ply")["sh"].shape == (0, 1, 3)
 
 
+def test_infinite_opacity_logits_are_read_as_opaque_and_transparent(tmp_path: Path) -> None:
+    """Other programs write them for the largest and the least opacity that eight bits hold."""
+    written = splats(3, 4)
+    written["opacity_logit"][:2] = np.inf, -np.inf
+    write_splats(tmp_path / "splats.ply", written)
+    opacity = 1.0 / (1.0 + np.exp(-read_splats(tmp_path / "splats.ply")["opacity_logit"].astype(np.float64)))
+    np.testing.assert_allclose(opacity[:2], [1.0, 0.0], atol=0.5 / 255 + 1e-6)
+    written["opacity_logit"][2] = np.nan
+    write_splats(tmp_path / "splats.ply", written)
+    with pytest.raises(InputError, match="Gaussian 2 holds NaN"):
+        read_splats(tmp_path / "splats.ply")
+
+
 def test_a_file_cut_short_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "splats.ply"
     write_splats(path, splats(9, 1))
