@@ -62,7 +62,7 @@ class FreeSpace:
     def surface(self, number: int, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> ShownSurface:
         """Return what the loaded map, which has this number, shows in a keyframe."""
         view = self.renderer.render(camera, T_camera_world, self._near)
-        return ShownSurface(number, camera, T_camera_world, view.expected_depth(LEAST_OPACITY))
+        return ShownSurface(number, camera, T_camera_world, view.expected_depth(LEAST_OPACITY).astype(np.float32))
 
     def floating(self, numbers: NDArray[np.integer], views: Sequence[ShownSurface]) -> NDArray[np.bool_]:
         """Return which of the loaded Gaussians (N,) float before the surfaces of other maps.

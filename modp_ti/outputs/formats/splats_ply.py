@@ -99,9 +99,9 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     if missing or rest not in (0, 9, 24, 45):
         raise InputError(f"{file}: not 3DGS splats; {missing[0] if missing else f'{rest} f_rest'} does not fit")
 
-    def columns(*wanted: str, limitless: bool = False) -> NDArray[np.float32]:
+    def columns(*wanted: str, may_be_infinite: bool = False) -> NDArray[np.float32]:
         values = np.ascontiguousarray(table[:, [column[name] for name in wanted]])
-        if limitless:
+        if may_be_infinite:
             values = np.where(np.isinf(values), logits(values > 0), values).astype(np.float32)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):
@@ -117,6 +117,6 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
         "log_scale": columns("scale_0", "scale_1", "scale_2"),
         "quaternion": columns("rot_0", "rot_1", "rot_2", "rot_3"),
         # Other programs write an infinite logit for an opacity that eight bits hold as 0 or 1.
-        "opacity_logit": columns("opacity", limitless=True)[:, 0],
+        "opacity_logit": columns("opacity", may_be_infinite=True)[:, 0],
         "sh": sh,
     }
