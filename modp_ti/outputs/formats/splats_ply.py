@@ -102,7 +102,7 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     def columns(*wanted: str, may_be_infinite: bool = False) -> NDArray[np.float32]:
         values = np.ascontiguousarray(table[:, [column[name] for name in wanted]])
         if may_be_infinite:
-            values = np.where(np.isinf(values), logits(values > 0), values).astype(np.float32)
+            values = np.where(np.isinf(values), logits(np.sign(values)), values).astype(np.float32)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):
             raise InputError(f"{file}: Gaussian {bad[0]} holds NaN or infinite numbers; the file is damaged")
