@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import ti
 from pipelines.densify.depth.plane_sweep import plane_warp
+from pipelines.surface.plane_sweep import LANES
 
 __all__ = ["agreeing_views"]
 
@@ -34,15 +35,20 @@ def agreeing_views(view: Placed, others: Iterable[Placed], tolerance: float) -> 
 @ti.kernel
 def _add(depth: IMAGE, warp: IMAGE, other: IMAGE, tolerance: ti.f32, count: IMAGE):
     width = depth.shape[1]
-    for i in range(depth.shape[0] * width):
-        row, column = i // width, i % width
-        z = depth[row, column]
-        p = ti.Vector([0.0, 0.0, 0.0])
-        for r in ti.static(range(3)):
-            p[r] = z * (warp[r, 0] * (column + 0.5) + warp[r, 1] * (row + 0.5) + warp[r, 2]) + warp[r, 3]
-        if z > 0.0 and p[2] > 0.0:
-            x, y = ti.floor(p[0] / p[2]), ti.floor(p[1] / p[2])
-            if x >= 0.0 and y >= 0.0 and x < other.shape[1] and y < other.shape[0]:
-                there = other[ti.cast(y, ti.i32), ti.cast(x, ti.i32)]
-                if ti.abs(p[2] - there) < tolerance * there:
-                    count[row, column] = count[row, column] + 1.0
+    groups = (width + LANES - 1) // LANES
+    for i in range(depth.shape[0] * groups):
+        row, first = i // groups, i % groups * LANES
+        v, lanes = row + 0.5, ti.min(LANES, width - first)
+        agreed = ti.Vector([0.0] * LANES)
+        for k in range(lanes):
+            u, z = first + k + 0.5, depth[row, first + k]
+            p = ti.Vector([0.0, 0.0, 0.0])
+            for r in ti.static(range(3)):
+                p[r] = z * (warp[r, 0] * u + warp[r, 1] * v + warp[r, 2]) + warp[r, 3]
+            over = 1.0 / ti.max(p[2], 1e-12)
+            x, y = p[0] * over, p[1] * over
+            inside = (z > 0.0) & (p[2] > 0.0) & (x >= 0.0) & (y >= 0.0) & (x < other.shape[1]) & (y < other.shape[0])
+            there = other[ti.cast(ti.select(inside, y, 0.0), ti.i32), ti.cast(ti.select(inside, x, 0.0), ti.i32)]
+            agreed[k] = ti.select(inside & (ti.abs(p[2] - there) < tolerance * there), 1.0, 0.0)
+        for k in range(lanes):
+            count[row, first + k] = count[row, first + k] + agreed[k]

@@ -116,15 +116,25 @@ class DepthMatcher:
         size = view.grey.shape[::-1]
         if size[0] < inverse.shape[1]:
             inverse = np.asarray(cv2.resize(inverse, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-        # Smoothing except at edges, so that a window is warped as one piece of surface.
-        smooth = cv2.medianBlur(inverse, 3)
-        smooth = cv2.bilateralFilter(smooth, -1, 0.03 * float(np.median(smooth)), 6)
+        smooth = _smoothed(inverse)
         if size[0] > smooth.shape[1]:
             smooth = cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR)
         # One step moves a pixel by about one pixel in the most distant neighbour.
         step = 1.0 / max(float(np.linalg.norm(warp[:2, 3])) for warp in warps)
         start = np.ascontiguousarray(smooth, dtype=np.float32)
         return self._sweep.sweep(view.grey, [other.grey for other in others], warps, start, step, reach)
+
+
+def _smoothed(inverse: Image) -> Image:
+    """Smooth an inverse depth (H, W) except at edges, so that a window is warped as one piece of surface.
+
+    Every second pixel of a row and of a column is smoothed with its kind only, which takes a quarter of the time.
+    """
+    median = cv2.medianBlur(inverse, 3)
+    smooth = np.empty_like(inverse)
+    for part in (np.s_[r::2, c::2] for r in range(2) for c in range(2)):
+        smooth[part] = cv2.bilateralFilter(np.ascontiguousarray(median[part]), -1, 0.03 * float(np.median(median)), 3)
+    return smooth
 
 
 def _half(view: DepthView) -> DepthView:

@@ -130,9 +130,10 @@ def fused(views: Sequence[SurfaceView], voxel: float, farthest: float) -> VoxelB
     colours = grid.attribute("color").numpy().reshape(-1, 3)
     rows = BLOCK**3 * used.numpy().astype(np.int32)
     for view in views:
+        seen = _in_view(view, voxel * (blocks + (BLOCK - 1) / 2), voxel * BLOCK)
         integrate(
-            blocks,
-            rows,
+            blocks[seen],
+            rows[seen],
             offsets,
             voxel,
             view.camera.matrix().astype(np.float32),
@@ -147,6 +148,16 @@ def fused(views: Sequence[SurfaceView], voxel: float, farthest: float) -> VoxelB
             colours,
         )
     return grid
+
+
+def _in_view(view: SurfaceView, centres: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
+    """Return which cubes (B,) with given centres (B, 3) and edges, in any rotation, may reach into a view."""
+    camera, T = view.camera, view.T_camera_world
+    K = camera.matrix()
+    # Inner normals of the planes through the camera that bound the view, and of its focal plane.
+    normals = np.array([K[0], camera.width * K[2] - K[0], K[1], camera.height * K[2] - K[1], K[2]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return ((centres @ T[:3, :3].T + T[:3, 3]) @ normals.T >= -np.sqrt(3.0) / 2.0 * edge).all(axis=1)
 
 
 def extracted(grid: VoxelBlockGrid) -> TriangleMesh:

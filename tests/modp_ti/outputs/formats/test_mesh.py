@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ import pytest
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats import mesh as mesh_module
 from modp_ti.outputs.formats.mesh import (
     TRUNCATION,
     SurfaceView,
@@ -23,10 +25,11 @@ from modp_ti.outputs.formats.mesh import (
     write_mesh,
 )
 from modp_ti.outputs.formats.open3d_io import open3d
-from tests.room import Room, pinhole, walk
+from tests.room import Room, look_at, pinhole, walk
 
 if TYPE_CHECKING:
     import open3d as o3d
+    from open3d.pybind.t.geometry import VoxelBlockGrid
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
 COLOUR = np.float32([0.25, 0.5, 1.0])
@@ -137,6 +140,34 @@ def test_of_few_views_one_is_enough_for_a_large_part_and_not_for_a_small_one() -
     sphere, crumb = create.create_sphere(1.0), create.create_sphere(0.03).translate((0.0, 2.0, 0.0))
     mesh = supported(sphere + crumb, views_around(sphere + crumb, 3), 0.1)
     assert len(mesh.vertices) == len(sphere.vertices)
+
+
+def by_block(grid: VoxelBlockGrid) -> list[np.ndarray]:
+    """Blocks in the order of their place, and their values: Open3D's own order may differ from call to call."""
+    used = grid.hashmap().active_buf_indices().numpy()
+    blocks = grid.hashmap().key_tensor().numpy()[used]
+    order = np.lexsort(blocks.T)
+    return [blocks[order], *(grid.attribute(name).numpy()[used[order]] for name in ("tsdf", "weight", "color"))]
+
+
+def test_blocks_out_of_view_are_left_out_and_no_voxel_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras that look into four directions see some of the blocks each."""
+    views = plane_views(np.array([0.0, 0.0, -1.0]), -1.2)
+    targets = ([1.0, 0.3, 1.0], [-1.0, -1.5, 1.0], [0.5, 0.0, -1.0])
+    views += [replace(views[0], T_camera_world=look_at(np.zeros(3), np.array(target))) for target in targets]
+    in_view, shares = mesh_module._in_view, []
+
+    def counted(view: SurfaceView, centres: np.ndarray, edge: float) -> np.ndarray:
+        seen = in_view(view, centres, edge)
+        shares.append(seen.mean())
+        return seen
+
+    monkeypatch.setattr(mesh_module, "_in_view", counted)
+    some = by_block(fused(views, voxel=0.02, farthest=4.0))
+    monkeypatch.setattr(mesh_module, "_in_view", lambda view, centres, edge: np.ones(len(centres), dtype=bool))
+    for values, of_all in zip(some, by_block(fused(views, voxel=0.02, farthest=4.0)), strict=True):
+        np.testing.assert_array_equal(values, of_all)
+    assert all(0.02 < share < 0.9 for share in shares)
 
 
 def test_views_of_nothing_are_refused() -> None:
