@@ -18,6 +18,9 @@ from fields.map.trajectory import Trajectory
 
 __all__ = ["KeyframeStore"]
 
+# Distance beyond which a keyframe is of another place [scene depths].
+FAR = 3.0
+
 
 class KeyframeStore:
     """The keyframes, and frames between them, in the order of their frames.
@@ -156,9 +159,18 @@ class KeyframeStore:
         self.nbytes += keyframe.nbytes
 
     def near(self) -> NDArray[np.int64]:
-        """Return the places (M,) of the keyframes that miss at most `most_missing` Gaussians."""
+        """Return the places (M,) of the keyframes around the latest one, of which views are drawn.
+
+        They miss at most `most_missing` Gaussians. While parts of the map lie on disk, they are also at most FAR away.
+        Otherwise, what is still in memory of an earlier place would be drawn as often as the present one.
+        """
         missing = np.fromiter((k.missing for k in self._keyframes), np.int64, len(self._keyframes))
-        return np.flatnonzero(missing <= self.most_missing)
+        places = np.flatnonzero(missing <= self.most_missing)
+        if missing.any() and len(places) and self.latest >= 0:
+            centres = np.array([self._keyframes[place].centre for place in places])
+            distances = np.linalg.norm(centres - self._keyframes[self.latest].centre, axis=1)
+            places = places[distances <= FAR * self.scene_depth]
+        return places
 
     def take_in_depths(self) -> None:
         """Recompute `scene_depth` after median depths have changed."""

@@ -50,6 +50,21 @@ def test_a_new_keyframe_starts_at_the_mean_error_and_the_first_at_one() -> None:
     assert store.append(frame(2)).error == pytest.approx(0.2)
 
 
+def test_views_are_of_the_present_place_only_while_parts_of_the_map_lie_on_disk() -> None:
+    """The scene is 4 m deep, the camera moves on by 5 m a keyframe, and another place is farther than 12 m."""
+    store = KeyframeStore()
+    for index in range(6):
+        T = np.eye(4)
+        T[0, 3] = -5.0 * index
+        store.append(frame(index, T=T))
+    store.most_missing = 10
+    assert store.near().tolist() == [0, 1, 2, 3, 4, 5]
+    store[4].missing = 1
+    assert store.near().tolist() == [3, 4, 5]
+    store[4].missing = 11
+    assert store.near().tolist() == [3, 5]
+
+
 def test_frames_between_keyframes_share_their_corrections() -> None:
     store = KeyframeStore()
     T = exp_se3([1, 0, 0, 0, 0.3, 0])
