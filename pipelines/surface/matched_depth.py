@@ -128,12 +128,13 @@ class DepthMatcher:
 def _smoothed(inverse: Image) -> Image:
     """Smooth an inverse depth (H, W) except at edges, so that a window is warped as one piece of surface.
 
-    Every second pixel of a row and of a column is smoothed with its kind only, which takes a quarter of the time.
+    The four sets of every second pixel of every second row are smoothed one by one, which takes a quarter of the time.
     """
     median = cv2.medianBlur(inverse, 3)
+    edge = 0.03 * float(np.median(median))
     smooth = np.empty_like(inverse)
-    for part in (np.s_[r::2, c::2] for r in range(2) for c in range(2)):
-        smooth[part] = cv2.bilateralFilter(np.ascontiguousarray(median[part]), -1, 0.03 * float(np.median(median)), 3)
+    for r, c in np.ndindex(2, 2):
+        smooth[r::2, c::2] = cv2.bilateralFilter(np.ascontiguousarray(median[r::2, c::2]), -1, edge, 3)
     return smooth
 
 
