@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from fields.map.blocks import Boxes, planes_of, seen
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.glb import write_glb, write_textured_glb
 from modp_ti.outputs.formats.open3d_io import open3d, written_aside
@@ -129,11 +130,12 @@ def fused(views: Sequence[SurfaceView], voxel: float, farthest: float) -> VoxelB
     tsdf, weight = (grid.attribute(name).numpy().reshape(-1) for name in ("tsdf", "weight"))
     colours = grid.attribute("color").numpy().reshape(-1, 3)
     rows = BLOCK**3 * used.numpy().astype(np.int32)
+    boxes = Boxes(voxel * (blocks - 0.5), voxel * (blocks + BLOCK - 0.5))
     for view in views:
-        seen = _in_view(view, voxel * (blocks + (BLOCK - 1) / 2), voxel * BLOCK)
+        in_view = seen(planes_of(view.camera, view.T_camera_world, np.inf)[None], boxes)[0]
         integrate(
-            blocks[seen],
-            rows[seen],
+            blocks[in_view],
+            rows[in_view],
             offsets,
             voxel,
             view.camera.matrix().astype(np.float32),
@@ -148,16 +150,6 @@ def fused(views: Sequence[SurfaceView], voxel: float, farthest: float) -> VoxelB
             colours,
         )
     return grid
-
-
-def _in_view(view: SurfaceView, centres: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
-    """Return which cubes (B,) with given centres (B, 3) and edges, in any rotation, may reach into a view."""
-    camera, T = view.camera, view.T_camera_world
-    K = camera.matrix()
-    # Inner normals of the planes through the camera that bound the view, and of its focal plane.
-    normals = np.array([K[0], camera.width * K[2] - K[0], K[1], camera.height * K[2] - K[1], K[2]])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return ((centres @ T[:3, :3].T + T[:3, 3]) @ normals.T >= -np.sqrt(3.0) / 2.0 * edge).all(axis=1)
 
 
 def extracted(grid: VoxelBlockGrid) -> TriangleMesh:
@@ -189,13 +181,13 @@ def supported(mesh: TriangleMesh, views: Sequence[SurfaceView], tolerance: float
         tolerance: Largest distance of a vertex from the depth of a view that sees it [scene units].
     """
     placed = ((view.camera, view.T_camera_world, view.depth) for view in views)
-    seen, through = supporting_views(np.asarray(mesh.vertices), placed, tolerance)
-    sure = (seen >= VIEWS_OF_SMALL) & (through <= THROUGH_SMALL * seen)
+    seeing, through = supporting_views(np.asarray(mesh.vertices), placed, tolerance)
+    sure = (seeing >= VIEWS_OF_SMALL) & (through <= THROUGH_SMALL * seeing)
     triangles = np.asarray(mesh.triangles)
     of_triangle, _, areas = map(np.asarray, mesh.cluster_connected_triangles())
     sure[triangles[(areas >= LEAST_PART * areas.sum())[of_triangle]]] = True
     # Of a short video, a surface that one frame saw is better than none.
-    unsure = ~sure | (seen < min(VIEWS_OF_VERTEX, len(views) // SHORT))
+    unsure = ~sure | (seeing < min(VIEWS_OF_VERTEX, len(views) // SHORT))
     mesh.remove_vertices_by_mask(unsure.tolist())
     return mesh.remove_unreferenced_vertices()
 

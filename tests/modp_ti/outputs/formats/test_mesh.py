@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from fields.geometry.camera import PinholeCamera
+from fields.map.blocks import Boxes
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats import mesh as mesh_module
 from modp_ti.outputs.formats.mesh import (
@@ -155,16 +156,16 @@ def test_blocks_out_of_view_are_left_out_and_no_voxel_changes(monkeypatch: pytes
     views = plane_views(np.array([0.0, 0.0, -1.0]), -1.2)
     targets = ([1.0, 0.3, 1.0], [-1.0, -1.5, 1.0], [0.5, 0.0, -1.0])
     views += [replace(views[0], T_camera_world=look_at(np.zeros(3), np.array(target))) for target in targets]
-    in_view, shares = mesh_module._in_view, []
+    seen, shares = mesh_module.seen, []
 
-    def counted(view: SurfaceView, centres: np.ndarray, edge: float) -> np.ndarray:
-        seen = in_view(view, centres, edge)
-        shares.append(seen.mean())
-        return seen
+    def counted(planes: np.ndarray, boxes: Boxes) -> np.ndarray:
+        flags = seen(planes, boxes)
+        shares.append(flags.mean())
+        return flags
 
-    monkeypatch.setattr(mesh_module, "_in_view", counted)
+    monkeypatch.setattr(mesh_module, "seen", counted)
     some = by_block(fused(views, voxel=0.02, farthest=4.0))
-    monkeypatch.setattr(mesh_module, "_in_view", lambda view, centres, edge: np.ones(len(centres), dtype=bool))
+    monkeypatch.setattr(mesh_module, "seen", lambda planes, boxes: np.ones((1, len(boxes)), dtype=bool))
     for values, of_all in zip(some, by_block(fused(views, voxel=0.02, farthest=4.0)), strict=True):
         np.testing.assert_array_equal(values, of_all)
     assert all(0.02 < share < 0.9 for share in shares)
