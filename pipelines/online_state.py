@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 
 from fields.frames.tracked_frame import TrackedFrame
+from fields.map.keyframe import Keyframe
 from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
 from pipelines.densify.densifier import Anchor
 from pipelines.online_map import OnlineMap
 from pipelines.state import MapState
 
 __all__ = ["restore", "state_of"]
+
+# Number of keyframes whose images go to disk together, in one file, while they are read again.
+STORED_TOGETHER = 16
 
 
 def state_of(mapper: OnlineMap) -> MapState:
@@ -72,11 +76,16 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
     rows = KeyframeRows(state.group("keyframes"))
     blocks = state.group("blocks")
     on_disk = set(blocks["images"].tolist()) if blocks else ()
+    read: list[Keyframe] = []  # images that go to disk
     for frame in frames:
         if frame.index in rows.rows:
             rows.put(frame, mapper.keyframes)
             if frame.index in on_disk:
-                mapper.paging.away.store_keyframe(mapper.keyframes[-1])
+                read.append(mapper.keyframes[-1])
+        if len(read) == STORED_TOGETHER:
+            mapper.paging.away.store_keyframes(read)
+            read = []
+    mapper.paging.away.store_keyframes(read)
     if len(mapper.keyframes) != len(rows.rows):
         raise ValueError(f"{len(mapper.keyframes)} of the {len(rows.rows)} keyframes are among the frames")
     mapper.keyframes.take_in_depths()

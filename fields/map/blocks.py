@@ -12,6 +12,9 @@ from fields.geometry.camera import PinholeCamera
 
 __all__ = ["Blocks", "Boxes", "box_of", "divide", "extent_of", "planes_of", "seen"]
 
+# Coordinates of cubes are clipped to this, so that they fit into 32 bits.
+FARTHEST = float(2**31 - 1)
+
 
 @dataclass(frozen=True, slots=True)
 class Boxes:
@@ -104,12 +107,17 @@ def divide(position: NDArray[np.floating], extent: NDArray[np.floating], side: f
         side: Side of the smallest blocks [scene units]. The origin of the world is a corner of one.
     """
     level = np.ceil(np.log2(np.maximum(4.0 * extent.astype(np.float64) / side, 1.0)))
-    cubes = np.floor(position.astype(np.float64) / (side * 2.0**level)[:, None])
-    cell = np.column_stack([level, cubes]).astype(np.int64)
-    members = np.lexsort(cell.T[::-1])  # stable: equal cells keep their order
-    changes = (np.diff(cell[members], axis=0) != 0).any(axis=1)
-    first = np.flatnonzero(np.concatenate([[True], changes])) if len(members) else np.zeros(0, dtype=np.int64)
-    return Blocks(_around(position[members], extent[members], first), members, np.append(first, len(members)))
+    # An axis at a time and in 32 bits, because a map may have millions of spheres.
+    cell = [level.astype(np.int32)]
+    for axis in range(3):
+        cube = np.floor(position[:, axis].astype(np.float64) / (side * 2.0**level))
+        cell.append(np.clip(cube, -FARTHEST, FARTHEST).astype(np.int32))
+    members = np.lexsort(cell[::-1])  # stable: equal cells keep their order
+    changes = np.zeros(max(len(members) - 1, 0), dtype=bool)
+    for number in cell:
+        changes |= np.diff(number[members]) != 0
+    first = np.flatnonzero(np.append(True, changes)) if len(members) else np.zeros(0, dtype=np.int64)
+    return Blocks(_around(position, extent, members, first), members, np.append(first, len(members)))
 
 
 def extent_of(log_scale: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -123,15 +131,21 @@ def extent_of(log_scale: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def box_of(position: NDArray[np.floating], extent: NDArray[np.floating]) -> Boxes:
     """Return the box around all spheres, given their centres (N, 3) and radii (N,), N >= 1."""
-    return _around(position, extent, np.zeros(1, dtype=np.int64))
+    return _around(position, extent, np.arange(len(position)), np.zeros(1, dtype=np.int64))
 
 
-def _around(position: NDArray[np.floating], extent: NDArray[np.floating], first: NDArray[np.int64]) -> Boxes:
-    """Boxes around consecutive groups of spheres, which begin at `first` (B,)."""
-    if len(first) == 0:
-        return Boxes(np.zeros((0, 3)), np.zeros((0, 3)))
-    centre, radius = position.astype(np.float64), extent.astype(np.float64)[:, None]
-    return Boxes(np.minimum.reduceat(centre - radius, first), np.maximum.reduceat(centre + radius, first))
+def _around(
+    position: NDArray[np.floating], extent: NDArray[np.floating], members: NDArray[np.int64], first: NDArray[np.int64]
+) -> Boxes:
+    """Boxes around consecutive groups of `members`, places of spheres; the groups begin at `first` (B,)."""
+    low, high = np.zeros((len(first), 3)), np.zeros((len(first), 3))
+    if len(first):
+        radius = extent[members].astype(np.float64)
+        for axis in range(3):
+            centre = position[members, axis].astype(np.float64)
+            low[:, axis] = np.minimum.reduceat(centre - radius, first)
+            high[:, axis] = np.maximum.reduceat(centre + radius, first)
+    return Boxes(low, high)
 
 
 def seen(planes: NDArray[np.float64], boxes: Boxes) -> NDArray[np.bool_]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,31 +132,35 @@ class KeyframeStore:
         keyframe.mask(transient)
         self.nbytes += keyframe.nbytes
 
-    def move_to_disk(self, keyframe: Keyframe, stored: Callable[[list[NDArray]], list[NDArray]]) -> None:
-        """Replace the images of a keyframe of the store, and its points, by memory-mapped ones.
+    def move_to_disk(self, keyframes: Sequence[Keyframe], stored: Callable[[list[NDArray]], list[NDArray]]) -> None:
+        """Replace the images of keyframes of the store, and their points, by memory-mapped ones.
 
-        Nothing is done if its images lie on disk already. Points count in `nbytes` all the same, since a correction
-        brings them back.
+        Images that lie on disk already stay there. Points count in `nbytes` all the same, since a correction brings
+        them back.
 
         Args:
-            keyframe: The keyframe.
+            keyframes: The keyframes.
             stored: Returns such arrays for arrays, in order.
         """
-        images = [*keyframe.pyramid, *keyframe.unmasked]
-        here = [place for place, image in enumerate(images) if not image.on_disk]
-        if not here:
+        going = [keyframe for keyframe in keyframes if keyframe.image_bytes > 0]
+        if not going:
             return
-        self.nbytes -= keyframe.nbytes
-        points = keyframe.points
+        points = [array for k in going for array in (k.points.xyz, k.points.pixels, k.points.ids)]
+        here = [image.rgba for k in going for image in (*k.pyramid, *k.unmasked) if not image.on_disk]
         # The points first: their numbers have to lie at multiples of their size.
-        xyz, pixels, ids, *moved = stored([points.xyz, points.pixels, points.ids, *(images[i].rgba for i in here)])
-        for place, rgba in zip(here, moved, strict=True):
-            images[place] = ImageLevel(rgba, images[place].camera, on_disk=True)
-        count = len(keyframe.pyramid)
-        keyframe.points = SparsePoints(xyz, pixels, ids)
-        keyframe.pyramid, keyframe.unmasked = tuple(images[:count]), tuple(images[count:])
-        keyframe.rgba = keyframe.pyramid[0].rgba
-        self.nbytes += keyframe.nbytes
+        arrays = stored([*points, *here])
+        of_points, of_images = iter(arrays[: len(points)]), iter(arrays[len(points) :])
+
+        def moved(image: ImageLevel) -> ImageLevel:
+            return image if image.on_disk else ImageLevel(next(of_images), image.camera, on_disk=True)
+
+        for keyframe in going:
+            self.nbytes -= keyframe.nbytes
+            keyframe.points = SparsePoints(next(of_points), next(of_points), next(of_points))
+            keyframe.pyramid = tuple(map(moved, keyframe.pyramid))
+            keyframe.unmasked = tuple(map(moved, keyframe.unmasked))
+            keyframe.rgba = keyframe.pyramid[0].rgba
+            self.nbytes += keyframe.nbytes
 
     def near(self) -> NDArray[np.int64]:
         """Return the places (M,) of the keyframes around the latest one, of which views are drawn.

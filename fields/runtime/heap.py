@@ -1,12 +1,16 @@
-"""Memory that the C library keeps after it was freed."""
+"""Memory that a process holds and does not need: of freed arrays, and of files that it has read."""
 
 from __future__ import annotations
 
 import ctypes
+import mmap
 import sys
 from contextlib import suppress
 
-__all__ = ["give_back_heap"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["give_back_heap", "give_back_pages"]
 
 
 def give_back_heap() -> None:
@@ -17,3 +21,17 @@ def give_back_heap() -> None:
     if sys.platform == "linux":
         with suppress(AttributeError):  # musl has no such function
             ctypes.CDLL(None).malloc_trim(0)
+
+
+def give_back_pages(array: NDArray) -> None:
+    """Give back the memory of an array that is mapped from a file, whose pages are read again when they are needed.
+
+    Does nothing to other arrays, and on Windows. The array must not have been changed.
+    """
+    owner = array
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    if isinstance(owner, memoryview):
+        owner = owner.obj
+    if isinstance(owner, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        owner.madvise(mmap.MADV_DONTNEED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +15,10 @@ from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.block_files import BlockError, BlockFiles, StoredBlock, records_of, state_of
 
-__all__ = ["BlockOnDisk", "BlocksOnDisk", "planes_of_views"]
+__all__ = ["CHUNK", "BlockOnDisk", "BlocksOnDisk", "planes_of_views"]
 
 # Depth up to which a view counts as seeing a block [median depths of its points]. Farther things are hidden, as a rule.
 REACH = 8.0
-
-
 # Number of blocks that are looked at together, which bounds the memory that this takes.
 CHUNK = 256
 ALL = slice(None)
@@ -139,9 +137,13 @@ class BlocksOnDisk:
             self.keyframes[place].missing += stored.count
         return block
 
-    def store_keyframe(self, keyframe: Keyframe) -> None:
-        """Move the images and points of a keyframe to disk. Raises OSError if there is no room."""
-        self.keyframes.move_to_disk(keyframe, self._files.store)
+    def store_keyframes(self, keyframes: Sequence[Keyframe]) -> None:
+        """Move the images and points of keyframes to disk. Raises OSError if there is no room."""
+        self.keyframes.move_to_disk(keyframes, self._files.store)
+
+    def joined(self, count: int, parts: Iterable[Mapping[str, NDArray]]) -> dict[str, NDArray]:
+        """Join arrays that come in parts, see `BlockFiles.joined`."""
+        return self._files.joined(count, parts)
 
     def forget_pages(self) -> None:
         """Give back the memory of keyframes on disk that have been read."""

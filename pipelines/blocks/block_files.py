@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import shutil
+import sys
 import tempfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,11 +96,8 @@ class BlockFiles:
         """Write the records of blocks to one file. Raises OSError if there is no room, or too little would be left."""
         together = np.concatenate(blocks)
         path = self._next("blocks", ".npy", together.nbytes)
-        try:
+        with _whole(path):
             np.save(path, together, allow_pickle=False)
-        except OSError:
-            path.unlink(missing_ok=True)
-            raise
         self._used[path] = len(blocks)
         self._kind, first = together.dtype, path.stat().st_size - together.nbytes
         stored = []
@@ -147,25 +149,41 @@ class BlockFiles:
             block.path.unlink(missing_ok=True)
 
     def store(self, arrays: Sequence[NDArray]) -> list[NDArray]:
-        """Write arrays of a keyframe to one file, and return them memory-mapped. Raises OSError as `write` does."""
-        size = sum(array.nbytes for array in arrays)
-        path = self._next("keyframe", ".raw", size)
-        try:
-            with path.open("wb") as file:
-                for array in arrays:
-                    file.write(np.ascontiguousarray(array).data)
-            with path.open("rb") as file:
-                # Copy-on-write, because kernels take no read-only arrays.
-                mapped = mmap.mmap(file.fileno(), size, access=mmap.ACCESS_COPY)
-        except OSError:
-            path.unlink(missing_ok=True)
-            raise
+        """Write arrays of keyframes to one file, and return them memory-mapped. Raises OSError as `write` does."""
+        path = self._next("keyframes", ".raw", sum(array.nbytes for array in arrays))
+        with _whole(path), path.open("w+b") as file:
+            for array in arrays:
+                file.write(np.ascontiguousarray(array).data)
+            file.flush()
+            mapped, stored = _mapped(file, [(array.dtype, array.shape) for array in arrays])
         self._keyframes.append(mapped)
-        first = np.cumsum([0, *(array.nbytes for array in arrays)])[:-1].tolist()
-        return [
-            np.frombuffer(mapped, array.dtype, array.size, start).reshape(array.shape)
-            for array, start in zip(arrays, first, strict=True)
-        ]
+        return stored
+
+    def joined(self, count: int, parts: Iterable[Mapping[str, NDArray]]) -> dict[str, NDArray]:
+        """Join arrays that come in parts in a file, and return them memory-mapped. Raises OSError as `write` does.
+
+        The file goes with the arrays; on Windows, with the folder.
+
+        Args:
+            count: Length of the joined arrays.
+            parts: Arrays by name, at least one of them.
+        """
+        following = iter(parts)
+        first = next(following)
+        kinds = {name: (array.dtype, (count, *array.shape[1:])) for name, array in first.items()}
+        sizes = [dtype.itemsize * math.prod(shape) for dtype, shape in kinds.values()]
+        path = self._next("map", ".raw", sum(sizes))
+        with _whole(path), path.open("w+b") as file:
+            ends = np.cumsum([0, *sizes])[:-1].tolist()
+            for part in chain([first], following):
+                for place, name in enumerate(kinds):
+                    file.seek(ends[place])
+                    ends[place] += file.write(np.ascontiguousarray(part[name]).data)
+            file.flush()
+            _, arrays = _mapped(file, list(kinds.values()))
+        with suppress(OSError):  # Windows keeps a file that is mapped
+            path.unlink()
+        return dict(zip(kinds, arrays, strict=True))
 
     def forget_pages(self) -> None:
         """Give back the memory of keyframes that have been read. It is taken again when they are read again."""
@@ -180,6 +198,30 @@ class BlockFiles:
             raise OSError(28, "No space left on device")
         self._written += 1
         return folder / f"{kind}-{self._written:06d}{suffix}"
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[None]:
+    """Remove a file that could not be written."""
+    try:
+        yield
+    except Exception:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def _mapped(file: IO[bytes], kinds: Sequence[tuple[np.dtype, tuple[int, ...]]]) -> tuple[mmap.mmap, list[NDArray]]:
+    """Map a file of arrays, given by type and shape, one after the other.
+
+    The mapping is copy-on-write, because kernels take no read-only arrays. Before Python 3.13, it keeps a file open.
+    """
+    closed = {"trackfd": False} if sys.version_info >= (3, 13) else {}
+    mapped, first, arrays = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY, **closed), 0, []
+    for dtype, shape in kinds:
+        size = math.prod(shape)
+        arrays.append(np.frombuffer(mapped, dtype, size, first).reshape(shape))
+        first += size * dtype.itemsize
+    return mapped, arrays
 
 
 def _checksum(records: NDArray[np.void]) -> int:

@@ -67,9 +67,8 @@ class Hierarchy:
     """
 
     def __init__(self, values: Mapping[str, NDArray]) -> None:
-        position = values["position"].astype(np.float64)
-        self.side = side_of(position, IN_FIRST_CELL)
-        self.blocks = divide(position, extent_of(values["log_scale"]), self.side * 2 ** (LEVELS - 1))
+        self.side = side_of(values["position"], IN_FIRST_CELL)
+        self.blocks = divide(values["position"], extent_of(values["log_scale"]), self.side * 2 ** (LEVELS - 1))
         self._levels = [Level(values, self.blocks.members, self.blocks.first)]
 
     def level(self, number: int) -> Level:
@@ -138,9 +137,9 @@ class Hierarchy:
         return Level(values, np.arange(first[-1]), first)
 
 
-def side_of(position: NDArray[np.float64], each: int) -> float:
+def side_of(position: NDArray[np.floating], each: int) -> float:
     """Return the side of cubes that hold about `each` positions (N, 3) of surfaces. Outliers do not count."""
     if len(position) == 0:
         return 1.0
-    low, high = np.quantile(position, [0.02, 0.98], axis=0)
-    return float(np.prod(np.sort(high - low)[1:]) * each / len(position)) ** 0.5 or 1.0
+    span = [float(np.diff(np.quantile(axis.astype(np.float64), [0.02, 0.98]))[0]) for axis in position.T]
+    return float(np.prod(np.sort(span)[1:]) * each / len(position)) ** 0.5 or 1.0

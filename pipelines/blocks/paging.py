@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.heap import give_back_heap
-from pipelines.blocks.away import BlocksOnDisk, planes_of_views
+from pipelines.blocks.away import CHUNK, BlocksOnDisk, planes_of_views
 from pipelines.blocks.groups import grouped
 from pipelines.memory_budget import OBSERVATION, MemoryBudget
 from pipelines.settings import MappingSettings
@@ -82,18 +82,35 @@ class Paging:
     def to_numpy(self) -> dict[str, NDArray]:
         """Return the values of the whole map, the resident Gaussians first, see `GaussianField.to_numpy`.
 
+        Those of a map that is partly on disk are memory-mapped, if the disk has room for them.
+
         Raises:
             BlockError: If a block's file is missing or damaged. The map is then without it.
         """
-        here, blocks = self.gaussians.to_numpy(), [self.away.read(block) for block in self.away]
-        return {name: np.concatenate([array, *(records[name] for records in blocks)]) for name, array in here.items()}
+        return self._joined(self.gaussians.to_numpy())
 
     def placed(self) -> tuple[NDArray[np.floating], NDArray[np.int32]]:
-        """Return the position (N, 3) and the anchor (N,) of every Gaussian of the whole map. Raises as `to_numpy`."""
-        blocks = [self.away.read(block) for block in self.away]
-        position = [self.gaussians.to_numpy()["position"], *(records["position"] for records in blocks)]
-        anchor = [self.gaussians.anchors(), *(records["anchor"] for records in blocks)]
-        return np.concatenate(position), np.concatenate(anchor)
+        """Return the position (N, 3) and the anchor (N,) of every Gaussian of the whole map, as `to_numpy` does."""
+        whole = self._joined({"position": self.gaussians.to_numpy()["position"], "anchor": self.gaussians.anchors()})
+        return whole["position"], whole["anchor"]
+
+    def _joined(self, here: dict[str, NDArray]) -> dict[str, NDArray]:
+        """Return arrays of the resident Gaussians, followed by the same ones of the blocks on disk."""
+        if len(self.away) == 0:
+            return here
+        try:
+            return self.away.joined(self.count, self._parts(here))
+        except OSError:  # no room on the disk
+            parts = list(self._parts(here))
+            return {name: np.concatenate([part[name] for part in parts]) for name in here}
+
+    def _parts(self, here: dict[str, NDArray]) -> Iterator[dict[str, NDArray]]:
+        """Yield arrays of the resident Gaussians, then those of a few blocks on disk at a time."""
+        yield here
+        blocks = list(self.away)
+        for first in range(0, len(blocks), CHUNK):
+            records = np.concatenate([self.away.read(block) for block in blocks[first : first + CHUNK]])
+            yield {name: np.ascontiguousarray(records[name]) for name in here}
 
     # ---- while the map grows ---------------------------------------------------------------------------------
 
@@ -231,8 +248,7 @@ class Paging:
         try:
             self._store(going)
             self.gaussians.remove(~gone)
-            for place in sorted(images):
-                self.away.store_keyframe(self.keyframes[place])
+            self.away.store_keyframes([self.keyframes[place] for place in sorted(images)])
             self.away.forget_pages()
             give_back_heap()
         except OSError as error:

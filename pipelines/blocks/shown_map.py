@@ -11,6 +11,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from fields.map.blocks import Blocks, divide, extent_of, planes_of, seen
 from fields.map.gaussians import GaussianField
+from fields.runtime.heap import give_back_pages
 from pipelines.blocks.hierarchy import Hierarchy, side_of
 
 __all__ = ["ShownMap"]
@@ -38,9 +39,9 @@ class ShownMap:
         self._blocks: Blocks | None = None
         self._hierarchy: Hierarchy | None = None
         if not self.fits:
-            position = self.values["position"].astype(np.float64)
+            position, extent = self.values["position"], extent_of(self.values["log_scale"])
             # Smaller blocks than those of the hierarchy, of which views see less in vain.
-            self._blocks = divide(position, extent_of(self.values["log_scale"]), side_of(position, GAUSSIANS_EACH))
+            self._blocks = divide(position, extent, side_of(position, GAUSSIANS_EACH))
 
     @property
     def fits(self) -> bool:
@@ -58,15 +59,20 @@ class ShownMap:
         if blocks is None:
             self.gaussians.load(self.values)
             return
+        self.gaussians.load(self._seen(blocks, camera, T_camera_world))
+        for array in self.values.values():
+            give_back_pages(array)
+
+    def _seen(self, blocks: Blocks, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> dict[str, NDArray]:
+        """Return the Gaussians of the blocks that a view sees, or fewer that stand for them."""
         planes = planes_of(camera, T_camera_world, np.inf)[None]
         chosen = np.flatnonzero(seen(planes, blocks.boxes)[0])
         if blocks.counts[chosen].sum() <= self.gaussians.capacity:
             members = np.concatenate([np.zeros(0, dtype=np.int64), *(blocks.of(block) for block in chosen.tolist())])
-            self.gaussians.load({name: array[members] for name, array in self.values.items()})
-            return
+            return {name: array[members] for name, array in self.values.items()}
         if self._hierarchy is None:
             self._hierarchy = Hierarchy(self.values)
         chosen = np.flatnonzero(seen(planes, self._hierarchy.blocks.boxes)[0])
         eye = inverse_se3(T_camera_world)[:3, 3]
         levels = self._hierarchy.levels_for(chosen, eye, camera.fx, self.gaussians.capacity)
-        self.gaussians.load(self._hierarchy.gaussians(chosen, levels))
+        return self._hierarchy.gaussians(chosen, levels)

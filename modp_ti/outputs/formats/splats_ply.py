@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.runtime.heap import give_back_pages
 from modp_ti.files import read_bytes
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
@@ -20,6 +21,8 @@ __all__ = ["read_splats", "write_splats"]
 # renderers must use the same to reproduce the images. Brush and splat-transform read this comment and do so by
 # themselves.
 COMMENT = "SplatRenderMode: mip"
+# Number of Gaussians that are written together, which bounds the memory that this takes.
+ROWS_EACH = 1 << 16
 
 
 def _names(sh_count: int) -> list[str]:
@@ -47,23 +50,29 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
         modp_ti.write_splats("splats.ply", mapper.pipeline.gaussians.to_numpy())
     """
     n, sh_count, _ = state["sh"].shape
-    table = np.concatenate(
-        [
-            state["position"],
-            np.zeros((n, 3)),
-            state["sh"][:, 0],
-            state["sh"][:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh_count - 1)),
-            state["opacity_logit"][:, None],
-            state["log_scale"],
-            state["quaternion"],
-        ],
-        axis=1,
-    ).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}", f"element vertex {n}"]
     header += [f"property float {name}" for name in _names(sh_count)]
     with replacing(path) as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-        file.write(table.tobytes())
+        for first in range(0, n, ROWS_EACH):
+            file.write(_table({name: array[first : first + ROWS_EACH] for name, array in state.items()}).tobytes())
+            for array in state.values():
+                give_back_pages(array)
+
+
+def _table(state: dict[str, NDArray]) -> NDArray[np.float32]:
+    """Return Gaussians as the rows of the file."""
+    n, sh_count, _ = state["sh"].shape
+    columns = [
+        state["position"],
+        np.zeros((n, 3)),
+        state["sh"][:, 0],
+        state["sh"][:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh_count - 1)),
+        state["opacity_logit"][:, None],
+        state["log_scale"],
+        state["quaternion"],
+    ]
+    return np.concatenate(columns, axis=1).astype("<f4")
 
 
 def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:

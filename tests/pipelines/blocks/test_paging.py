@@ -144,6 +144,32 @@ def test_a_limit_of_memory_moves_keyframes_to_disk(taichi_on_the_cpu: None) -> N
             np.testing.assert_array_equal(getattr(view.points, name), getattr(given.points, name))
 
 
+def test_keyframes_that_go_together_share_a_file(taichi_on_the_cpu: None, tmp_path: Path) -> None:
+    """A process may open 256 files at a time on macOS, 1,024 on Linux, and Python keeps those that are mapped open."""
+    mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
+    moved = sum(view.pyramid[0].on_disk for view in mapper.keyframes)
+    files = len(list(tmp_path.glob("blocks-*/keyframes-*")))
+    assert 0 < files < moved
+
+
+def test_the_whole_map_is_what_lies_here_and_on_disk(
+    taichi_on_the_cpu: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
+    away = mapper.paging.away
+    parts = [mapper.gaussians.to_numpy(), *(away.read(block) for block in away)]
+    assert len(parts) > 1
+    files = {path.name for path in tmp_path.rglob("*.*")}
+    mapped = mapper.all_gaussians()
+    assert {path.name for path in tmp_path.rglob("*.*")} == files, "its file is gone when nobody needs the arrays"
+    monkeypatch.setattr(disk_room, "KEPT_FREE", 1 << 62)
+    in_memory = mapper.all_gaussians()
+    for name, array in mapped.items():
+        assert not array.flags.owndata and in_memory[name].flags.owndata
+        np.testing.assert_array_equal(array, np.concatenate([part[name] for part in parts]))
+        np.testing.assert_array_equal(array, in_memory[name])
+
+
 def test_a_damaged_block_is_named_and_the_map_goes_on_without_it(taichi_on_the_cpu: None) -> None:
     mapper = walk(mapper_of(), end=OUT)
     block = next(iter(mapper.paging.away))
