@@ -42,6 +42,7 @@ class MergedParts(EarlierMap):
         self._posed: list[str] = []  # names of all frames of the tracker
         self._names: list[str] = []  # of those that could be read
         self._kept: Sequence[int] = []
+        self._filled = 0  # Gaussians that the merged map has beside those of the parts
 
     def join(self, tracker: Tracker) -> Tracker:
         """Find the finished runs of the parts. The tracker stays as it is.
@@ -65,13 +66,22 @@ class MergedParts(EarlierMap):
         return tracker
 
     def refinement(self, settings: RefineSettings) -> RefineSettings:
-        """Add the steps that the keyframes did not get in their parts, in views."""
-        mapping, budget = self._config.mapping, self._config.mapping.optimise.budget
-        left = mapping.optimise.steps - steps_in_part(self._config)
-        counts = [len(run.record.keyframes) for run in self._runs]
-        keyframes = sum(count if budget is None else min(count, budget) for count in counts)
-        further = keyframes * left * mapping.views.per_step // settings.views
+        """Add the steps that are left to the refinement: with its parts, the map gets as many views as one run."""
+        mapping = self._config.mapping
+        optimise = mapping.optimise
+        if steps_in_part(self._config) == optimise.steps:
+            return settings
+        counts = [self._own_keyframes(number) for number in range(len(self._parts))]
+        whole = sum(count if optimise.budget is None else min(count, optimise.budget) for count in counts)
+        views = whole * optimise.steps * mapping.views.per_step + optimise.last_views(sum(counts))
+        further = max(views - sum(self._view_renders), 0) // settings.views
         return settings.model_copy(update={"steps": settings.steps + further})
+
+    def _own_keyframes(self, number: int) -> int:
+        """Return the number of keyframes of a part that are not beyond its cuts."""
+        part, run = self._parts[number], self._runs[number]
+        own = set(self._posed[part.own.start : part.own.stop])
+        return sum(run.names[line] in own for line in run.record.keyframes)
 
     @property
     def seconds(self) -> float:
@@ -100,7 +110,8 @@ class MergedParts(EarlierMap):
                     "seconds": of_run["seconds"],
                 }
                 for part, of_run, kept in zip(self._parts, self._figures, self._kept, strict=True)
-            ]
+            ],
+            "filled": self._filled,
         }
 
     def go_on(self, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest) -> None:
@@ -115,7 +126,8 @@ class MergedParts(EarlierMap):
         index = {name: place for place, name in enumerate(self._names)}
         parts = [self._mapped(number, index) for number in range(len(self._parts))]
         try:
-            self._kept = mapper.merge(parts, frames())
+            self._kept = mapper.merge(parts, frames(), fill=self._config.refine.wanted)
+            self._filled = mapper.pipeline.gaussian_count - sum(self._kept)
         except ValueError as error:
             raise InputError(
                 f"{self._config.output}: the maps of the parts do not fit the recording ({error}): delete the folder "
