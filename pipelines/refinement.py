@@ -61,9 +61,10 @@ def refine(
 ) -> None:
     """Optimise a finished map on error-weighted draws from all keyframes.
 
-    All rates decay. Before the first step, Gaussians that cover fewer than `settings.min_contribution` pixels in every
-    keyframe are removed, but not from a map of many keyframes in a refinement by the clock. A map that is partly on
-    disk is refined group after group of keyframes, each for its share of the steps.
+    After a share `settings.hold`, in which poses are refined as while the map grows, all rates decay. Before the first
+    step, Gaussians that cover fewer than `settings.min_contribution` pixels in every keyframe are removed, but not from
+    a map of many keyframes in a refinement by the clock. A map that is partly on disk is refined group after group of
+    keyframes, each for its share of the steps.
 
     Args:
         mapper: Mapper after `finish`.
@@ -79,7 +80,6 @@ def refine(
         modp_ti.refine(mapper, modp_ti.RefineSettings(steps=100))
     """
     store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
-    pose_rate = poses.learning_rate if settings.poses and poses.enabled else 0.0
     if len(store) == 0 or mapper.gaussian_count == 0:
         return
     by_the_clock = schedule is not None or settings.seconds is not None
@@ -97,20 +97,22 @@ def refine(
     while share is not None:
         group = min(int(np.searchsorted(ends, share, side="right")) - 1, len(groups) - 1)
         passed = (share - ends[group]) / (ends[group + 1] - ends[group])
+        decayed = max(passed - settings.hold, 0.0) / (1.0 - settings.hold)
+        moves = poses.enabled and (settings.poses or passed < settings.hold)
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0, groups[group])
             if weights is not None:
                 p *= weights[groups[group]]
                 p /= p.sum()
             batch = [int(j) for j in mapper.rng.choice(groups[group], settings.views, p=p)]
-            slower = settings.position_decay**passed
+            slower = settings.position_decay**decayed
             rates = mapper.optimiser.rates(
                 store.scene_depth,
                 position_factor=slower,
-                scale_factor=settings.scale_decay**passed,
-                other_factor=settings.rate_decay**passed,
+                scale_factor=settings.scale_decay**decayed,
+                other_factor=settings.rate_decay**decayed,
             )
-            psnr = mapper.optimiser.step(store, batch, rates, pose_rate * slower)
+            psnr = mapper.optimiser.step(store, batch, rates, poses.learning_rate * slower if moves else 0.0)
         step += 1
         if progress is not None:
             progress(step, psnr)

@@ -377,6 +377,12 @@ class RefineSettings(StrictModel):
     )
     views: int = Field(default=4, ge=1, description="views per step, drawn as the global views are")
     poses: bool = Field(default=False, description="also refine poses, at a rate that decays as that of positions does")
+    hold: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="share of the refinement before rates decay; poses are refined in it, as while the map grows",
+    )
     position_decay: float = Field(
         default=0.01, gt=0, le=1, description="factor of the position rate at the end of the decay"
     )

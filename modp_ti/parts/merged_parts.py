@@ -66,7 +66,10 @@ class MergedParts(EarlierMap):
         return tracker
 
     def refinement(self, settings: RefineSettings) -> RefineSettings:
-        """Add the steps that are left to the refinement: with its parts, the map gets as many views as one run."""
+        """Add the steps that are left to the merged map, before the rates decay, as they are those of mapping.
+
+        With its parts, the map gets as many views as one run.
+        """
         mapping = self._config.mapping
         optimise = mapping.optimise
         if steps_in_part(self._config) == optimise.steps:
@@ -75,7 +78,8 @@ class MergedParts(EarlierMap):
         whole = sum(count if optimise.budget is None else min(count, optimise.budget) for count in counts)
         views = whole * optimise.steps * mapping.views.per_step + optimise.last_views(sum(counts))
         further = max(views - sum(self._view_renders), 0) // settings.views
-        return settings.model_copy(update={"steps": settings.steps + further})
+        steps = settings.steps + further
+        return settings.model_copy(update={"steps": steps, "hold": further / steps})
 
     def _own_keyframes(self, number: int) -> int:
         """Return the number of keyframes of a part that are not beyond its cuts."""

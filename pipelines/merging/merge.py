@@ -23,8 +23,8 @@ __all__ = ["MappedPart", "merge"]
 EDGE = 1 / 16
 # Pyramid level at which it is measured how much of each Gaussian shows, which takes half as long as at the full size.
 COARSE = 1
-# Share of `densify.pixels` that each keyframe adds to the merged map. With a quarter of them, redkitchen in four parts has
-# 94,408 Gaussians, where one run has 60,407, and 0.07 dB more.
+# Share of `densify.pixels` that each keyframe adds to the merged map. With a quarter of them, redkitchen in four parts
+# has 94,408 Gaussians, where one run has 60,407, and 0.07 dB more.
 FILLED = 1 / 16
 # How often Gaussians that float in free space are looked for. What they hid, and what the next owner of their place has
 # there, may float as well: 654, 148 and 23 Gaussians of four parts with 79,497.

@@ -115,6 +115,28 @@ def test_refinement_improves_the_map_and_leaves_the_poses(mapped: OnlineMapper) 
         np.testing.assert_array_equal(keyframe.T_camera_world, T)
 
 
+def test_rates_hold_and_poses_move_in_a_share_of_the_refinement(
+    mapped: OnlineMapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, poses = mapped.gaussians.to_numpy(), [k.T_camera_world for k in mapped.keyframes]
+    rates, moves = [], []
+    step = mapped.optimiser.step
+
+    def recorded(store: KeyframeStore, batch: list[int], of: LearningRates, pose_rate: float) -> float:
+        rates.append(of.position)
+        moves.append(pose_rate)
+        return step(store, batch, of, pose_rate)
+
+    monkeypatch.setattr(mapped.optimiser, "step", recorded)
+    refine(mapped, RefineSettings(steps=11, hold=0.5, min_contribution=0.0))
+    assert rates[:6] == rates[:1] * 6 and rates[10] == pytest.approx(0.01 * rates[0])
+    np.testing.assert_allclose(np.diff(np.log(rates[5:])), np.log(0.01) / 5, rtol=1e-6)
+    assert moves == [SETTINGS.poses.learning_rate] * 5 + [0.0] * 6
+    mapped.gaussians.load(state)
+    for keyframe, T in zip(mapped.keyframes, poses, strict=True):
+        keyframe.T_camera_world = T
+
+
 def test_refinement_removes_what_no_keyframe_shows(mapped: OnlineMapper) -> None:
     state, count = mapped.gaussians.to_numpy(), len(mapped.gaussians)
     behind = {name: values[:5].copy() for name, values in state.items()}
