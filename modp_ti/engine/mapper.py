@@ -224,7 +224,7 @@ class Mapper:
         assert isinstance(self.pipeline, OnlineMapper), "`go_on_with` refuses other maps"
         self.pipeline.watch_changes(earlier)
 
-    def merge(self, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame], fill: bool) -> list[int]:
+    def merge(self, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
         """Put the maps of the parts of a recording into this new mapper, see `pipelines.merging.merge`.
 
         Raises:
@@ -232,7 +232,7 @@ class Mapper:
         """
         if not isinstance(self.pipeline, OnlineMapper):
             raise ValueError("an offline map is not made of parts")
-        kept = merge(self.pipeline, parts, self._noted(frames), fill)
+        kept = merge(self.pipeline, parts, self._noted(frames))
         self.finished = True
         return kept
 

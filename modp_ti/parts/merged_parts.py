@@ -42,7 +42,6 @@ class MergedParts(EarlierMap):
         self._posed: list[str] = []  # names of all frames of the tracker
         self._names: list[str] = []  # of those that could be read
         self._kept: Sequence[int] = []
-        self._filled = 0  # Gaussians that the merged map has beside those of the parts
 
     def join(self, tracker: Tracker) -> Tracker:
         """Find the finished runs of the parts. The tracker stays as it is.
@@ -114,8 +113,7 @@ class MergedParts(EarlierMap):
                     "seconds": of_run["seconds"],
                 }
                 for part, of_run, kept in zip(self._parts, self._figures, self._kept, strict=True)
-            ],
-            "filled": self._filled,
+            ]
         }
 
     def go_on(self, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest) -> None:
@@ -130,8 +128,7 @@ class MergedParts(EarlierMap):
         index = {name: place for place, name in enumerate(self._names)}
         parts = [self._mapped(number, index) for number in range(len(self._parts))]
         try:
-            self._kept = mapper.merge(parts, frames(), fill=self._config.refine.wanted)
-            self._filled = mapper.pipeline.gaussian_count - sum(self._kept)
+            self._kept = mapper.merge(parts, frames())
         except ValueError as error:
             raise InputError(
                 f"{self._config.output}: the maps of the parts do not fit the recording ({error}): delete the folder "

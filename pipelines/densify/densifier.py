@@ -82,16 +82,16 @@ class Densifier:
     def add_tracked_points(self, view: Keyframe) -> None:
         """Add Gaussians at the tracked points of a view, which becomes an anchor."""
         self.anchors.append(Anchor(self.keyframes[-1], self.settings.voxels.target * view.view_scale))
-        self._grow(tracked_seeds(view), view, len(self.anchors) - 1)
+        seeds = tracked_seeds(view)
+        self._grow(seeds, view)
 
-    def add_error_pixels(self, view: Keyframe, warming_up: bool, share: float = 1.0, anchor: int | None = None) -> None:
-        """Add Gaussians at pixels of high error of a keyframe.
+    def add_error_pixels(self, view: Keyframe, warming_up: bool, share: float = 1.0) -> None:
+        """Add Gaussians at pixels of high error of the latest keyframe. Call `add_tracked_points` first.
 
         Args:
             view: The keyframe, or a level of it.
             warming_up: Whether the map is too young to render; pixels are then drawn from the whole image.
             share: Share of `densify.pixels` that is drawn.
-            anchor: The keyframe's place among the anchors; None for the last one, which `add_tracked_points` adds.
         """
         with self._stopwatch.measure("depth"):
             self.optimiser.compare(view, self.keyframes.scene_depth)
@@ -104,15 +104,15 @@ class Densifier:
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
             neighbours = self.keyframes.before(view.index, depth.neighbours)
             seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit, depth.max_misplacement)
-        self._grow(seeds, view, len(self.anchors) - 1 if anchor is None else anchor)
+        self._grow(seeds, view)
 
-    def _grow(self, seeds: Seeds, view: Keyframe, anchor: int) -> None:
+    def _grow(self, seeds: Seeds, view: Keyframe) -> None:
         """Add Gaussians at the seeds that the voxels admit. The first seeds settle the voxels around the camera."""
         with self._stopwatch.measure("occupancy"):
             if self.voxels is not None and len(self.gaussians) == 0:
                 self.voxels.settle(self.settings.voxels.coarsest * view.view_scale, view.centre)
-            spacing, settings = self.anchors[anchor].spacing, self.settings.densify
-            grow(self.gaussians, seeds, self.voxels, spacing, settings, self.budget, anchor)
+            spacing, anchor = self.anchors[-1].spacing, len(self.anchors) - 1
+            grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, anchor)
 
     def first_anchor_since(self, keyframe: Keyframe) -> int:
         """Return the place of the first anchor of this keyframe or of a frame after it."""

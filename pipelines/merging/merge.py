@@ -23,9 +23,6 @@ __all__ = ["MappedPart", "merge"]
 EDGE = 1 / 16
 # Pyramid level at which it is measured how much of each Gaussian shows, which takes half as long as at the full size.
 COARSE = 1
-# Share of `densify.pixels` that each keyframe adds to the merged map. With a quarter of them, redkitchen in four parts
-# has 94,408 Gaussians, where one run has 60,407, and 0.07 dB more.
-FILLED = 1 / 16
 # How often Gaussians that float in free space are looked for. What they hid, and what the next owner of their place has
 # there, may float as well: 654, 148 and 23 Gaussians of four parts with 79,497.
 ROUNDS = 3
@@ -54,9 +51,7 @@ class MappedPart:
     view_renders: int
 
 
-def merge(
-    mapper: OnlineMap, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame], fill: bool = False
-) -> list[int]:
+def merge(mapper: OnlineMap, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
     """Put the maps of the parts of a recording into a new online map.
 
     Every frame has the pose and the exposure that the part has found that it belongs to, and every Gaussian comes from
@@ -67,11 +62,9 @@ def merge(
         mapper: The new map, without frames.
         parts: The parts, in order. Each frame belongs to one of them.
         frames: All frames of the recording in order, with their tracked poses. They are iterated over once.
-        fill: Whether Gaussians are added where keyframes show high error, as across the borders between the parts. They
-            have to be optimised.
 
     Returns:
-        The number of Gaussians that are left of each part. Those that were added come after them.
+        The number of Gaussians that are left of each part.
 
     Raises:
         ValueError: If the Gaussians do not fit the settings, or none of the keyframes is among the frames.
@@ -81,10 +74,6 @@ def merge(
     take_in_frames(mapper, _finished(parts, frames))
     kept = _kept(mapper, parts)
     take_in_gaussians(mapper, _together(parts, kept))
-    if fill and mapper.settings.densify.error_compensation:
-        for place, view in enumerate(mapper.keyframes):
-            if not view.is_between:
-                mapper.densifier.add_error_pixels(view, warming_up=False, share=FILLED, anchor=place)
     return [int(own.sum()) for own in kept]
 
 
