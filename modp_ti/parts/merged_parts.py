@@ -42,6 +42,7 @@ class MergedParts(EarlierMap):
         self._posed: list[str] = []  # names of all frames of the tracker
         self._names: list[str] = []  # of those that could be read
         self._kept: Sequence[int] = []
+        self._rendered = 0  # views of the parts, and those that merging took
 
     def join(self, tracker: Tracker) -> Tracker:
         """Find the finished runs of the parts. The tracker stays as it is.
@@ -76,7 +77,7 @@ class MergedParts(EarlierMap):
         counts = [self._own_keyframes(number) for number in range(len(self._parts))]
         whole = sum(count if optimise.budget is None else min(count, optimise.budget) for count in counts)
         views = whole * optimise.steps * mapping.views.per_step + optimise.last_views(sum(counts))
-        further = max(views - sum(self._view_renders), 0) // settings.views
+        further = max(views - self._rendered, 0) // settings.views
         steps = settings.steps + further
         return settings.model_copy(update={"steps": steps, "hold": further / steps})
 
@@ -129,6 +130,7 @@ class MergedParts(EarlierMap):
         parts = [self._mapped(number, index) for number in range(len(self._parts))]
         try:
             self._kept = mapper.merge(parts, frames())
+            self._rendered = mapper.pipeline.renderer.view_renders
         except ValueError as error:
             raise InputError(
                 f"{self._config.output}: the maps of the parts do not fit the recording ({error}): delete the folder "
