@@ -14,6 +14,8 @@ __all__ = ["Blocks", "Boxes", "box_of", "divide", "extent_of", "planes_of", "see
 
 # Coordinates of cubes are clipped to this, so that they fit into 32 bits.
 FARTHEST = float(2**31 - 1)
+# Size of a sphere over the smallest side beyond which cubes do not grow further.
+LARGEST = 2.0**100
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,16 +108,20 @@ def divide(position: NDArray[np.floating], extent: NDArray[np.floating], side: f
         extent: Radii (N,) [scene units].
         side: Side of the smallest blocks [scene units]. The origin of the world is a corner of one.
     """
-    level = np.ceil(np.log2(np.maximum(4.0 * extent.astype(np.float64) / side, 1.0)))
-    # An axis at a time and in 32 bits, because a map may have millions of spheres.
-    cell = [level.astype(np.int32)]
+    # An axis at a time, in place and in 32 bits, because a map may have millions of spheres.
+    level = np.ceil(np.log2(np.clip(4.0 * extent.astype(np.float64) / side, 1.0, LARGEST))).astype(np.int32)
+    cell, sides = [level], np.ldexp(side, level)
     for axis in range(3):
-        cube = np.floor(position[:, axis].astype(np.float64) / (side * 2.0**level))
-        cell.append(np.clip(cube, -FARTHEST, FARTHEST).astype(np.int32))
+        cube = position[:, axis].astype(np.float64)
+        cube /= sides
+        np.clip(np.floor(cube, out=cube), -FARTHEST, FARTHEST, out=cube)
+        cell.append(cube.astype(np.int32))
+    del sides, cube
     members = np.lexsort(cell[::-1])  # stable: equal cells keep their order
     changes = np.zeros(max(len(members) - 1, 0), dtype=bool)
     for number in cell:
         changes |= np.diff(number[members]) != 0
+    del cell, level, number
     first = np.flatnonzero(np.append(True, changes)) if len(members) else np.zeros(0, dtype=np.int64)
     return Blocks(_around(position, extent, members, first), members, np.append(first, len(members)))
 

@@ -13,7 +13,7 @@ __all__ = ["SparseBricks"]
 
 # Fan-outs per axis of the pointer levels above the bricks. They are small at the bottom, where most of a node around a
 # surface is empty.
-POINTERS = (64, 16, 8, 2, 2, 2)
+POINTERS = (32, 4, 4, 4, 4, 2, 2, 2)
 assert np.prod(POINTERS) == BRICKS
 # Number of groups of bricks that the CPU processes in parallel in `admit`.
 SHARES = 8
@@ -25,7 +25,7 @@ FLAGS = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
 @ti.data_oriented
 class SparseBricks(Bricks):
-    """Bricks of 64-bit words below six pointer levels.
+    """Bricks of 64-bit words below eight pointer levels.
 
     The stacks share one tree, because every additional tree takes address space, of which Taichi 1.7.4 handles only the
     first GB well.

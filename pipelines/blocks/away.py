@@ -140,14 +140,11 @@ class BlocksOnDisk:
     def store_keyframes(self, keyframes: Sequence[Keyframe]) -> None:
         """Move the images and points of keyframes to disk. Raises OSError if there is no room."""
         self.keyframes.move_to_disk(keyframes, self._files.store)
+        self._files.forget_pages()
 
     def joined(self, count: int, parts: Iterable[Mapping[str, NDArray]]) -> dict[str, NDArray]:
         """Join arrays that come in parts, see `BlockFiles.joined`."""
         return self._files.joined(count, parts)
-
-    def forget_pages(self) -> None:
-        """Give back the memory of keyframes on disk that have been read."""
-        self._files.forget_pages()
 
     def forget(self, block: BlockOnDisk) -> None:
         """Remove a block and its file."""

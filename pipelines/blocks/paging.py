@@ -99,7 +99,9 @@ class Paging:
         if len(self.away) == 0:
             return here
         try:
-            return self.away.joined(self.count, self._parts(here))
+            joined = self.away.joined(self.count, self._parts(here))
+            give_back_heap()
+            return joined
         except OSError:  # no room on the disk
             parts = list(self._parts(here))
             return {name: np.concatenate([part[name] for part in parts]) for name in here}
@@ -249,7 +251,6 @@ class Paging:
             self._store(going)
             self.gaussians.remove(~gone)
             self.away.store_keyframes([self.keyframes[place] for place in sorted(images)])
-            self.away.forget_pages()
             give_back_heap()
         except OSError as error:
             self.problem = f"blocks of the map cannot be kept on disk: {error.strerror}"

@@ -11,7 +11,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from fields.map.blocks import Blocks, divide, extent_of, planes_of, seen
 from fields.map.gaussians import GaussianField
-from fields.runtime.heap import give_back_pages
+from fields.runtime.heap import give_back_heap, give_back_pages
 from pipelines.blocks.hierarchy import Hierarchy, side_of
 
 __all__ = ["ShownMap"]
@@ -40,8 +40,11 @@ class ShownMap:
         self._hierarchy: Hierarchy | None = None
         if not self.fits:
             position, extent = self.values["position"], extent_of(self.values["log_scale"])
+            self._give_back()
             # Smaller blocks than those of the hierarchy, of which views see less in vain.
             self._blocks = divide(position, extent, side_of(position, GAUSSIANS_EACH))
+            self._give_back()
+            give_back_heap()
 
     @property
     def fits(self) -> bool:
@@ -60,8 +63,7 @@ class ShownMap:
             self.gaussians.load(self.values)
             return
         self.gaussians.load(self._seen(blocks, camera, T_camera_world))
-        for array in self.values.values():
-            give_back_pages(array)
+        self._give_back()
 
     def _seen(self, blocks: Blocks, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> dict[str, NDArray]:
         """Return the Gaussians of the blocks that a view sees, or fewer that stand for them."""
@@ -76,3 +78,8 @@ class ShownMap:
         eye = inverse_se3(T_camera_world)[:3, 3]
         levels = self._hierarchy.levels_for(chosen, eye, camera.fx, self.gaussians.capacity)
         return self._hierarchy.gaussians(chosen, levels)
+
+    def _give_back(self) -> None:
+        """Give back the memory of what was read of a map on disk."""
+        for array in self.values.values():
+            give_back_pages(array)
