@@ -108,22 +108,32 @@ def divide(position: NDArray[np.floating], extent: NDArray[np.floating], side: f
         extent: Radii (N,) [scene units].
         side: Side of the smallest blocks [scene units]. The origin of the world is a corner of one.
     """
-    # An axis at a time, in place and in 32 bits, because a map may have millions of spheres.
     level = np.ceil(np.log2(np.clip(4.0 * extent.astype(np.float64) / side, 1.0, LARGEST))).astype(np.int32)
-    cell, sides = [level], np.ldexp(side, level)
-    for axis in range(3):
+    members, first = _groups([level, *_cubes(position, np.ldexp(side, level))])
+    return Blocks(_around(position, extent, members, first), members, np.append(first, len(members)))
+
+
+def _cubes(position: NDArray[np.floating], sides: NDArray[np.float64]) -> list[NDArray[np.int32]]:
+    """Return the coordinates (N,) along each axis of the cubes of these sides (N,) that positions (N, 3) lie in."""
+    cubes = []
+    for axis in range(3):  # one at a time, in place and in 32 bits, because a map may have millions of Gaussians
         cube = position[:, axis].astype(np.float64)
         cube /= sides
         np.clip(np.floor(cube, out=cube), -FARTHEST, FARTHEST, out=cube)
-        cell.append(cube.astype(np.int32))
-    del sides, cube
-    members = np.lexsort(cell[::-1])  # stable: equal cells keep their order
-    changes = np.zeros(max(len(members) - 1, 0), dtype=bool)
-    for number in cell:
-        changes |= np.diff(number[members]) != 0
-    del cell, level, number
-    first = np.flatnonzero(np.append(True, changes)) if len(members) else np.zeros(0, dtype=np.int64)
-    return Blocks(_around(position, extent, members, first), members, np.append(first, len(members)))
+        cubes.append(cube.astype(np.int32))
+    return cubes
+
+
+def _groups(numbers: Sequence[NDArray[np.int32]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return places (N,) in lexicographic order of their numbers, and where places (G,) with other numbers begin."""
+    members = np.lexsort(numbers[::-1])  # stable: equal places keep their order
+    if len(members) == 0:
+        return members, np.zeros(0, dtype=np.int64)
+    begins = np.ones(len(members), dtype=bool)
+    begins[1:] = False
+    for number in numbers:
+        begins[1:] |= np.diff(number[members]) != 0
+    return members, np.flatnonzero(begins)
 
 
 def extent_of(log_scale: NDArray[np.floating]) -> NDArray[np.floating]:
