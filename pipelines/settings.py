@@ -378,20 +378,14 @@ class RefineSettings(StrictModel):
     views: int = Field(default=4, ge=1, description="views per step, drawn as the global views are")
     poses: bool = Field(default=False, description="also refine poses, at a rate that decays as that of positions does")
     hold: float = Field(
-        default=0.0,
-        ge=0,
-        lt=1,
-        description="share of the refinement before rates decay; poses are refined in it, as while the map grows",
+        default=0.0, ge=0, lt=1, description="share of it before rates decay; poses are refined in it, as in mapping"
     )
     position_decay: float = Field(
         default=0.01, gt=0, le=1, description="factor of the position rate at the end of the decay"
     )
     scale_decay: float = Field(default=0.1, gt=0, le=1, description="factor of the scale rate at the end of the decay")
     rate_decay: float = Field(
-        default=0.1,
-        gt=0,
-        le=1,
-        description="factor of the rates of rotation, opacity and colour at the end of the decay",
+        default=0.1, gt=0, le=1, description="factor of the rates of rotation, opacity and colour at the end of it"
     )
     min_contribution: float = Field(
         default=0.5,
