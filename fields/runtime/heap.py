@@ -23,15 +23,18 @@ def give_back_heap() -> None:
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def give_back_pages(array: NDArray) -> None:
-    """Give back the memory of an array that is mapped from a file, whose pages are read again when they are needed.
+def give_back_pages(*arrays: NDArray) -> None:
+    """Give back the memory of arrays that are mapped from files, whose pages are read again when they are needed.
 
-    Does nothing to other arrays, and on Windows. The array must not have been changed.
+    Does nothing to other arrays, and on Windows. The arrays, and others in the same file, must not have been changed.
     """
-    owner = array
-    while isinstance(owner, np.ndarray):
-        owner = owner.base
-    if isinstance(owner, memoryview):
-        owner = owner.obj
-    if isinstance(owner, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
-        owner.madvise(mmap.MADV_DONTNEED)
+    if not hasattr(mmap, "MADV_DONTNEED"):
+        return
+    for array in arrays:
+        owner = array
+        while isinstance(owner, np.ndarray):
+            owner = owner.base
+        if isinstance(owner, memoryview):
+            owner = owner.obj
+        if isinstance(owner, mmap.mmap):
+            owner.madvise(mmap.MADV_DONTNEED)

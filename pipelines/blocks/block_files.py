@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.runtime.disk_room import has_room
+from fields.runtime.heap import give_back_pages
 
 __all__ = ["BlockError", "BlockFiles", "StoredBlock", "records_of", "state_of"]
 
@@ -75,7 +76,7 @@ class BlockFiles:
         self._wanted = folder
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._written = 0
-        self._keyframes: list[mmap.mmap] = []
+        self._keyframes: list[NDArray] = []  # an array of each file
         self._kind = np.dtype(np.void)  # of the records
         self._used: dict[Path, int] = {}  # number of blocks that each file still holds
 
@@ -155,8 +156,8 @@ class BlockFiles:
             for array in arrays:
                 file.write(np.ascontiguousarray(array).data)
             file.flush()
-            mapped, stored = _mapped(file, [(array.dtype, array.shape) for array in arrays])
-        self._keyframes.append(mapped)
+            stored = _mapped(file, [(array.dtype, array.shape) for array in arrays])
+        self._keyframes.append(stored[0])
         return stored
 
     def joined(self, count: int, parts: Iterable[Mapping[str, NDArray]]) -> dict[str, NDArray]:
@@ -180,16 +181,14 @@ class BlockFiles:
                     file.seek(ends[place])
                     ends[place] += file.write(np.ascontiguousarray(part[name]).data)
             file.flush()
-            _, arrays = _mapped(file, list(kinds.values()))
+            arrays = _mapped(file, list(kinds.values()))
         with suppress(OSError):  # Windows keeps a file that is mapped
             path.unlink()
         return dict(zip(kinds, arrays, strict=True))
 
     def forget_pages(self) -> None:
         """Give back the memory of keyframes that have been read. It is taken again when they are read again."""
-        if hasattr(mmap, "MADV_DONTNEED"):
-            for mapped in self._keyframes:
-                mapped.madvise(mmap.MADV_DONTNEED)
+        give_back_pages(*self._keyframes)
 
     def _next(self, kind: str, suffix: str, size: int) -> Path:
         """Return the path of a new file of so many bytes."""
@@ -210,7 +209,7 @@ def _whole(path: Path) -> Iterator[None]:
         raise
 
 
-def _mapped(file: IO[bytes], kinds: Sequence[tuple[np.dtype, tuple[int, ...]]]) -> tuple[mmap.mmap, list[NDArray]]:
+def _mapped(file: IO[bytes], kinds: Sequence[tuple[np.dtype, tuple[int, ...]]]) -> list[NDArray]:
     """Map a file of arrays, given by type and shape, one after the other.
 
     The mapping is copy-on-write, because kernels take no read-only arrays. Before Python 3.13, it keeps a file open.
@@ -221,7 +220,7 @@ def _mapped(file: IO[bytes], kinds: Sequence[tuple[np.dtype, tuple[int, ...]]]) 
         size = math.prod(shape)
         arrays.append(np.frombuffer(mapped, dtype, size, first).reshape(shape))
         first += size * dtype.itemsize
-    return mapped, arrays
+    return arrays
 
 
 def _checksum(records: NDArray[np.void]) -> int:

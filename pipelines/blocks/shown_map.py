@@ -40,10 +40,10 @@ class ShownMap:
         self._hierarchy: Hierarchy | None = None
         if not self.fits:
             position, extent = self.values["position"], extent_of(self.values["log_scale"])
-            self._give_back()
+            give_back_pages(*self.values.values())
             # Smaller blocks than those of the hierarchy, of which views see less in vain.
             self._blocks = divide(position, extent, side_of(position, GAUSSIANS_EACH))
-            self._give_back()
+            give_back_pages(*self.values.values())
             give_back_heap()
 
     @property
@@ -63,7 +63,7 @@ class ShownMap:
             self.gaussians.load(self.values)
             return
         self.gaussians.load(self._seen(blocks, camera, T_camera_world))
-        self._give_back()
+        give_back_pages(*self.values.values())
 
     def _seen(self, blocks: Blocks, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> dict[str, NDArray]:
         """Return the Gaussians of the blocks that a view sees, or fewer that stand for them."""
@@ -78,8 +78,3 @@ class ShownMap:
         eye = inverse_se3(T_camera_world)[:3, 3]
         levels = self._hierarchy.levels_for(chosen, eye, camera.fx, self.gaussians.capacity)
         return self._hierarchy.gaussians(chosen, levels)
-
-    def _give_back(self) -> None:
-        """Give back the memory of what was read of a map on disk."""
-        for array in self.values.values():
-            give_back_pages(array)

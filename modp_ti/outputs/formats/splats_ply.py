@@ -56,8 +56,7 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
         file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
         for first in range(0, n, ROWS_EACH):
             file.write(_table({name: array[first : first + ROWS_EACH] for name, array in state.items()}).tobytes())
-            for array in state.values():
-                give_back_pages(array)
+            give_back_pages(*state.values())
 
 
 def _table(state: dict[str, NDArray]) -> NDArray[np.float32]:
