@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.optimise.light import DARK, SATURATED, light_changes, resized_vignette
+from pipelines.optimise.light import COMPARED, DARK, SATURATED, light_changes, resized_vignette
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
@@ -72,6 +72,12 @@ def fitted_gains(
     return np.clip(gains, 1.0 / LARGEST_GAIN, LARGEST_GAIN)
 
 
+def _is_elsewhere(store: KeyframeStore) -> bool:
+    """Whether the latest keyframe tracks points, but none that the keyframes just before it track."""
+    *earlier, latest = (keyframe.points.ids for keyframe in store.selected[-COMPARED - 1 :])
+    return len(latest) > 0 and not np.isin(latest, np.concatenate(earlier)).any()
+
+
 class ExposureRefinement:
     """Adam on the exposure (A, b) of keyframes, which store its moments. New keyframes start from a fit to the map."""
 
@@ -92,6 +98,10 @@ class ExposureRefinement:
 
         With `enabled: auto`, exposures are estimated from the first keyframe on whose light has changed, see
         `light_changes`. All earlier keyframes then get the identity, which the first keyframe always has.
+
+        A keyframe that sees nothing of the map keeps the exposure of the one before it; at a place of its own, it gets
+        the identity. There, the brightness of the map is free, and each place would else be brighter by what the
+        exposure had changed within the one before.
 
         Args:
             store: The keyframes.
@@ -114,6 +124,8 @@ class ExposureRefinement:
         renderer.forward(small.camera, view.T_camera_world, near)
         known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
         if known.sum() < MIN_PIXELS:
+            if _is_elsewhere(store):
+                view.exposure = np.array(IDENTITY)
             return
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 
-__all__ = ["DARK", "SATURATED", "light_changes", "resized_vignette"]
+__all__ = ["COMPARED", "DARK", "SATURATED", "light_changes", "resized_vignette"]
 
 # Darker values are mostly noise, brighter ones may be saturated: neither says how bright the image is.
 DARK, SATURATED = 0.04, 0.96

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -93,6 +94,20 @@ def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
     refinement.step(view, np.full((3, 4), np.nan))
     np.testing.assert_array_equal(view.exposure, EXPOSURE)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(own: bool) -> None:
+    nothing = SimpleNamespace(
+        forward=lambda *_: None,
+        images=SimpleNamespace(opacity_to_numpy=lambda: np.zeros((CAMERA.height, CAMERA.width))),
+    )
+    store = KeyframeStore()
+    store.append(frame(0)).exposure = EXPOSURE
+    points = frame(1).points if own else replace(frame(1).points, ids=frame(0).points.ids)
+    view = store.append(replace(frame(1), points=points))
+    ExposureRefinement(ExposureSettings(enabled=True)).begin(store, nothing, 0.01)
+    np.testing.assert_array_equal(view.exposure, IDENTITY if own else EXPOSURE)
 
 
 # ---- whole runs on the wall of test_mapping --------------------------------------------------------------------
