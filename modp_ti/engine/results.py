@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
 from modp_ti.outputs.formats.colmap_model import image_names, write_image
 from modp_ti.outputs.formats.map_folder import appearing, write_map
 from modp_ti.outputs.formats.scores_csv import write_scores
-from modp_ti.outputs.formats.splats_ply import read_splats
+from modp_ti.outputs.formats.splats_ply import check_splats
 from modp_ti.outputs.report.page import ReportedRun, write_report
 from modp_ti.outputs.report.pictures import Album
 from modp_ti.outputs.report.record import RunRecord
@@ -84,10 +83,10 @@ class Results:
                 self._images = parts.enter_context(appearing(self.config.output / "colmap"))
             yield
 
-    def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> MapVersion:
-        """Write the map, and return it with its Gaussians as read back from `splats.ply`."""
+    def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> None:
+        """Write the map. Raises InputError if `splats.ply` is not read back as it was written."""
         write_map(self.folder, version, self.frames, self._names, keyframes, near, self.undistorter)
-        return replace(version, gaussians=read_splats(self.folder / "splats.ply"))
+        check_splats(self.folder / "splats.ply", version.gaussians)
 
     def elsewhere(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> str:
         """Write the map to a new temporary folder, which stays; return the part of an error message that says so."""

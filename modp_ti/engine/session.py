@@ -296,13 +296,13 @@ class _Session:
         self._after_step("refining", step, steps, psnr)
 
     def _write(self, versions: dict[str, MapVersion]) -> None:
-        """Write the map; evaluate it as read back from its file, and write the scores and the report."""
+        """Write the map, evaluate it, and write the scores and the report."""
         pipeline, output = self.mapper.pipeline, self.config.output
         results = Results(self.config, self.mapper.frames, self.tracker.undistorter)
         last = list(versions)[-1]
         try:
             with results.writing_map(), self.line.working("writing the map"):
-                versions[last] = results.write_map(versions[last], pipeline.keyframes, pipeline.near)
+                results.write_map(versions[last], pipeline.keyframes, pipeline.near)
                 self.conductor.write_session(results.folder, self.config)
         except InputError as error:
             raise InputError(f"{error}{self.unfinished.way_on(versions[last])}") from None

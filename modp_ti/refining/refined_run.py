@@ -20,7 +20,7 @@ from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate
 from modp_ti.outputs.formats.exposure import write_exposures
 from modp_ti.outputs.formats.scores_csv import read_scores
-from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
+from modp_ti.outputs.formats.splats_ply import check_splats, write_splats
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.playback.finished_frames import frames_of
 from modp_ti.outputs.playback.finished_run import FinishedRun
@@ -92,6 +92,7 @@ def write_refined(
     earlier = "refined" if metrics["refined"] is not None else "online"
     with results.writing_figures():
         write_splats(results.folder / "splats.ply", refined.gaussians)
+        check_splats(results.folder / "splats.ply", refined.gaussians)
         exposures = refined.exposures_of(len(run))
         if refined.estimated:
             known = [exposure for exposure in exposures if exposure is not None]
@@ -99,7 +100,7 @@ def write_refined(
                 results.folder / "exposure.json", range(len(run)), run.timestamps.tolist(), known, refined.estimated
             )
         version = MapVersion(
-            read_splats(results.folder / "splats.ply"),
+            refined.gaussians,
             list(run.poses),
             exposures,
             metrics[earlier]["view_renders"] + refined.view_renders,

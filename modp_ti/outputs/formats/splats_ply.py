@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ from modp_ti.files import read_bytes
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
 from modp_ti.files.ply import parse_ply_header
+from modp_ti.files.reading import open_file
 from modp_ti.outputs.formats.splat_packing import logits
 
-__all__ = ["read_splats", "write_splats"]
+__all__ = ["check_splats", "read_splats", "write_splats"]
 
 # The filter that the map was optimised with: 0.3 px^2 of blur and the opacity compensation of mip-splatting. Other
 # renderers must use the same to reproduce the images. Brush and splat-transform read this comment and do so by
@@ -49,14 +51,39 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
     Example:
         modp_ti.write_splats("splats.ply", mapper.pipeline.gaussians.to_numpy())
     """
+    with replacing(path) as file:
+        for piece in _pieces(state):
+            file.write(piece)
+
+
+def check_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> None:
+    """Check that a file reads back, byte for byte, as `write_splats` has written it.
+
+    Args:
+        path: The file.
+        state: The Gaussians that were written.
+
+    Raises:
+        InputError: If it does not, or cannot be read.
+    """
+    try:
+        with open_file(path) as file:
+            same = all(file.read(len(piece)) == piece for piece in _pieces(state)) and not file.read(1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read back: {error.strerror}") from None
+    if not same:
+        raise InputError(f"{path}: is not read back as it was written; check the disk, or choose another output folder")
+
+
+def _pieces(state: dict[str, NDArray]) -> Iterator[bytes]:
+    """Yield the content of the file, a part of the rows at a time."""
     n, sh_count, _ = state["sh"].shape
     header = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}", f"element vertex {n}"]
     header += [f"property float {name}" for name in _names(sh_count)]
-    with replacing(path) as file:
-        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-        for first in range(0, n, ROWS_EACH):
-            file.write(_table({name: array[first : first + ROWS_EACH] for name, array in state.items()}).tobytes())
-            give_back_pages(*state.values())
+    yield ("\n".join([*header, "end_header"]) + "\n").encode("ascii")
+    for first in range(0, n, ROWS_EACH):
+        yield _table({name: array[first : first + ROWS_EACH] for name, array in state.items()}).tobytes()
+        give_back_pages(*state.values())
 
 
 def _table(state: dict[str, NDArray]) -> NDArray[np.float32]:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from plyfile import PlyData
 
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
+from modp_ti.outputs.formats import splats_ply
+from modp_ti.outputs.formats.splats_ply import check_splats, read_splats, write_splats
 
 
 def splats(count: int, sh_count: int) -> dict[str, NDArray[np.float32]]:
@@ -26,6 +27,21 @@ def test_what_is_written_is_read_back_bit_for_bit(tmp_path: Path, sh_count: int)
     for name, values in state.items():
         np.testing.assert_array_equal(back[name], values)
     assert [p.name for p in tmp_path.iterdir()] == ["splats.ply"]
+
+
+@pytest.mark.parametrize("damage", ["changed", "cut", "longer"])
+def test_a_file_that_is_not_what_was_written_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    monkeypatch.setattr(splats_ply, "ROWS_EACH", 5)  # so that there are several pieces
+    path, state = tmp_path / "splats.ply", splats(17, 4)
+    write_splats(path, state)
+    check_splats(path, state)
+    content = bytearray(path.read_bytes())
+    content[-70] ^= 1
+    path.write_bytes({"changed": content, "cut": path.read_bytes()[:-8], "longer": path.read_bytes() + b"0"}[damage])
+    with pytest.raises(InputError, match=r"splats\.ply: is not read back as it was written"):
+        check_splats(path, state)
 
 
 def test_another_reader_finds_the_3dgs_layout(tmp_path: Path) -> None:
