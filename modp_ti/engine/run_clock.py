@@ -43,10 +43,10 @@ class RunClock:
 
 
 def peak_memory_mb() -> float | None:
-    """Return the peak memory of this process so far [MB]; None on Windows."""
+    """Return the peak memory of this process so far [10^6 bytes]; None on Windows."""
     try:
         import resource
     except ImportError:
         return None
     unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux kibibytes
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / (1 << 20), 1)
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)

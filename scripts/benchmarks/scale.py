@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.timing import peak_memory_mb, resident_mb
+from benchmarks.timing import resident_mb
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine.build import build_mapper
 from modp_ti.engine.mapper import Mapper
+from modp_ti.engine.run_clock import peak_memory_mb
 from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.evaluation import evaluate
 

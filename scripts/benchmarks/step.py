@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 
 from benchmarks.scene import Size, add_gaussians, noise_frame
-from benchmarks.timing import milliseconds, peak_memory_mb, stage_milliseconds
+from benchmarks.timing import milliseconds, stage_milliseconds
 from fields.buffers.tiles import TILE_PIXELS, TILE_WIDTH
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
+from modp_ti.engine.run_clock import peak_memory_mb
 from pipelines.optimise.adam import LearningRates
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.render.compositing_reference import ReferenceCompositing

@@ -10,7 +10,7 @@ import numpy as np
 
 from fields.runtime.engine import ti
 
-__all__ = ["milliseconds", "peak_memory_mb", "resident_mb", "seconds", "stage_milliseconds"]
+__all__ = ["milliseconds", "resident_mb", "seconds", "stage_milliseconds"]
 
 
 def seconds(call: Callable[[], object], wait: Callable[[], object] = ti.sync) -> float:
@@ -41,13 +41,8 @@ def milliseconds(call: Callable[[], object], repeats: int) -> float:
     return stage_milliseconds([("call", call)], repeats)["call"]
 
 
-def peak_memory_mb() -> float:
-    """Return the peak host memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def resident_mb() -> float:
-    """Return the host memory of this process now [MB], NaN on systems other than Linux."""
+    """Return the host memory of this process now [10^6 bytes], NaN on systems other than Linux."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[1]) * resource.getpagesize() / 1e6
