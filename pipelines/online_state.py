@@ -47,8 +47,7 @@ def state_of(mapper: OnlineMap) -> MapState:
         "guards": mapper.optimiser.caught().counts(),
     }
     if voxels is not None:
-        places, words = voxels.marks()
-        groups["voxels"] = {"places": places, "words": words}
+        groups["voxels"] = dict(zip(("places", "words", "resting"), voxels.marks(), strict=True))
         numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
     if len(mapper.paging.away):
         groups["blocks"] = mapper.paging.away.state()

@@ -25,7 +25,9 @@ __all__ = [
     "Bricks",
     "corner_of",
     "depth_reached",
+    "numbered",
     "place_of",
+    "places_of_marks",
     "without_repetitions",
 ]
 
@@ -79,13 +81,35 @@ def corner_of(cells: NDArray[np.int32], stack: int) -> NDArray[np.int32]:
 
 def without_repetitions(corners: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return each of the bricks' corners (N, 3) once, in lexicographic order."""
-    x, y, z = corners.astype(np.int64).T
-    key = np.unique((x << 32) | (y << 16) | z)  # three times faster than unique rows
+    key = np.unique(numbered(corners))  # three times faster than unique rows
     return np.stack([key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF], axis=1).astype(np.int32)
 
 
+def numbered(corners: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return one number (N,) for each brick's corner (N, 3), in lexicographic order."""
+    x, y, z = corners.astype(np.int64).T
+    return (x << 32) | (y << 16) | z
+
+
+def places_of_marks(
+    corners: NDArray[np.int32], words: NDArray[np.uint64]
+) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
+    """Return the places (M, 4) of the non-zero words of bricks, in lexicographic order, and these words (M,).
+
+    Args:
+        corners: The bricks' corners (B, 3), each once.
+        words: Their words (B, 10).
+    """
+    order = np.argsort(numbered(corners))
+    corners, words = corners[order], words[order]
+    brick, word = np.nonzero(words)
+    return np.column_stack([corners[brick], word]).astype(np.int32), words[brick, word]
+
+
 class Bricks(ABC):
-    """Storage of the bricks that have been marked. A brick stays allocated when its marks are removed.
+    """Storage of the bricks that have been marked. `clear` leaves them allocated.
+
+    Space is divided into regions, the cubes of the coarsest stack's bricks. They have numbers.
 
     Cells (N, 3) are those of the finest level, and `level` (N,) is the level that is asked for; beyond its range, the
     first coarser level that covers the cell is used.
@@ -108,8 +132,16 @@ class Bricks(ABC):
         """Remove all marks."""
 
     @abstractmethod
-    def read(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
-        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 10)."""
+    def corners(self) -> NDArray[np.int32]:
+        """Return the corners (B, 3) of the allocated bricks, in any order."""
+
+    @abstractmethod
+    def read(self, corners: NDArray[np.int32]) -> NDArray[np.uint64]:
+        """Return the words (B, 10) of allocated bricks, given by their corners (B, 3)."""
+
+    @abstractmethod
+    def remove(self, corners: NDArray[np.int32]) -> None:
+        """Deallocate bricks, given by their corners (B, 3). All bricks of a region go together."""
 
     @abstractmethod
     def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
@@ -141,6 +173,17 @@ class Bricks(ABC):
             admitted[free] = True
         return admitted
 
+    def regions(self, corners: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the region (B,) of each brick, given by its corner (B, 3)."""
+        stack = corners[:, 0] // BRICKS
+        place = corners - BRICKS // 2
+        place[:, 0] -= stack * BRICKS
+        return _region_numbers(place >> (BRICK_LEVELS * (self.stacks - 1 - stack))[:, None])
+
+    def regions_of_cells(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the region of each cell (N,). Cells out of range are in regions without bricks."""
+        return _region_numbers(np.clip(cells >> (BRICK_LEVELS * self.stacks), -BRICKS // 2 - 1, BRICKS // 2))
+
     def corners_to_mark(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.int32]:
         """Corners (B, 3) of all bricks that `mark` writes to, with repetitions."""
         first = self.depth_reached(cells, level) // BRICK_LEVELS
@@ -155,3 +198,9 @@ class Bricks(ABC):
             beyond = (depth < self.levels) & ((reach >> first) >= SIDE // 2)
             depth = np.where(beyond, first + BRICK_LEVELS, depth)
         return depth
+
+
+def _region_numbers(regions: NDArray[np.int32]) -> NDArray[np.int64]:
+    """One number (N,) for each three integers (N, 3) from -2^16 to 2^16 - 1."""
+    x, y, z = regions.astype(np.int64).T + BRICKS
+    return (x << 34) | (y << 17) | z

@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.bricks import WORDS, Bricks, depth_reached, place_of, without_repetitions
+from fields.map.bricks import WORDS, Bricks, depth_reached, numbered, place_of, places_of_marks, without_repetitions
 from fields.runtime.engine import dense_array, ti
 
 __all__ = ["HashedBricks"]
@@ -47,11 +47,26 @@ class HashedBricks(Bricks):
         """Remove all marks."""
         self._halves.fill(0)
 
-    def read(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
-        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 10)."""
-        halves = self._halves.to_numpy()[: self._count]
-        words = halves[:, 0::2] | halves[:, 1::2].astype(np.uint64) << np.uint64(32)
-        return self._corners.to_numpy()[: self._count], words
+    def corners(self) -> NDArray[np.int32]:
+        """Return the corners (B, 3) of the allocated bricks, in any order."""
+        return self._corners.to_numpy()[: self._count]
+
+    def read(self, corners: NDArray[np.int32]) -> NDArray[np.uint64]:
+        """Return the words (B, 10) of allocated bricks, given by their corners (B, 3)."""
+        every = numbered(self.corners())
+        order = np.argsort(every)
+        halves = self._halves.to_numpy()[order[np.searchsorted(every, numbered(corners), sorter=order)]]
+        return halves[:, 0::2] | halves[:, 1::2].astype(np.uint64) << np.uint64(32)
+
+    def remove(self, corners: NDArray[np.int32]) -> None:
+        """Deallocate bricks, given by their corners (B, 3). All bricks of a region go together."""
+        every = self.corners()
+        kept = every[~np.isin(numbered(every), numbered(corners))]
+        words = self.read(kept)
+        self._count = 0
+        self._allocate(max(FIRST_ROOM, 1 << max(len(kept) - 1, 0).bit_length()))
+        self._add(kept)
+        self.write(*places_of_marks(kept, words))
 
     def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
         """Set words (M,) at their places (M, 4): the brick's corner and the word in the brick."""

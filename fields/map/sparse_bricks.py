@@ -4,7 +4,15 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.bricks import BRICK_LEVELS, BRICKS, WORDS, Bricks, depth_reached, place_of, without_repetitions
+from fields.map.bricks import (
+    BRICK_LEVELS,
+    BRICKS,
+    WORDS,
+    Bricks,
+    depth_reached,
+    place_of,
+    without_repetitions,
+)
 from fields.runtime.backend import on_gpu, refuse_too_many_fields, sparse
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
@@ -63,14 +71,30 @@ class SparseBricks(Bricks):
         """Remove all marks."""
         self._clear()
 
-    def read(self) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
-        """Return the corners (B, 3) of the allocated bricks, in any order, and their words (B, 10)."""
-        count = self.count
-        corners, words = np.zeros((count, 3), dtype=np.int32), np.zeros((count, WORDS), dtype=np.uint64)
-        if count:
+    def corners(self) -> NDArray[np.int32]:
+        """Return the corners (B, 3) of the allocated bricks, in any order."""
+        corners = np.zeros((self.count, 3), dtype=np.int32)
+        if len(corners):
             self._next[None] = 0
-            self._read(corners, words)
-        return corners, words
+            self._list(corners)
+        return corners
+
+    def read(self, corners: NDArray[np.int32]) -> NDArray[np.uint64]:
+        """Return the words (B, 10) of allocated bricks, given by their corners (B, 3)."""
+        words = np.zeros((len(corners), WORDS), dtype=np.uint64)
+        self._read(corners, words)
+        return words
+
+    def remove(self, corners: NDArray[np.int32]) -> None:
+        """Deallocate bricks, given by their corners (B, 3). All bricks of a region go together."""
+        places = []
+        for node in range(len(POINTERS)):
+            width = int(np.prod(POINTERS[node + 1 :]))  # of what lies below a pointer of the node [bricks]
+            # The nodes above those that lie within the region stay.
+            within = width <= 1 << BRICK_LEVELS * (self.stacks - 1 - corners[:, 0] // BRICKS)
+            nodes = without_repetitions(corners[within] // width)
+            places.append(np.column_stack([nodes, np.full(len(nodes), node)]))
+        self._deactivate(np.concatenate(places).astype(np.int32))
 
     def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
         """Set words (M,) at their places (M, 4): the brick's corner and the word in the brick."""
@@ -116,12 +140,16 @@ class SparseBricks(Bricks):
         return count
 
     @ti.kernel
-    def _read(self, corners: ti.types.ndarray(dtype=ti.i32, ndim=2), words: ti.types.ndarray(dtype=ti.u64, ndim=2)):
+    def _list(self, corners: CELLS):
         for i, j, k in self._bricks:
             row = ti.atomic_add(self._next[None], 1)
             corners[row, 0], corners[row, 1], corners[row, 2] = i, j, k
+
+    @ti.kernel
+    def _read(self, corners: CELLS, words: ti.types.ndarray(dtype=ti.u64, ndim=2)):
+        for row in range(corners.shape[0]):
             for word in range(WORDS):
-                words[row, word] = self.words[i, j, k, word]
+                words[row, word] = self.words[corners[row, 0], corners[row, 1], corners[row, 2], word]
 
     @ti.kernel
     def _activate(self, corners: CELLS):
@@ -130,6 +158,14 @@ class SparseBricks(Bricks):
             for i in range(corners.shape[0]):
                 corner = ti.Vector([corners[i, 0], corners[i, 1], corners[i, 2]])
                 ti.activate(self._nodes[node], corner // ti.static(int(np.prod(POINTERS[node + 1 :]))))
+
+    @ti.kernel
+    def _deactivate(self, places: CELLS):
+        # A loop for each level, because a node's memory is only given back if those below it have been.
+        for node in ti.static(range(len(POINTERS) - 1, -1, -1)):
+            for m in range(places.shape[0]):
+                if places[m, 3] == node:
+                    ti.deactivate(self._nodes[node], ti.Vector([places[m, 0], places[m, 1], places[m, 2]]))
 
     @ti.kernel
     def _write(self, places: CELLS, words: ti.types.ndarray(dtype=ti.u64, ndim=1)):

@@ -41,7 +41,7 @@ class Paging:
     Space is divided into cubes. When a new keyframe lacks room, the blocks that it does not see go to disk, the
     farthest first, with the complete state of their Gaussians. Before a view is rendered, the blocks that it sees come
     back. Keyframes of distant places are not drawn as views while the map grows. The voxels of the whole map stay in
-    memory, so that no Gaussian is added where one lies on disk.
+    memory, so that no Gaussian is added where one lies on disk; where none is resident, they rest.
 
     What is moved depends on the map alone, so that runs are reproducible. A map within its limits is not touched.
 
@@ -214,6 +214,7 @@ class Paging:
         boxes, counts = self.away.boxes, self.away.counts
         wanted = np.flatnonzero(seen(planes_of_views(views), boxes).any(axis=0))
         wanted = wanted[_by_distance(boxes[wanted], views[0])]
+        nbytes += int(counts[wanted].sum()) * VOXELS_EACH  # of voxels that rest
         self._make_room(views, int(counts[wanted].sum()) + gaussians, nbytes)
         fit = np.cumsum(counts[wanted]) + gaussians <= min(self._spare(nbytes))
         self.away.fetch(self.away.at(wanted[fit]))
@@ -250,6 +251,8 @@ class Paging:
         try:
             self._store(going)
             self.gaussians.remove(~gone)
+            if self.budget.voxels is not None:
+                self.budget.voxels.rest(self.gaussians.to_numpy()["position"])
             self.away.store_keyframes([self.keyframes[place] for place in sorted(images)])
             give_back_heap()
         except OSError as error:

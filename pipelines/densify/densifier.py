@@ -23,6 +23,8 @@ __all__ = ["Anchor", "Densifier"]
 
 # A pixel whose rendered opacity is below this counts as a hole.
 HOLE = 0.5
+# Gaussians whose voxels are marked together, before those rest of which no Gaussian is resident.
+MARKED_TOGETHER = 1 << 17
 
 
 @dataclass(slots=True)
@@ -137,7 +139,7 @@ class Densifier:
         Args:
             coarsest: New size of the coarsest voxels [scene units].
             origin: New origin (3,) of the voxels in the world frame.
-            position: Means (N, 3) of the Gaussians in the world frame.
+            position: Means (N, 3) of the Gaussians in the world frame, the resident ones first.
             anchor: Their anchors (N,).
         """
         if self.voxels is None:
@@ -145,5 +147,8 @@ class Densifier:
         self.voxels.clear()
         self.voxels.settle(coarsest, origin)
         spacing = np.array([a.spacing for a in self.anchors] + [self.voxels.coarsest])[anchor]  # -1: the coarsest
-        order = np.argsort(spacing, kind="stable")  # on a GPU, `update` runs once per run of equal levels
-        self.voxels.update(position[order], spacing[order])
+        for part in np.array_split(np.arange(len(position)), max(1, len(position) // MARKED_TOGETHER)):
+            order = part[np.argsort(spacing[part], kind="stable")]  # on a GPU, `update` runs once per run of levels
+            self.voxels.update(position[order], spacing[order])
+            if len(position) > len(self.gaussians):
+                self.voxels.rest(position[: len(self.gaussians)])

@@ -15,7 +15,7 @@ LEVELS = 4
 places = st.tuples(*[st.integers(-40, 39)] * 3).map(lambda cell: tuple((c + 0.5) / 8 for c in cell))
 sizes = st.sampled_from([2.0, 1.0, 0.9, 0.5, 0.3, 0.25, 0.2, 0.125, 0.1])
 steps = st.lists(
-    st.tuples(st.sampled_from(["update", "query", "admit"]), st.lists(places, min_size=1, max_size=12), sizes),
+    st.tuples(st.sampled_from(["update", "query", "admit", "rest"]), st.lists(places, min_size=1, max_size=12), sizes),
     min_size=1,
     max_size=8,
 )
@@ -47,7 +47,9 @@ def test_any_sequence_is_answered_as_by_sets(voxels: OccupancyVoxels, sequence) 
     marked: set[tuple[int, ...]] = set()
     for what, batch, size in sequence:
         xyz = np.array(batch)
-        if what == "update":
+        if what == "rest":
+            voxels.rest(xyz)
+        elif what == "update":
             voxels.update(xyz, size)
             marked |= set().union(*(cells_of(place, size) for place in batch))
         elif what == "query":

@@ -10,11 +10,12 @@ import pytest
 from plyfile import PlyData
 
 from fields.frames.pose_correction import PoseCorrection
+from fields.map.occupancy import OccupancyVoxels
 from fields.runtime import disk_room
 from fields.runtime.backend import initialise
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.blocks.block_files import BlockError
-from pipelines.densify import hidden_gaussians
+from pipelines.densify import densifier, hidden_gaussians
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
 from tests.pipelines.blocks.long_wall import frame
@@ -93,6 +94,18 @@ def test_two_walks_are_the_same_byte_for_byte(taichi_on_the_cpu: None) -> None:
         np.testing.assert_array_equal(one[name], other[name])
 
 
+def test_voxels_that_rest_change_nothing(taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = walk(mapper_of())
+    rests = mapper.densifier.voxels.marks()[2]
+    assert rests.any() and not rests.all()
+    held, values = mapper.densifier.voxels.nbytes, mapper.all_gaussians()
+    monkeypatch.setattr(OccupancyVoxels, "rest", lambda *_: None)
+    mapper = walk(mapper_of())
+    assert held < mapper.densifier.voxels.nbytes
+    for name, array in mapper.all_gaussians().items():
+        np.testing.assert_array_equal(array, values[name])
+
+
 def test_a_restored_map_goes_on_as_the_saved_one(taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hidden_gaussians, "FIRST_SWEEP", 4)
     mapper = walk(mapper_of(), end=15)
@@ -106,11 +119,13 @@ def test_a_restored_map_goes_on_as_the_saved_one(taichi_on_the_cpu: None, monkey
     again.restore(type(state)(arrays, state.numbers), (frame(i, STEPS[i]) for i in range(15)))
     walk(again, 15, 22).finish()
     assert again.hidden.due == mapper.hidden.due
+    assert again.densifier.voxels.nbytes == mapper.densifier.voxels.nbytes
     for name, array in again.all_gaussians().items():
         np.testing.assert_array_equal(array, expected[name])
 
 
-def test_a_correction_moves_what_lies_on_disk(taichi_on_the_cpu: None) -> None:
+def test_a_correction_moves_what_lies_on_disk(taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(densifier, "MARKED_TOGETHER", 1000)
     mapper = walk(mapper_of(corrections={"steps": 0}), end=15)
     before, on_disk = mapper.all_gaussians(), int(mapper.paging.away.counts.sum())
     assert on_disk > 0
@@ -124,6 +139,7 @@ def test_a_correction_moves_what_lies_on_disk(taichi_on_the_cpu: None) -> None:
     expected = np.sort(before["position"] + shift, axis=0)  # a coordinate at a time, as blocks change their order
     np.testing.assert_allclose(np.sort(after["position"], axis=0), expected, atol=1e-4)
     position, _ = mapper.paging.placed()
+    assert mapper.densifier.voxels.marks()[2].any()
     occupied = mapper.densifier.voxels.query(position, mapper.densifier.anchors[0].spacing)
     assert occupied.all()
 

@@ -35,7 +35,7 @@ def online() -> dict[str, NDArray]:
     mapper = OnlineMapper(SETTINGS, 64, 48, seed=1)
     mapper.compile()
     reports = [mapper.process(frame(i)) for i in range(3)]
-    places, words = mapper.densifier.voxels.marks()
+    places, words, _ = mapper.densifier.voxels.marks()
     return {
         "reported": np.array([report.psnr for report in reports]),
         "errors": np.array([k.error for k in mapper.keyframes]),
