@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from fields.geometry.camera import PinholeCamera as PinholeCamera
     from fields.geometry.se3 import torch_exp_se3 as torch_exp_se3
     from fields.map.gaussians import GaussianField as GaussianField
-    from fields.map.occupancy import OccupancyVoxels as OccupancyVoxels
     from fields.runtime.backend import initialise as initialise
+    from fields.voxels.occupancy import OccupancyVoxels as OccupancyVoxels
     from modp_ti.config.scene_file import load_scene as load_scene
     from modp_ti.config.settings import SceneConfig as SceneConfig
     from modp_ti.engine.mapper import Mapper as Mapper
@@ -68,7 +68,7 @@ _HOMES = {
     "Locator": "modp_ti.outputs.locating.locator",
     "Mapper": "modp_ti.engine.mapper",
     "MappingSettings": "pipelines.settings",
-    "OccupancyVoxels": "fields.map.occupancy",
+    "OccupancyVoxels": "fields.voxels.occupancy",
     "OnlineMapper": "pipelines.online",
     "PinholeCamera": "fields.geometry.camera",
     "PoseCorrection": "fields.frames.pose_correction",

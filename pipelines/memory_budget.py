@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
-from fields.map.occupancy import OccupancyVoxels
+from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.optimise.safeguards import Safeguards
 
 __all__ = ["OBSERVATION", "MemoryBudget"]

@@ -1,1 +1,1 @@
-"""The contents of the map: Gaussians, keyframes and occupancy voxels."""
+"""The contents of the map: Gaussians, keyframes and the trajectory."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import inverse_se3
 from fields.map.gaussians import NO_ANCHOR, SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
-from fields.map.occupancy import OccupancyVoxels
+from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.densify.depth import DepthEstimator
 from pipelines.densify.depth.misplacement import misplacement
 from pipelines.memory_budget import MemoryBudget

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.timing import resident_mb, seconds
-from fields.map.occupancy import OccupancyVoxels
 from fields.runtime.backend import initialise
+from fields.voxels.occupancy import OccupancyVoxels
 
 __all__ = ["LEVELS", "measure_voxels"]
 

@@ -10,9 +10,9 @@ import pytest
 from plyfile import PlyData
 
 from fields.frames.pose_correction import PoseCorrection
-from fields.map.occupancy import OccupancyVoxels
 from fields.runtime import disk_room
 from fields.runtime.backend import initialise
+from fields.voxels.occupancy import OccupancyVoxels
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.blocks.block_files import BlockError
 from pipelines.densify import densifier, hidden_gaussians

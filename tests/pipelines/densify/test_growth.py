@@ -12,7 +12,7 @@ from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from fields.map.occupancy import OccupancyVoxels
+from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.densify.depth import DepthEstimate
 from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.memory_budget import MemoryBudget

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.occupancy import OccupancyVoxels
+from fields.voxels.occupancy import OccupancyVoxels
 
 LEVELS = 9
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.map import hashed_bricks, occupancy, sparse_bricks
-from fields.map.occupancy import OccupancyVoxels
 from fields.runtime.backend import initialise
+from fields.voxels import hashed_bricks, occupancy, sparse_bricks
+from fields.voxels.occupancy import OccupancyVoxels
 
 FORMS = ["cpu", "gpu", "hashed"]
 

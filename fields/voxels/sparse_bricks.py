@@ -4,7 +4,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.bricks import (
+from fields.runtime.backend import on_gpu, refuse_too_many_fields, sparse
+from fields.runtime.engine import ti
+from fields.runtime.parallel import HANDED_OUT
+from fields.voxels.bricks import (
     BRICK_LEVELS,
     BRICKS,
     WORDS,
@@ -13,9 +16,6 @@ from fields.map.bricks import (
     place_of,
     without_repetitions,
 )
-from fields.runtime.backend import on_gpu, refuse_too_many_fields, sparse
-from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 
 __all__ = ["SparseBricks"]
 

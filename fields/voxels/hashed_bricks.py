@@ -4,8 +4,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.bricks import WORDS, Bricks, depth_reached, numbered, place_of, places_of_marks, without_repetitions
 from fields.runtime.engine import dense_array, ti
+from fields.voxels.bricks import WORDS, Bricks, depth_reached, numbered, place_of, places_of_marks, without_repetitions
 
 __all__ = ["HashedBricks"]
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fields.map import occupancy
-from fields.map.occupancy import OccupancyVoxels
+from fields.voxels import occupancy
+from fields.voxels.occupancy import OccupancyVoxels
 
 LEVELS = 4
 # Middles of the finest level's cells, of edge 1/8: no place lies on the border of two.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fields.map.bricks import BRICK_BYTES, BRICK_LEVELS, BRICKS, SIDE, WORDS, Bricks, corner_of, places_of_marks
-from fields.map.hashed_bricks import HashedBricks
-from fields.map.resting_bricks import RESTING_BYTES, RestingBricks
-from fields.map.sparse_bricks import SparseBricks
 from fields.runtime.backend import has_sparse_fields, program
+from fields.voxels.bricks import BRICK_BYTES, BRICK_LEVELS, BRICKS, SIDE, WORDS, Bricks, corner_of, places_of_marks
+from fields.voxels.hashed_bricks import HashedBricks
+from fields.voxels.resting_bricks import RESTING_BYTES, RestingBricks
+from fields.voxels.sparse_bricks import SparseBricks
 
 __all__ = ["OccupancyVoxels"]
 

@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.bricks import Bricks, places_of_marks
+from fields.voxels.bricks import Bricks, places_of_marks
 
 __all__ = ["RESTING_BYTES", "RestingBricks"]
 

@@ -1,0 +1,1 @@
+"""The occupancy voxels: where the map already holds Gaussians."""
