@@ -30,6 +30,8 @@ NUMBERS: dict[str, tuple[int, ...]] = {
 # Names in a snapshot that differ from the name of the field.
 FIELDS = {"lag": "pending_motion"}
 WHOLE = ("index", "pose_steps", "exposure_steps")
+# Flags. Snapshots of version 0.2 do not have them.
+KINDS = ("is_between", "is_gauge")
 POINTS = {"xyz": 3, "pixels": 2}
 NO_MASK = np.zeros((0, 0), dtype=np.uint8)
 
@@ -41,7 +43,7 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
         store: The keyframes.
 
     Returns:
-        One array per field of `NUMBERS`, `exposure` and `is_between`, with one row per keyframe. The rows of `exposure`
+        One array per field of `NUMBERS` and `KINDS` and `exposure`, with one row per keyframe. The rows of `exposure`
         are NaN for keyframes without one. `points` holds the number of tracked points of each keyframe; `xyz` (P, 3),
         `pixels` (P, 2) and `ids` (P,) hold the points of all keyframes, concatenated. If anything moves, `transient`
         holds the masks of all keyframes, concatenated, and `transient_size` (N, 2) their sizes, 0 without a mask.
@@ -56,7 +58,8 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
     unknown = np.full((3, 4), np.nan)
     exposures = [unknown if view.exposure is None else view.exposure for view in views]
     arrays["exposure"] = np.array(exposures).reshape(-1, 3, 4)
-    arrays["is_between"] = np.array([view.is_between for view in views], dtype=np.int64)
+    for name in KINDS:
+        arrays[name] = np.array([getattr(view, name) for view in views], dtype=np.int64)
     arrays["points"] = np.array([len(view.points) for view in views], dtype=np.int64)
     for name, width in POINTS.items():
         parts = [getattr(view.points, name) for view in views]
@@ -90,10 +93,10 @@ class KeyframeRows:
                 raise ValueError(f"{name} has shape {arrays[name].shape}, expected {(count, *shape)}")
             if name != "exposure" and not np.isfinite(arrays[name]).all():
                 raise ValueError(f"{name} is not finite")
-        # Snapshots of version 0.2 do not know frames between keyframes.
-        self._is_between = arrays.get("is_between", np.zeros(count, dtype=np.int64))
-        if self._is_between.shape != (count,):
-            raise ValueError(f"is_between has shape {self._is_between.shape}, expected {(count,)}")
+        self._kinds = {name: arrays.get(name, np.zeros(count, dtype=np.int64)) for name in KINDS}
+        for name, kind in self._kinds.items():
+            if kind.shape != (count,):
+                raise ValueError(f"{name} has shape {kind.shape}, expected {(count,)}")
         total = int(arrays["points"].sum())
         if arrays["points"].shape != (count,) or (arrays["points"] < 0).any() or len(arrays["ids"]) != total:
             raise ValueError(f"{len(arrays['ids'])} tracked points, {total} are announced")
@@ -120,7 +123,8 @@ class KeyframeRows:
         row = len(store)
         if self.rows.get(frame.index) != row:
             raise ValueError(f"frame {frame.index} is not keyframe {row}")
-        view = store.append(frame, bool(self._is_between[row]))
+        view = store.append(frame, bool(self._kinds["is_between"][row]))
+        view.is_gauge = bool(self._kinds["is_gauge"][row])
         for name, shape in NUMBERS.items():
             value = self._arrays[name][row]
             plain = int(value) if name in WHOLE else float(value) if shape == () else np.array(value)

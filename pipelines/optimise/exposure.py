@@ -1,7 +1,8 @@
 """Exposure: an affine colour transform (A, b) of each keyframe, estimated together with the map.
 
-image = (A colour + b) * vignette. The transform of the first keyframe is fixed to the identity, which removes the
-ambiguity between the transforms and the colours of the map. The others are regularised towards the identity.
+image = (A colour + b) * vignette. The transform of the first keyframe, and of the first at each place of its own, is
+fixed to the identity, which removes the ambiguity between the transforms and the colours of the map. The others are
+regularised towards the identity.
 """
 
 from __future__ import annotations
@@ -100,8 +101,8 @@ class ExposureRefinement:
         `light_changes`. All earlier keyframes then get the identity, which the first keyframe always has.
 
         A keyframe that sees nothing of the map keeps the exposure of the one before it; at a place of its own, it gets
-        the identity. There, the brightness of the map is free, and each place would else be brighter by what the
-        exposure had changed within the one before.
+        the identity for good, as the first keyframe of the map does. There, the brightness of the map is free: all
+        exposures would rise while its Gaussians are young and too dark.
 
         Args:
             store: The keyframes.
@@ -122,15 +123,18 @@ class ExposureRefinement:
         before = IDENTITY if view.exposure is None else view.exposure
         small = view.at_level(store.levels)
         renderer.forward(small.camera, view.T_camera_world, near)
-        known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
+        opacity = renderer.images.opacity_to_numpy()
+        known = (opacity > MIN_OPACITY) & (small.rgba[..., 3] > 0)
         if known.sum() < MIN_PIXELS:
             if _is_elsewhere(store):
-                view.exposure = np.array(IDENTITY)
+                view.exposure, view.is_gauge = np.array(IDENTITY), True
             return
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:
             image = image / resized_vignette(view.vignette, small.rgba)[known]
-        gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(before))
+        # A young map is not quite opaque. Without the division, each new keyframe would be too bright by that.
+        colours = renderer.images.colour_to_numpy()[known] / opacity[known, None]
+        gains = fitted_gains(colours, image, np.diag(before))
         view.exposure = np.column_stack([np.diag(gains), np.zeros(3)])
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], weight: float = 1.0) -> None:

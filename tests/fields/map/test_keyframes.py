@@ -156,10 +156,10 @@ def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
     assert keyframe.median_depth == pytest.approx(np.median(now[:, 2]) + T[2, 3])
 
 
-def test_frames_between_keyframes_are_told_apart_also_after_they_were_saved() -> None:
+def test_kinds_of_keyframes_are_told_apart_also_after_they_were_saved() -> None:
     store, again, old = KeyframeStore(), KeyframeStore(), KeyframeStore()
     for index in range(5):
-        store.append(frame(index), is_between=index in (1, 3, 4))
+        store.append(frame(index), is_between=index in (1, 3, 4)).is_gauge = index == 2
     arrays = keyframe_arrays(store)
     rows = KeyframeRows(arrays)
     for index in range(5):
@@ -167,10 +167,11 @@ def test_frames_between_keyframes_are_told_apart_also_after_they_were_saved() ->
     for one in (store, again):
         assert [view.index for view in one.selected] == [0, 2] and one.latest == 2
         assert [view.is_between for view in one] == [False, True, False, True, True]
-    rows = KeyframeRows({name: array for name, array in arrays.items() if name != "is_between"})
+        assert [view.is_gauge for view in one] == [False, False, True, False, False]
+    rows = KeyframeRows({name: array for name, array in arrays.items() if not name.startswith("is_")})
     for index in range(5):
         rows.put(frame(index), old)
-    assert len(old.selected) == 5 and old.latest == 4
+    assert len(old.selected) == 5 and old.latest == 4 and not any(view.is_gauge for view in old)
 
 
 def masked_store() -> KeyframeStore:

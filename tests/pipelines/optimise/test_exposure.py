@@ -108,11 +108,34 @@ def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_
     view = store.append(replace(frame(1), points=points))
     ExposureRefinement(ExposureSettings(enabled=True)).begin(store, nothing, 0.01)
     np.testing.assert_array_equal(view.exposure, IDENTITY if own else EXPOSURE)
+    assert view.is_gauge == own
+
+
+def test_a_map_that_is_not_quite_opaque_does_not_brighten_a_new_keyframe() -> None:
+    scene = np.random.default_rng(4).uniform(0.3, 0.6, (CAMERA.height, CAMERA.width, 3))
+    opacity = np.random.default_rng(5).uniform(0.85, 1.0, (CAMERA.height, CAMERA.width))
+    young = SimpleNamespace(
+        forward=lambda *_: None,
+        images=SimpleNamespace(opacity_to_numpy=lambda: opacity, colour_to_numpy=lambda: scene * opacity[..., None]),
+    )
+    store = KeyframeStore()
+    for index, gain in enumerate((1.0, 1.2)):
+        view = store.append(replace(frame(index), image=(gain * scene).astype(np.float32)))
+        view.exposure = np.array(IDENTITY)
+    ExposureRefinement(ExposureSettings(enabled=True)).begin(store, young, 0.01)
+    # With 8 bits, and without the scene's darkest values, the median is off by a few thousandths.
+    np.testing.assert_allclose(np.diag(store[1].exposure[:, :3]), 1.2, atol=0.01)
+    assert not store[1].is_gauge
 
 
 # ---- whole runs on the wall of test_mapping --------------------------------------------------------------------
 
 GAINS = (1.0, 0.8, 1.15, 0.9, 0.7, 1.0, 0.85)
+
+
+def changing() -> list:
+    frames = [frame(i) for i in range(len(GAINS))]
+    return [replace(f, image=np.clip(g * f.image, 0, 1)) for f, g in zip(frames, GAINS, strict=True)]
 
 
 def mapped(frames: list, **exposure: object) -> OnlineMapper:
@@ -133,14 +156,23 @@ def mapped(frames: list, **exposure: object) -> OnlineMapper:
 
 @pytest.mark.parametrize("enabled", [True, "auto"])
 def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None, enabled: bool | str) -> None:
-    frames = [frame(i) for i in range(len(GAINS))]
-    frames = [replace(f, image=np.clip(g * f.image, 0, 1)) for f, g in zip(frames, GAINS, strict=True)]
-    mapper = mapped(frames, enabled=enabled)
+    mapper = mapped(changing(), enabled=enabled)
     assert len(mapper.keyframes) == len(GAINS)
     np.testing.assert_array_equal(mapper.keyframes[0].exposure, IDENTITY)
     for view, gain in zip(mapper.keyframes, GAINS, strict=True):
         shown = view.exposure @ [0.5, 0.5, 0.5, 1.0]
         np.testing.assert_allclose(shown, 0.5 * gain, atol=0.03)
+
+
+def test_the_exposure_of_a_gauge_is_fixed(taichi_on_the_cpu: None) -> None:
+    mapper = mapped(changing(), enabled=True)
+    mapper.keyframes[1].is_gauge = True
+    before = [view.exposure for view in mapper.keyframes]
+    views = list(range(len(before)))
+    mapper.optimiser.step(mapper.keyframes, views, mapper.optimiser.rates(mapper.keyframes.scene_depth), pose_rate=0.0)
+    mapper.optimiser.settle()
+    moved = [not np.array_equal(view.exposure, old) for view, old in zip(mapper.keyframes, before, strict=True)]
+    assert moved == [False, False, *[True] * (len(before) - 2)]
 
 
 def test_no_exposure_is_estimated_in_a_light_that_does_not_change(taichi_on_the_cpu: None) -> None:
