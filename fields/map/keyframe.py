@@ -57,7 +57,8 @@ class Keyframe:
         exposure_m: First moment (3, 4) of Adam on the exposure.
         exposure_v: Second moment (3, 4) of Adam on the exposure.
         exposure_steps: Number of Adam steps of the exposure.
-        is_gauge: Whether its exposure is fixed, since it is the first keyframe of a place of its own.
+        begins_place: Whether it is the first keyframe at a place of its own, apart from the map so far. Its exposure is
+            fixed. Places are told apart where exposures are estimated.
         pending_motion: Similarity (4, 4) of the world around the keyframe, by the tracker's corrections, that its
             Gaussians have not followed yet.
         is_between: Whether it is a frame between keyframes. The map is optimised on it as on a keyframe, but gets only
@@ -85,7 +86,7 @@ class Keyframe:
     exposure_m: NDArray[np.float64] = field(default_factory=lambda: NO_EXPOSURE_MOMENT)
     exposure_v: NDArray[np.float64] = field(default_factory=lambda: NO_EXPOSURE_MOMENT)
     exposure_steps: int = 0
-    is_gauge: bool = False
+    begins_place: bool = False
     pending_motion: NDArray[np.float64] = field(default_factory=lambda: NO_MOTION)
     is_between: bool = False
     transient: NDArray[np.uint8] | None = None

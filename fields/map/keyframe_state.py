@@ -31,7 +31,7 @@ NUMBERS: dict[str, tuple[int, ...]] = {
 FIELDS = {"lag": "pending_motion"}
 WHOLE = ("index", "pose_steps", "exposure_steps")
 # Flags. Snapshots of version 0.2 do not have them.
-KINDS = ("is_between", "is_gauge")
+KINDS = ("is_between", "begins_place")
 POINTS = {"xyz": 3, "pixels": 2}
 NO_MASK = np.zeros((0, 0), dtype=np.uint8)
 
@@ -124,7 +124,7 @@ class KeyframeRows:
         if self.rows.get(frame.index) != row:
             raise ValueError(f"frame {frame.index} is not keyframe {row}")
         view = store.append(frame, bool(self._kinds["is_between"][row]))
-        view.is_gauge = bool(self._kinds["is_gauge"][row])
+        view.begins_place = bool(self._kinds["begins_place"][row])
         for name, shape in NUMBERS.items():
             value = self._arrays[name][row]
             plain = int(value) if name in WHOLE else float(value) if shape == () else np.array(value)

@@ -165,12 +165,14 @@ class KeyframeStore:
     def near(self) -> NDArray[np.int64]:
         """Return the places (M,) of the keyframes around the latest one, of which views are drawn.
 
-        They miss at most `most_missing` Gaussians. While parts of the map lie on disk, they are also at most FAR away.
-        Otherwise, what is still in memory of an earlier place would be drawn as often as the present one.
+        They miss at most `most_missing` Gaussians. If parts of the map lie on disk, or it has places apart, they are
+        also at most FAR away. Otherwise, what is in memory of an earlier place would be drawn as often as the present
+        one.
         """
         missing = np.fromiter((k.missing for k in self._keyframes), np.int64, len(self._keyframes))
         places = np.flatnonzero(missing <= self.most_missing)
-        if missing.any() and len(places) and self.latest >= 0:
+        apart = missing.any() or any(k.begins_place for k in self._keyframes)
+        if apart and len(places) and self.latest >= 0:
             centres = np.array([self._keyframes[place].centre for place in places])
             distances = np.linalg.norm(centres - self._keyframes[self.latest].centre, axis=1)
             places = places[distances <= FAR * self.scene_depth]

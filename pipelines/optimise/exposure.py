@@ -127,7 +127,7 @@ class ExposureRefinement:
         known = (opacity > MIN_OPACITY) & (small.rgba[..., 3] > 0)
         if known.sum() < MIN_PIXELS:
             if _is_elsewhere(store):
-                view.exposure, view.is_gauge = np.array(IDENTITY), True
+                view.exposure, view.begins_place = np.array(IDENTITY), True
             return
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:

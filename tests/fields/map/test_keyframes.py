@@ -9,7 +9,7 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
 from fields.geometry.similarity import motion_around
-from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
+from fields.map.keyframe_state import KINDS, KeyframeRows, keyframe_arrays
 from fields.map.keyframes import KeyframeStore
 
 CAMERA = PinholeCamera(10.0, 40.0, 4.0, 3.0, 8, 6)
@@ -50,7 +50,7 @@ def test_a_new_keyframe_starts_at_the_mean_error_and_the_first_at_one() -> None:
     assert store.append(frame(2)).error == pytest.approx(0.2)
 
 
-def test_views_are_of_the_present_place_only_while_parts_of_the_map_lie_on_disk() -> None:
+def test_views_are_of_the_present_place_only_once_there_are_others_or_parts_of_the_map_lie_on_disk() -> None:
     """The scene is 4 m deep, the camera moves on by 5 m a keyframe, and another place is farther than 12 m."""
     store = KeyframeStore()
     for index in range(6):
@@ -59,6 +59,9 @@ def test_views_are_of_the_present_place_only_while_parts_of_the_map_lie_on_disk(
         store.append(frame(index, T=T))
     store.most_missing = 10
     assert store.near().tolist() == [0, 1, 2, 3, 4, 5]
+    store[4].begins_place = True
+    assert store.near().tolist() == [3, 4, 5]
+    store[4].begins_place = False
     store[4].missing = 1
     assert store.near().tolist() == [3, 4, 5]
     store[4].missing = 11
@@ -159,7 +162,7 @@ def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
 def test_kinds_of_keyframes_are_told_apart_also_after_they_were_saved() -> None:
     store, again, old = KeyframeStore(), KeyframeStore(), KeyframeStore()
     for index in range(5):
-        store.append(frame(index), is_between=index in (1, 3, 4)).is_gauge = index == 2
+        store.append(frame(index), is_between=index in (1, 3, 4)).begins_place = index == 2
     arrays = keyframe_arrays(store)
     rows = KeyframeRows(arrays)
     for index in range(5):
@@ -167,11 +170,11 @@ def test_kinds_of_keyframes_are_told_apart_also_after_they_were_saved() -> None:
     for one in (store, again):
         assert [view.index for view in one.selected] == [0, 2] and one.latest == 2
         assert [view.is_between for view in one] == [False, True, False, True, True]
-        assert [view.is_gauge for view in one] == [False, False, True, False, False]
-    rows = KeyframeRows({name: array for name, array in arrays.items() if not name.startswith("is_")})
+        assert [view.begins_place for view in one] == [False, False, True, False, False]
+    rows = KeyframeRows({name: array for name, array in arrays.items() if name not in KINDS})
     for index in range(5):
         rows.put(frame(index), old)
-    assert len(old.selected) == 5 and old.latest == 4 and not any(view.is_gauge for view in old)
+    assert len(old.selected) == 5 and old.latest == 4 and not any(view.begins_place for view in old)
 
 
 def masked_store() -> KeyframeStore:

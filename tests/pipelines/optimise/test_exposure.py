@@ -108,7 +108,7 @@ def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_
     view = store.append(replace(frame(1), points=points))
     ExposureRefinement(ExposureSettings(enabled=True)).begin(store, nothing, 0.01)
     np.testing.assert_array_equal(view.exposure, IDENTITY if own else EXPOSURE)
-    assert view.is_gauge == own
+    assert view.begins_place == own
 
 
 def test_a_map_that_is_not_quite_opaque_does_not_brighten_a_new_keyframe() -> None:
@@ -125,7 +125,7 @@ def test_a_map_that_is_not_quite_opaque_does_not_brighten_a_new_keyframe() -> No
     ExposureRefinement(ExposureSettings(enabled=True)).begin(store, young, 0.01)
     # With 8 bits, and without the scene's darkest values, the median is off by a few thousandths.
     np.testing.assert_allclose(np.diag(store[1].exposure[:, :3]), 1.2, atol=0.01)
-    assert not store[1].is_gauge
+    assert not store[1].begins_place
 
 
 # ---- whole runs on the wall of test_mapping --------------------------------------------------------------------
@@ -164,9 +164,9 @@ def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None, enabled: bool
         np.testing.assert_allclose(shown, 0.5 * gain, atol=0.03)
 
 
-def test_the_exposure_of_a_gauge_is_fixed(taichi_on_the_cpu: None) -> None:
+def test_the_exposure_of_the_first_keyframe_of_a_place_is_fixed(taichi_on_the_cpu: None) -> None:
     mapper = mapped(changing(), enabled=True)
-    mapper.keyframes[1].is_gauge = True
+    mapper.keyframes[1].begins_place = True
     before = [view.exposure for view in mapper.keyframes]
     views = list(range(len(before)))
     mapper.optimiser.step(mapper.keyframes, views, mapper.optimiser.rates(mapper.keyframes.scene_depth), pose_rate=0.0)
