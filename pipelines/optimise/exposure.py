@@ -123,8 +123,7 @@ class ExposureRefinement:
         before = IDENTITY if view.exposure is None else view.exposure
         small = view.at_level(store.levels)
         renderer.forward(small.camera, view.T_camera_world, near)
-        opacity = renderer.images.opacity_to_numpy()
-        known = (opacity > MIN_OPACITY) & (small.rgba[..., 3] > 0)
+        known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
         if known.sum() < MIN_PIXELS:
             if _is_elsewhere(store):
                 view.exposure, view.begins_place = np.array(IDENTITY), True
@@ -132,9 +131,7 @@ class ExposureRefinement:
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:
             image = image / resized_vignette(view.vignette, small.rgba)[known]
-        # A young map is not quite opaque. Without the division, each new keyframe would be too bright by that.
-        colours = renderer.images.colour_to_numpy()[known] / opacity[known, None]
-        gains = fitted_gains(colours, image, np.diag(before))
+        gains = fitted_gains(renderer.images.colour_to_numpy()[known], image, np.diag(before))
         view.exposure = np.column_stack([np.diag(gains), np.zeros(3)])
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], weight: float = 1.0) -> None:
