@@ -74,9 +74,13 @@ def fitted_gains(
 
 
 def _is_elsewhere(store: KeyframeStore) -> bool:
-    """Whether the latest keyframe tracks points, but none that the keyframes just before it track."""
+    """Whether the latest keyframe tracks points, but none that the keyframes just before it track.
+
+    Those must share points among themselves: the ids of some trackers never return, and tell nothing.
+    """
     *earlier, latest = (keyframe.points.ids for keyframe in store.selected[-COMPARED - 1 :])
-    return len(latest) > 0 and not np.isin(latest, np.concatenate(earlier)).any()
+    known = np.concatenate(earlier)
+    return len(latest) > 0 and len(np.unique(known)) < len(known) and not np.isin(latest, known).any()
 
 
 class ExposureRefinement:

@@ -96,16 +96,18 @@ def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     np.testing.assert_array_equal(view.exposure, EXPOSURE)
 
 
-@pytest.mark.parametrize("own", [True, False])
-def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(own: bool) -> None:
+@pytest.mark.parametrize(("ids", "own"), [((0, 0, 2), True), ((0, 0, 0), False), ((0, 1, 2), False)])
+def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(ids: tuple, own: bool) -> None:
+    """Each keyframe tracks points with the ids of the given frame. If no id ever returns, none tells of a new place."""
     nothing = SimpleNamespace(
         forward=lambda *_: None,
         images=SimpleNamespace(opacity_to_numpy=lambda: np.zeros((CAMERA.height, CAMERA.width))),
     )
     store = KeyframeStore()
-    store.append(frame(0)).exposure = EXPOSURE
-    points = frame(1).points if own else replace(frame(1).points, ids=frame(0).points.ids)
-    view = store.append(replace(frame(1), points=points))
+    for index, of in enumerate(ids):
+        points = replace(frame(index).points, ids=frame(of).points.ids)
+        view = store.append(replace(frame(index), points=points))
+        view.exposure = EXPOSURE
     ExposureRefinement(ExposureSettings(enabled=True)).begin(store, nothing, 0.01)
     np.testing.assert_array_equal(view.exposure, IDENTITY if own else EXPOSURE)
     assert view.begins_place == own
