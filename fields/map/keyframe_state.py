@@ -43,7 +43,7 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
         store: The keyframes.
 
     Returns:
-        One array per field of `NUMBERS` and `KINDS` and `exposure`, with one row per keyframe. The rows of `exposure`
+        One array per field of `NUMBERS` and `KINDS`, and `exposure`, with one row per keyframe. The rows of `exposure`
         are NaN for keyframes without one. `points` holds the number of tracked points of each keyframe; `xyz` (P, 3),
         `pixels` (P, 2) and `ids` (P,) hold the points of all keyframes, concatenated. If anything moves, `transient`
         holds the masks of all keyframes, concatenated, and `transient_size` (N, 2) their sizes, 0 without a mask.
