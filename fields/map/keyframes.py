@@ -70,6 +70,11 @@ class KeyframeStore:
         """Median over the keyframes of the median depth of their tracked points, the unit of length of the settings."""
         return self._depths.value if len(self._depths) else 1.0
 
+    @property
+    def place_begins(self) -> int:
+        """Index of the frame with which the latest place of its own began; 0 if there is none, see `begins_place`."""
+        return max((k.index for k in self._keyframes if k.begins_place), default=0)
+
     def bytes_of(self, frame: TrackedFrame) -> int:
         """Return the number of bytes that a frame would take as a keyframe."""
         return nbytes_of(self._kept(frame, self.levels), frame.points)
@@ -244,7 +249,7 @@ class KeyframeStore:
     def _around(self, index: int) -> tuple[Keyframe, Keyframe, float]:
         """Keyframes of its view before and after frame `index`, and its position between; outside, twice the nearest.
 
-        A view without keyframes takes those of any.
+        A view without keyframes takes those of any. Between two places apart, it is twice the nearest, too.
         """
         every = self._keyframes
         if self.views > 1:
@@ -254,4 +259,7 @@ class KeyframeStore:
             nearest = every[min(after, len(every) - 1)]
             return nearest, nearest, 0.0
         a, b = every[after - 1], every[after]
+        if b.begins_place and index < b.index:
+            nearest = a if index - a.index < b.index - index else b
+            return nearest, nearest, 0.0
         return a, b, (index - a.index) / (b.index - a.index)

@@ -95,9 +95,8 @@ def write_refined(
         check_splats(results.folder / "splats.ply", refined.gaussians)
         exposures = refined.exposures_of(len(run))
         if refined.estimated:
-            known = [exposure for exposure in exposures if exposure is not None]
             write_exposures(
-                results.folder / "exposure.json", range(len(run)), run.timestamps.tolist(), known, refined.estimated
+                results.folder / "exposure.json", range(len(run)), run.timestamps.tolist(), exposures, refined.estimated
             )
         version = MapVersion(
             refined.gaussians,

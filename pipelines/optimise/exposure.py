@@ -104,9 +104,9 @@ class ExposureRefinement:
         With `enabled: auto`, exposures are estimated from the first keyframe on whose light has changed, see
         `light_changes`. All earlier keyframes then get the identity, which the first keyframe always has.
 
-        A keyframe that sees nothing of the map keeps the exposure of the one before it; at a place of its own, it gets
-        the identity for good, as the first keyframe of the map does. There, the brightness of the map is free: all
-        exposures would rise while its Gaussians are young and too dark.
+        A keyframe at a place of its own, which sees nothing of the map, begins anew as the first keyframe of a map
+        does, and so do those after it: the brightness of that place is free, and exposures that were estimated at once
+        would all rise while its Gaussians are young and too dark. Back at an earlier place, they are estimated again.
 
         Args:
             store: The keyframes.
@@ -116,21 +116,30 @@ class ExposureRefinement:
         view, enabled = store[-1], self.settings.enabled
         if not enabled:
             return
+        unestimated = np.array(IDENTITY) if enabled is True else None
         if len(store) == 1:
-            view.exposure = np.array(IDENTITY) if enabled is True else None
+            view.exposure = unestimated
             return
-        if view.exposure is None:
-            if not light_changes(store):
-                return
-            for keyframe in store:
-                keyframe.exposure = np.array(IDENTITY)
-        before = IDENTITY if view.exposure is None else view.exposure
+        elsewhere = _is_elsewhere(store)
+        estimated = view.exposure is not None or light_changes(store)
+        if not (estimated or elsewhere):
+            return
         small = view.at_level(store.levels)
         renderer.forward(small.camera, view.T_camera_world, near)
         known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
-        if known.sum() < MIN_PIXELS:
-            if _is_elsewhere(store):
-                view.exposure, view.begins_place = np.array(IDENTITY), True
+        sees_map = known.sum() >= MIN_PIXELS
+        if elsewhere and not sees_map:
+            view.exposure, view.begins_place = unestimated, True
+            return
+        if not (estimated or any(keyframe.exposure is not None for keyframe in store)):
+            return
+        before = IDENTITY if view.exposure is None else view.exposure
+        if view.exposure is None:
+            begins = store.place_begins
+            for keyframe in store:
+                if keyframe.index >= begins:
+                    keyframe.exposure = np.array(IDENTITY)
+        if not sees_map:
             return
         image = small.rgba[known][:, :3] / 255.0
         if view.vignette is not None:

@@ -41,11 +41,12 @@ def light_changes(store: KeyframeStore) -> bool:
     colours are still wrong, does not look like a change.
 
     Args:
-        store: The keyframes.
+        store: The keyframes. Those before the latest place began do not count.
     """
     latest = store[-1]
     here = _colours(latest, store.levels)
-    for earlier in store.selected[-COMPARED - 1 : -1]:
+    begins = store.place_begins
+    for earlier in [k for k in store.selected[-COMPARED - 1 : -1] if k.index >= begins]:
         p = earlier.points.xyz @ latest.T_camera_world[:3, :3].T + latest.T_camera_world[:3, 3]
         front = (p[:, 2] > 0) & earlier.camera.contains(earlier.points.pixels)
         pixels, there = latest.camera.project(p[front]), earlier.points.pixels[front]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from modp_ti.files import LARGEST, read_json
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
+from pipelines.render.cpu.photometric_model import IDENTITY
 
 __all__ = ["read_exposures", "write_exposures"]
 
@@ -20,7 +21,7 @@ def write_exposures(
     path: Path,
     indices: Sequence[int],
     timestamps: Sequence[float],
-    exposures: Sequence[NDArray[np.float64]],
+    exposures: Sequence[NDArray[np.float64] | None],
     keyframes: set[int],
 ) -> None:
     """Write the exposure (A, b) of every frame, which maps the map's `colour` to A colour + b.
@@ -29,7 +30,7 @@ def write_exposures(
         path: The file.
         indices: Indices of the frames.
         timestamps: Their time stamps [s].
-        exposures: (3, 4) matrix (A, b) of each frame.
+        exposures: (3, 4) matrix (A, b) of each frame. None is written as the identity.
         keyframes: Indices of the frames whose exposure was estimated. The others are interpolated.
     """
     frames = [
@@ -37,7 +38,7 @@ def write_exposures(
             "index": index,
             "timestamp": timestamp,
             "keyframe": index in keyframes,
-            "matrix": np.round(exposure, 6).tolist(),
+            "matrix": np.round(IDENTITY if exposure is None else exposure, 6).tolist(),
         }
         for index, timestamp, exposure in zip(indices, timestamps, exposures, strict=True)
     ]

@@ -83,10 +83,9 @@ def write_map(
     lines = [line for line, index in enumerate(frames.index) if index in selected]
     held_out = [line for line, held in enumerate(frames.held_out) if held]
     write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out, undistorter)
-    if len(keyframes) and keyframes[0].exposure is not None:
-        exposures = [exposure for exposure in version.exposures if exposure is not None]
-        estimated = {keyframe.index for keyframe in keyframes}
-        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, exposures, estimated)
+    if any(exposure is not None for exposure in version.exposures):
+        estimated = {keyframe.index for keyframe in keyframes if keyframe.exposure is not None}
+        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, version.exposures, estimated)
     places = {index: place for place, index in enumerate(frames.index)}
     masks = {places[view.index]: view.transient for view in keyframes if view.transient is not None}
     if masks:

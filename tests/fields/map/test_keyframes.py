@@ -117,6 +117,22 @@ def test_exposure_is_interpolated_between_keyframes_and_the_nearest_outside() ->
         np.testing.assert_allclose(store.exposure_at(index), value)
 
 
+def test_nothing_is_interpolated_between_two_places() -> None:
+    """The second place begins at frame 20. Frames before it take after the nearest keyframe."""
+    store = KeyframeStore()
+    twist = np.array([0.2, -0.1, 0.3, 0.01, 0.02, -0.03])
+    for index, value, share in ((10, 1.0, 1.0), (20, 3.0, 4.0), (22, 5.0, 4.0)):
+        view = store.append(frame(index))
+        view.exposure = np.full((3, 4), value)
+        view.T_camera_world = exp_se3(share * twist) @ view.T_tracked
+    assert store.place_begins == 0
+    store[1].begins_place = True
+    assert store.place_begins == 20
+    for index, value, share in ((10, 1.0, 1.0), (14, 1.0, 1.0), (16, 3.0, 4.0), (20, 3.0, 4.0), (21, 4.0, 4.0)):
+        np.testing.assert_allclose(store.exposure_at(index), value)
+        np.testing.assert_allclose(store.corrected(index, np.eye(4)), exp_se3(share * twist), atol=1e-12)
+
+
 def test_a_new_keyframe_starts_with_the_exposure_of_the_last_but_shares_no_memory_with_it() -> None:
     store = KeyframeStore()
     store.append(frame(0)).exposure = np.full((3, 4), 2.0)

@@ -96,21 +96,64 @@ def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     np.testing.assert_array_equal(view.exposure, EXPOSURE)
 
 
-@pytest.mark.parametrize(("ids", "own"), [((0, 0, 2), True), ((0, 0, 0), False), ((0, 1, 2), False)])
-def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(ids: tuple, own: bool) -> None:
-    """Each keyframe tracks points with the ids of the given frame. If no id ever returns, none tells of a new place."""
-    nothing = SimpleNamespace(
-        forward=lambda *_: None,
-        images=SimpleNamespace(opacity_to_numpy=lambda: np.zeros((CAMERA.height, CAMERA.width))),
+def showing(opacity: float, colour: float = 0.5) -> SimpleNamespace:
+    """A renderer whose images show one opacity and colour."""
+    shape = (CAMERA.height, CAMERA.width)
+    images = SimpleNamespace(
+        opacity_to_numpy=lambda: np.full(shape, opacity), colour_to_numpy=lambda: np.full((*shape, 3), colour)
     )
+    return SimpleNamespace(forward=lambda *_: None, images=images)
+
+
+def keyframes(ids: tuple[int, ...], *exposures: NDArray | None) -> KeyframeStore:
+    """Keyframes with these exposures, each of which tracks points with the ids of a frame."""
     store = KeyframeStore()
-    for index, of in enumerate(ids):
-        points = replace(frame(index).points, ids=frame(of).points.ids)
-        view = store.append(replace(frame(index), points=points))
-        view.exposure = EXPOSURE
-    ExposureRefinement(ExposureSettings(enabled=True)).begin(store, nothing, 0.01)
-    np.testing.assert_array_equal(view.exposure, IDENTITY if own else EXPOSURE)
-    assert view.begins_place == own
+    for index, (of, exposure) in enumerate(zip(ids, exposures, strict=True)):
+        store.append(replace(frame(index), points=replace(frame(index).points, ids=frame(of).points.ids)))
+        store[-1].exposure = exposure
+    return store
+
+
+@pytest.mark.parametrize(("ids", "own"), [((0, 0, 2), True), ((0, 0, 0), False), ((0, 1, 2), False)])
+@pytest.mark.parametrize(("enabled", "begins_with"), [(True, IDENTITY), ("auto", None)])
+def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(
+    ids: tuple[int, ...], own: bool, enabled: bool | str, begins_with: NDArray | None
+) -> None:
+    """If no id ever returns, none tells of a new place."""
+    store = keyframes(ids, EXPOSURE, EXPOSURE, EXPOSURE)
+    ExposureRefinement(ExposureSettings(enabled=enabled)).begin(store, showing(0.0), 0.01)
+    np.testing.assert_array_equal(store[-1].exposure, begins_with if own else EXPOSURE)
+    assert store[-1].begins_place == own
+
+
+def test_exposures_of_a_new_place_are_estimated_once_its_light_changes() -> None:
+    """The wall of keyframes 2 to 4 is another place. It begins darker than keyframe 1, but changes only in the last."""
+    store = KeyframeStore()
+    refinement = ExposureRefinement(ExposureSettings(enabled="auto"))
+    for index, (gain, opacity) in enumerate([(1.0, 1.0), (1.0, 1.0), (0.6, 0.0), (0.6, 1.0), (0.9, 1.0)]):
+        points = replace(frame(index).points, ids=frame(0).points.ids + 100_000 * (index >= 2))
+        store.append(replace(frame(index), image=np.float32(gain) * frame(index).image, points=points))
+        if index < 2:
+            store[index].exposure = EXPOSURE
+        else:
+            refinement.begin(store, showing(opacity), 0.01)
+        if index == 3:
+            assert [view.exposure is None for view in store] == [False, False, True, True]
+    assert [view.begins_place for view in store] == [False, False, True, False, False]
+    for view, exposure in zip(store, [EXPOSURE, EXPOSURE, IDENTITY, IDENTITY], strict=False):
+        np.testing.assert_array_equal(view.exposure, exposure)
+    gain = np.median(store[-1].rgba[..., :3] / 255.0 / 0.5, axis=(0, 1))
+    np.testing.assert_allclose(store[-1].exposure, np.column_stack([np.diag(gain), np.zeros(3)]), atol=0.02)
+
+
+@pytest.mark.parametrize("estimated_there", [True, False])
+def test_back_at_an_earlier_place_exposures_are_estimated_if_they_were_there(estimated_there: bool) -> None:
+    """Ten keyframes lie between, and none of them tracks a point of the first or the last."""
+    store = keyframes((0, *[1] * 10, 0), EXPOSURE if estimated_there else None, *[None] * 11)
+    store[1].begins_place = True
+    ExposureRefinement(ExposureSettings(enabled="auto")).begin(store, showing(1.0), 0.01)
+    assert [view.begins_place for view in store] == [False, True, *[False] * 10]
+    assert [view.exposure is not None for view in store] == [estimated_there] * 12
 
 
 # ---- whole runs on the wall of test_mapping --------------------------------------------------------------------

@@ -35,6 +35,16 @@ def test_a_brighter_or_darker_image_is_a_change(gain: float) -> None:
     assert light_changes(store_of([frame(0), frame(1), brightened(2, gain)]))
 
 
+def test_the_light_of_an_earlier_place_does_not_count() -> None:
+    store = store_of([frame(0), frame(1), brightened(2, 0.5)])
+    store[2].begins_place = True
+    assert not light_changes(store)
+    store.append(brightened(3, 0.5))
+    assert not light_changes(store)
+    store.append(frame(4))
+    assert light_changes(store)
+
+
 def test_a_slow_drift_adds_up_over_several_keyframes() -> None:
     step = np.exp(0.4 * CHANGED)
     assert not light_changes(store_of([frame(0), brightened(1, step)]))
