@@ -63,10 +63,8 @@ class LocalGlobalViews:
 
     def begin(self, store: KeyframeStore) -> None:
         last = store.latest
-        self._bank = [
-            j for j in range(max(0, last - self.settings.bank), last) if store[j].missing <= store.most_missing
-        ]
         self._near = store.near()
+        self._bank = [int(j) for j in self._near if last - self.settings.bank <= j < last]
         current = SeenPoints.of(store[last])
         self._overlap = np.array([covisibility(current, SeenPoints.of(store[j])) for j in self._bank])
 
