@@ -96,11 +96,12 @@ def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     np.testing.assert_array_equal(view.exposure, EXPOSURE)
 
 
-def showing(opacity: float, colour: float = 0.5) -> SimpleNamespace:
-    """A renderer whose images show one opacity and colour."""
-    shape = (CAMERA.height, CAMERA.width)
+def showing(share: float) -> SimpleNamespace:
+    """A renderer whose images show a grey map in the upper share of the image."""
+    opacity = np.zeros((CAMERA.height, CAMERA.width))
+    opacity[: round(share * CAMERA.height)] = 1.0
     images = SimpleNamespace(
-        opacity_to_numpy=lambda: np.full(shape, opacity), colour_to_numpy=lambda: np.full((*shape, 3), colour)
+        opacity_to_numpy=lambda: opacity, colour_to_numpy=lambda: np.full((*opacity.shape, 3), 0.5)
     )
     return SimpleNamespace(forward=lambda *_: None, images=images)
 
@@ -121,8 +122,15 @@ def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_
 ) -> None:
     """If no id ever returns, none tells of a new place."""
     store = keyframes(ids, EXPOSURE, EXPOSURE, EXPOSURE)
-    ExposureRefinement(ExposureSettings(enabled=enabled)).begin(store, showing(0.0), 0.01)
+    ExposureRefinement(ExposureSettings(enabled=enabled)).begin(store, showing(share=0.0), 0.01)
     np.testing.assert_array_equal(store[-1].exposure, begins_with if own else EXPOSURE)
+    assert store[-1].begins_place == own
+
+
+@pytest.mark.parametrize(("share", "own"), [(0.1, True), (0.5, False)])
+def test_fringes_of_an_earlier_place_are_no_return_to_it(share: float, own: bool) -> None:
+    store = keyframes((0, 0, 2), EXPOSURE, EXPOSURE, EXPOSURE)
+    ExposureRefinement(ExposureSettings(enabled=True)).begin(store, showing(share), 0.01)
     assert store[-1].begins_place == own
 
 
@@ -130,13 +138,13 @@ def test_exposures_of_a_new_place_are_estimated_once_its_light_changes() -> None
     """The wall of keyframes 2 to 4 is another place. It begins darker than keyframe 1, but changes only in the last."""
     store = KeyframeStore()
     refinement = ExposureRefinement(ExposureSettings(enabled="auto"))
-    for index, (gain, opacity) in enumerate([(1.0, 1.0), (1.0, 1.0), (0.6, 0.0), (0.6, 1.0), (0.9, 1.0)]):
+    for index, (gain, share) in enumerate([(1.0, 1.0), (1.0, 1.0), (0.6, 0.0), (0.6, 1.0), (0.9, 1.0)]):
         points = replace(frame(index).points, ids=frame(0).points.ids + 100_000 * (index >= 2))
         store.append(replace(frame(index), image=np.float32(gain) * frame(index).image, points=points))
         if index < 2:
             store[index].exposure = EXPOSURE
         else:
-            refinement.begin(store, showing(opacity), 0.01)
+            refinement.begin(store, showing(share), 0.01)
         if index == 3:
             assert [view.exposure is None for view in store] == [False, False, True, True]
     assert [view.begins_place for view in store] == [False, False, True, False, False]
