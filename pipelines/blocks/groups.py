@@ -47,5 +47,6 @@ def _end(rows: Sequence[NDArray[np.bool_]], counts: NDArray[np.int64]) -> int:
     """Return how many of a group's keyframes (K, B) stay in it: all, or those before it comes to another place."""
     before, after = np.logical_or.accumulate(rows), np.logical_or.accumulate(rows[::-1])[::-1]
     shares = [counts[a & b].sum() / max(counts[b].sum(), 1) for a, b in zip(before[:-1], after[1:], strict=True)]
-    least = int(np.argmin(shares)) if shares else 0
-    return least + 1 if shares and shares[least] <= SHARED else len(rows)
+    if shares and min(shares) <= SHARED:
+        return shares.index(min(shares)) + 1
+    return len(rows)
