@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from modp_ti.outputs.time_left import TimeLeft, duration
+from modp_ti.outputs.time_left import RECENT, TimeLeft, duration
 
 if TYPE_CHECKING:
     from modp_ti.outputs.live_status import LiveStatus
@@ -104,6 +104,7 @@ class ProgressLine:
         done: int = 0,
         later: Callable[[float], float | None] | None = None,
         prepares: bool = False,
+        recent: float = RECENT,
     ) -> None:
         """Begin the line of a stage.
 
@@ -114,9 +115,10 @@ class ProgressLine:
             later: Returns the time that the following stages will take [s], given the recent time of an item [s].
                 While it returns None, no time is shown. None if nothing follows.
             prepares: Whether the time of the first item includes preparations.
+            recent: Share of the elapsed time whose items set the pace, see `TimeLeft`.
         """
         self.stop()
-        self._left = TimeLeft(total, done, clock=time.monotonic, prepares=prepares)
+        self._left = TimeLeft(total, done, clock=time.monotonic, prepares=prepares, recent=recent)
         self._later = later or _nothing
         self._state = ""
         self._logged = time.monotonic()

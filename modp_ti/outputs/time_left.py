@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
     from pipelines.pipeline import Pipeline
 
-__all__ = ["TimeAfterMapping", "TimeLeft", "duration"]
+__all__ = ["RECENT", "TimeAfterMapping", "TimeLeft", "duration"]
 
 # Time that a stage must have run before an estimate is made [s].
 EARLIEST = 10.0
@@ -29,8 +29,8 @@ SCORED, RENDERED = 1.0, 0.5
 class TimeLeft:
     """Estimates the remaining time of a stage whose items take different times.
 
-    The pace is that of the items finished in the last third of the elapsed time, since a keyframe takes longer the
-    larger the map is. No estimate is made in the first ten seconds, or if the number of items is unknown.
+    The pace is by default that of the items finished in the last third of the elapsed time, since a keyframe takes
+    longer the larger the map is. No estimate is made in the first ten seconds, or if the number of items is unknown.
 
     Args:
         total: Number of items; None if unknown.
@@ -38,6 +38,7 @@ class TimeLeft:
         clock: Returns the time [s].
         earliest: Time before the first estimate [s].
         prepares: Whether the time of the first item includes preparations; it is then left out.
+        recent: Share of the elapsed time whose items set the pace. 1 for items that come in bursts.
 
     Attributes:
         total: As the argument. It may be changed.
@@ -51,14 +52,16 @@ class TimeLeft:
         clock: Callable[[], float],
         earliest: float = EARLIEST,
         prepares: bool = False,
+        recent: float = RECENT,
     ) -> None:
         self.total = total
         self._clock = clock
         self._earliest = earliest
         self._prepares = prepares
+        self._recent = recent
         self._began = clock()
         self._done = done
-        # Times and counts, oldest first. The first one is the latest that lies before the recent third.
+        # Times and counts, oldest first. The first one is the latest that lies before the recent share.
         self._history: deque[tuple[float, int]] = deque([(self._began, done)])
 
     def update(self, done: int) -> None:
@@ -69,7 +72,7 @@ class TimeLeft:
             self._history = deque([(now, done)])
         self._done = done
         self._history.append((now, done))
-        since = now - RECENT * (now - self._began)
+        since = now - self._recent * (now - self._began)
         while len(self._history) > 2 and self._history[1][0] <= since:
             self._history.popleft()
 

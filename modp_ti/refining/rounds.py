@@ -123,7 +123,8 @@ class _Refinement:
             count = max(2, -(-len(self._gaussians["position"]) // GAUSSIANS_EACH))
         began = time.perf_counter()
         self._line.note(f"refining in {count} regions, {self._plan.rounds} rounds")
-        self._line.start("refining", self._config.refine.steps, prepares=True)
+        # Every task of a round prepares for some 20 s, in which no step is made: only the mean pace says what is left.
+        self._line.start("refining", self._config.refine.steps, recent=1.0)
         try:
             for number in range(self._plan.rounds):
                 self._round(number, count)
