@@ -19,6 +19,7 @@ from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
 from pipelines.densify.depth import DepthEstimator, build_depth
 from pipelines.densify.hidden_gaussians import HiddenGaussians
+from pipelines.densify.other_places import OtherPlaces
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.pace import CompletePace, Pace
@@ -84,6 +85,7 @@ class OnlineMap(Pipeline):
         self.budget = self.densifier.budget
         self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
         self.optimiser.before_views = self.paging.gather
+        self.optimiser.before_update = OtherPlaces(self.densifier).hold
         contribution = Contribution(self.gaussians, self.renderer)
         self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
         self.transients = None

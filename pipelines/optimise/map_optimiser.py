@@ -35,6 +35,7 @@ class MapOptimiser:
 
     Attributes:
         before_views: Called with the views of each Adam step before they are rendered.
+        before_update: Called with them when all gradients are known, before the Gaussians are updated.
     """
 
     def __init__(self, gaussians: GaussianField, renderer: Renderer, settings: MappingSettings) -> None:
@@ -53,6 +54,7 @@ class MapOptimiser:
         self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
         self.before_views: Callable[[list[Keyframe]], None] = lambda views: None
+        self.before_update: Callable[[list[Keyframe]], None] = lambda views: None
 
     def rates(
         self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0, other_factor: float = 1.0
@@ -175,6 +177,7 @@ class MapOptimiser:
             if view.exposure is not None and j > 0 and not view.begins_place:
                 exposure_gradients.setdefault(j, []).append(self.renderer.async_exposure_gradient())
         self.aspect.backward(o.aspect_weight, store.scene_depth)
+        self.before_update([view for view, _ in seen])
         self.adam.step(rates, len(views), largest=EXPLODED * store.scene_depth)
         for j, gradients in pose_gradients.items():
             move = partial(self._move_pose, store[j], gradients, pose_rate)
