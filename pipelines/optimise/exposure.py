@@ -109,7 +109,8 @@ class ExposureRefinement:
 
         A keyframe at a place of its own, which hardly sees the map, begins anew as the first keyframe of a map does,
         and so do those after it: the brightness of that place is free, and exposures that were estimated at once would
-        all rise while its Gaussians are young and too dark. Back at an earlier place, they are estimated again.
+        all rise while its Gaussians are young and too dark. Back at an earlier place, they are estimated again. That a
+        place begins is noted without exposures as well.
 
         Args:
             store: The keyframes.
@@ -117,14 +118,12 @@ class ExposureRefinement:
             near: Depth below which nothing is drawn [scene units].
         """
         view, enabled = store[-1], self.settings.enabled
-        if not enabled:
-            return
         unestimated = np.array(IDENTITY) if enabled is True else None
         if len(store) == 1:
             view.exposure = unestimated
             return
         elsewhere = _is_elsewhere(store)
-        estimated = view.exposure is not None or light_changes(store)
+        estimated = bool(enabled) and (view.exposure is not None or light_changes(store))
         if not (estimated or elsewhere):
             return
         small = view.at_level(store.levels)
@@ -133,7 +132,7 @@ class ExposureRefinement:
         if elsewhere and known.mean() < APART:
             view.exposure, view.begins_place = unestimated, True
             return
-        if not (estimated or any(keyframe.exposure is not None for keyframe in store)):
+        if not enabled or not (estimated or any(keyframe.exposure is not None for keyframe in store)):
             return
         before = IDENTITY if view.exposure is None else view.exposure
         if view.exposure is None:

@@ -116,7 +116,7 @@ def keyframes(ids: tuple[int, ...], *exposures: NDArray | None) -> KeyframeStore
 
 
 @pytest.mark.parametrize(("ids", "own"), [((0, 0, 2), True), ((0, 0, 0), False), ((0, 1, 2), False)])
-@pytest.mark.parametrize(("enabled", "begins_with"), [(True, IDENTITY), ("auto", None)])
+@pytest.mark.parametrize(("enabled", "begins_with"), [(True, IDENTITY), ("auto", None), (False, None)])
 def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(
     ids: tuple[int, ...], own: bool, enabled: bool | str, begins_with: NDArray | None
 ) -> None:
