@@ -52,15 +52,15 @@ def test_preparations_are_not_extrapolated() -> None:
 
 
 def test_items_in_bursts_are_estimated_from_all_of_them() -> None:
-    """Of four tasks with ten items each, the third begins with 20 s in which no item is finished."""
+    """Of four tasks with 30 items each, the second begins with 20 s in which no item is finished."""
     clock = Clock()
-    left, recent = TimeLeft(40, clock=clock, recent=1.0), TimeLeft(40, clock=clock)
-    for number, cost in enumerate([20.0, *[0.5] * 9] * 2 + [20.0], 1):
+    left, recent = TimeLeft(120, clock=clock, recent=1.0), TimeLeft(120, clock=clock)
+    for number, cost in enumerate([20.0, *[0.2] * 29, 20.0], 1):
         clock.now += cost
         left.update(number)
         recent.update(number)
-    assert left.seconds() == pytest.approx(19 * 69.0 / 21)
-    assert recent.seconds() == pytest.approx(19 * 20.5 / 2)
+    assert left.seconds() == pytest.approx(89 * 45.8 / 31)
+    assert recent.seconds() == pytest.approx(89 * 20.0)
 
 
 def test_a_resumed_run_counts_only_its_own_items() -> None:
