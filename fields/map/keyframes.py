@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from fields.frames.camera_revision import CameraRevision
 from fields.frames.pyramid import ImageLevel
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
-from fields.geometry.se3 import interpolate_se3
+from fields.geometry.se3 import camera_centres, interpolate_se3
 from fields.map.keyframe import Keyframe, median_depth_of, nbytes_of
 from fields.map.running_median import RunningMedian
 from fields.map.trajectory import Trajectory
 
-__all__ = ["FAR", "KeyframeStore"]
+__all__ = ["KeyframeStore"]
 
 # Distance beyond which a keyframe is of another place [scene depths].
 FAR = 3.0
@@ -178,10 +178,13 @@ class KeyframeStore:
         places = np.flatnonzero(missing <= self.most_missing)
         apart = missing.any() or any(k.begins_place for k in self._keyframes)
         if apart and len(places) and self.latest >= 0:
-            centres = np.array([self._keyframes[place].centre for place in places])
-            distances = np.linalg.norm(centres - self._keyframes[self.latest].centre, axis=1)
-            places = places[distances <= FAR * self.scene_depth]
+            places = places[~self.far([self._keyframes[place] for place in places], [self._keyframes[self.latest]])]
         return places
+
+    def far(self, keyframes: Sequence[Keyframe], views: Sequence[Keyframe]) -> NDArray[np.bool_]:
+        """Return which of the keyframes (K,) are more than FAR away from each of the views."""
+        a, b = (camera_centres(np.array([k.T_camera_world for k in of])) for of in (keyframes, views))
+        return (np.linalg.norm(a[:, None] - b, axis=2) > FAR * self.scene_depth).all(axis=1)
 
     def take_in_depths(self) -> None:
         """Recompute `scene_depth` after median depths have changed."""

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import camera_centres
 from fields.map.keyframe import Keyframe
-from fields.map.keyframes import FAR
 from fields.runtime.engine import ti
 from pipelines.densify.densifier import Densifier
 
@@ -47,10 +45,7 @@ class OtherPlaces:
         store = self._densifier.keyframes
         if not any(keyframe.begins_place for keyframe in store):
             return np.zeros(len(self._densifier.anchors), dtype=bool)
-        centres = camera_centres(np.array([keyframe.T_camera_world for keyframe in store.selected]))
-        far = np.ones(len(centres), dtype=bool)
-        for view in views:
-            far &= np.linalg.norm(centres - view.centre, axis=1) > FAR * store.scene_depth
+        far = store.far(store.selected, views)
         return self._densifier.anchors_at([store.selected[place] for place in np.flatnonzero(far)])
 
     @ti.kernel
