@@ -57,8 +57,8 @@ class Keyframe:
         exposure_m: First moment (3, 4) of Adam on the exposure.
         exposure_v: Second moment (3, 4) of Adam on the exposure.
         exposure_steps: Number of Adam steps of the exposure.
-        begins_place: Whether it is the first keyframe at a place of its own, apart from the map so far. Its exposure is
-            the identity. Places are told apart unless `exposure.enabled` is false.
+        begins_place: Whether it is the first keyframe at a place of its own, apart from the map so far. Steps change
+            neither its pose nor its exposure, which is the identity.
         pending_motion: Similarity (4, 4) of the world around the keyframe, by the tracker's corrections, that its
             Gaussians have not followed yet.
         is_between: Whether it is a frame between keyframes. The map is optimised on it as on a keyframe, but gets only

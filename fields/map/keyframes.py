@@ -16,7 +16,7 @@ from fields.map.keyframe import Keyframe, median_depth_of, nbytes_of
 from fields.map.running_median import RunningMedian
 from fields.map.trajectory import Trajectory
 
-__all__ = ["KeyframeStore"]
+__all__ = ["FAR", "KeyframeStore"]
 
 # Distance beyond which a keyframe is of another place [scene depths].
 FAR = 3.0

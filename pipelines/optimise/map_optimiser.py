@@ -100,9 +100,9 @@ class MapOptimiser:
         """Make Adam steps on the views, one for each batch.
 
         Updates the Gaussians, the errors of the keyframes, their poses and, where estimated, their exposures. Pose and
-        exposure of the first keyframe are fixed, and the exposure of the first one of each further place. On a GPU, the
-        host does not wait for the device: errors and PSNR lag by one step (NaN at first), and a pose is updated before
-        its keyframe is rendered again. `settle` applies all pending results.
+        exposure of the first keyframe are fixed, and those of the first one of each further place. On a GPU, the host
+        does not wait for the device: errors and PSNR lag by one step (NaN at first), and a pose is updated before its
+        keyframe is rendered again. `settle` applies all pending results.
 
         Args:
             store: The keyframes.
@@ -172,9 +172,10 @@ class MapOptimiser:
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
             self.renderer.backward()
             seen.append((view, values))
-            if pose_rate > 0 and j > 0:
+            begins = j == 0 or view.begins_place
+            if pose_rate > 0 and not begins:
                 pose_gradients.setdefault(j, []).append(self.renderer.async_camera_gradient())
-            if view.exposure is not None and j > 0 and not view.begins_place:
+            if view.exposure is not None and not begins:
                 exposure_gradients.setdefault(j, []).append(self.renderer.async_exposure_gradient())
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         self.before_update([view for view, _ in seen])

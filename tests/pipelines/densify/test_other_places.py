@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from fields.runtime.backend import initialise
@@ -33,6 +34,23 @@ def test_a_step_on_views_of_both_places_optimises_both(mapper: OnlineMapper) -> 
         update={"optimise": mapper.settings.optimise.model_copy(update={"batch": 2})}
     )
     assert min(shares(mapper, [1, 2])) > 0.5
+
+
+@pytest.mark.parametrize(("apart", "largest"), [(True, 1.0), (False, 2.0)])
+def test_no_gaussian_in_view_reaches_from_one_place_to_the_next(
+    mapper: OnlineMapper, apart: bool, largest: float
+) -> None:
+    mapper.keyframes[2].begins_place = apart
+    depth, state, anchor = mapper.keyframes.scene_depth, mapper.gaussians.to_numpy(), mapper.gaussians.anchors()
+    giants = np.arange(len(mapper.gaussians)) % 7 == 0
+    state["log_scale"][giants, 1] = np.log(2.0 * depth)
+    mapper.gaussians.load(state | {"anchor": anchor})
+    seen = giants & changed(mapper, [2, 3])
+    # Those that the views must not change otherwise are among them.
+    assert (seen & (anchor == 0)).any()
+    assert (seen & (anchor == 2)).any()
+    sizes = np.exp(mapper.gaussians.to_numpy()["log_scale"][seen].max(axis=1)) / depth
+    assert sizes.max() == pytest.approx(largest, rel=0.1)
 
 
 def test_in_a_map_of_one_place_nothing_is_held(mapper: OnlineMapper) -> None:

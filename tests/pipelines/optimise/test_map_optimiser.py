@@ -148,6 +148,16 @@ def test_poses_move_only_where_asked_and_the_first_never(optimiser: MapOptimiser
     np.testing.assert_array_equal(store[2].T_tracked, tracked)
 
 
+def test_the_pose_of_the_first_keyframe_of_a_place_is_fixed(optimiser: MapOptimiser, store: KeyframeStore) -> None:
+    store[1].begins_place = True
+    before = [view.T_camera_world for view in store]
+    views = list(range(len(store)))
+    optimiser.step(store, views, optimiser.rates(store.scene_depth), pose_rate=0.1)
+    optimiser.settle()
+    moved = [not np.array_equal(view.T_camera_world, T) for view, T in zip(store, before, strict=True)]
+    assert moved == [False, False, *[True] * (len(store) - 2)]
+
+
 def test_steps_bring_the_render_to_the_image(optimiser: MapOptimiser, store: KeyframeStore) -> None:
     before = optimiser.compare(store[0], store.scene_depth)
     rates = optimiser.rates(store.scene_depth)
