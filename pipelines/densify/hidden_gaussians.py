@@ -24,8 +24,8 @@ class HiddenGaussians:
     """Sweeps over the keyframes, a few at a time or all at once, and then removes what hardly showed in any of them.
 
     A sweep spares the Gaussians that were placed in the `YOUNG` keyframes before it or while it went on. It leaves out
-    keyframes that see much of what lies on disk, and spares what they placed, so that its time does not grow with a map
-    that is larger than memory.
+    keyframes that are far away or see much of what lies on disk, and spares what they placed, so that its time does not
+    grow with a map that is larger than memory.
 
     Args:
         contribution: Measures how much of each Gaussian shows.
@@ -103,10 +103,11 @@ class HiddenGaussians:
         self._left_out = []
 
     def _near(self, views: Sequence[Keyframe]) -> list[Keyframe]:
-        """Return the views that are near. The others are left out."""
-        most = self._densifier.keyframes.most_missing
-        self._left_out += [view for view in views if view.missing > most]
-        return [view for view in views if view.missing <= most]
+        """Return the views that are near, see `KeyframeStore.near`. The others are left out."""
+        store = self._densifier.keyframes
+        near = {store[place].index for place in store.near().tolist()}
+        self._left_out += [view for view in views if view.index not in near]
+        return [view for view in views if view.index in near]
 
     def _measure(self, views: Iterable[Keyframe], near: float, level: int) -> None:
         """Measure views, each with all that it sees."""
