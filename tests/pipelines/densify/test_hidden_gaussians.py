@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
+from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.densify.hidden_gaussians import HiddenGaussians
 from pipelines.online import OnlineMapper
 from pipelines.pace import CompletePace, Plan
 from pipelines.settings import MappingSettings
+from tests.pipelines.two_walls import APART, moved
 from tests.pipelines.wall import frame
 
 SETTINGS = MappingSettings(densify={"warm_up": 2, "prune_every": 3})
@@ -83,14 +86,18 @@ def test_a_map_is_never_swept_where_the_settings_say_so(taichi_on_the_cpu: None)
     assert mapper.renderer.view_renders - renders <= 1 + SETTINGS.views.per_step
 
 
-def sweeps(missing: list[int], already: int = 0) -> dict[int, list[int]]:
+def sweeps(missing: list[int], already: int = 0, apart: int | None = None) -> dict[int, list[int]]:
     """The keyframes that are swept when each comes, of a growing map without Gaussians.
 
     Args:
         missing: Gaussians on disk that each keyframe sees, of which 10 are few.
         already: Number of keyframes that come with a finished map.
+        apart: Number of keyframes at the first place, if another one far away follows.
     """
-    store = SimpleNamespace(selected=[], most_missing=10)
+    store = KeyframeStore()
+    store.most_missing = 10
+    one = frame(0)
+    there = moved(one, APART)
     none = np.zeros(0, dtype=np.int32)
     gaussians = SimpleNamespace(anchors=lambda: none, coverages=lambda: none, remove=lambda kept: 0)
     densifier = SimpleNamespace(
@@ -103,12 +110,13 @@ def sweeps(missing: list[int], already: int = 0) -> dict[int, list[int]]:
     paging = SimpleNamespace(away=away, gather=lambda views: None)
     measured: list[int] = []
     contribution = SimpleNamespace(
-        begin=measured.clear, measure=lambda views, near, level: measured.extend(view.number for view in views)
+        begin=measured.clear, measure=lambda views, near, level: measured.extend(view.index for view in views)
     )
     hidden = HiddenGaussians(contribution, densifier, paging, 0.5)  # pyright: ignore[reportArgumentType]
     found = {}
     for number, count in enumerate(missing):
-        store.selected.append(SimpleNamespace(number=number, missing=count))
+        view = store.append(replace(one if apart is None or number < apart else there, index=number))
+        view.missing, view.begins_place = count, number == apart
         if number >= already:
             measured.clear()
             hidden.sweep_when_due(0.1)
@@ -126,6 +134,14 @@ def test_far_keyframes_are_left_out_and_make_sweeps_no_rarer() -> None:
     found = sweeps([10] * 5 + [11] * 95 + [0] * 200)
     assert list(found) == [64, 96, 128, 160, 193, 242]
     assert found[160] == [*range(5), *range(100, 160)]
+
+
+def test_at_a_place_apart_its_own_keyframes_are_swept() -> None:
+    """Nothing lies on disk: what the others see is in memory, as it is in a large pool."""
+    found = sweeps([0] * 300, apart=150)
+    assert list(found) == [64, 96, 144, 216, 249, 299]
+    assert found[144] == list(range(144))
+    assert found[249] == list(range(150, 249))
 
 
 def test_what_a_keyframe_that_is_left_out_has_placed_stays(taichi_on_the_cpu: None) -> None:
