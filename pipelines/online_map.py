@@ -85,7 +85,8 @@ class OnlineMap(Pipeline):
         self.budget = self.densifier.budget
         self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
         self.optimiser.before_views = self.paging.gather
-        self.optimiser.before_update = OtherPlaces(self.densifier).hold
+        places = OtherPlaces(self.densifier)
+        self.optimiser.before_step, self.optimiser.before_update = places.look, places.hold
         contribution = Contribution(self.gaussians, self.renderer)
         self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
         self.transients = None

@@ -16,7 +16,7 @@ from fields.map.keyframe import Keyframe, median_depth_of, nbytes_of
 from fields.map.running_median import RunningMedian
 from fields.map.trajectory import Trajectory
 
-__all__ = ["FAR", "KeyframeStore"]
+__all__ = ["FAR", "KeyframeStore", "centres_of"]
 
 # Distance beyond which a keyframe is of another place [scene depths].
 FAR = 3.0
@@ -178,13 +178,14 @@ class KeyframeStore:
         places = np.flatnonzero(missing <= self.most_missing)
         apart = missing.any() or any(k.begins_place for k in self._keyframes)
         if apart and len(places) and self.latest >= 0:
-            places = places[~self.far([self._keyframes[place] for place in places], [self._keyframes[self.latest]])]
+            centres = centres_of([self._keyframes[place] for place in places])
+            places = places[~self.far(centres, [self._keyframes[self.latest]])]
         return places
 
-    def far(self, keyframes: Sequence[Keyframe], views: Sequence[Keyframe]) -> NDArray[np.bool_]:
-        """Return which of the keyframes (K,) are more than FAR away from each of the views."""
-        a, b = (camera_centres(np.array([k.T_camera_world for k in of])) for of in (keyframes, views))
-        return (np.linalg.norm(a[:, None] - b, axis=2) > FAR * self.scene_depth).all(axis=1)
+    def far(self, centres: NDArray[np.float64], views: Sequence[Keyframe]) -> NDArray[np.bool_]:
+        """Return which of the camera centres (K, 3) are more than FAR away from each of the views."""
+        distance = np.linalg.norm(centres[:, None] - centres_of(views), axis=2)
+        return (distance > FAR * self.scene_depth).all(axis=1)
 
     def take_in_depths(self) -> None:
         """Recompute `scene_depth` after median depths have changed."""
@@ -266,3 +267,8 @@ class KeyframeStore:
             nearest = a if index - a.index < b.index - index else b
             return nearest, nearest, 0.0
         return a, b, (index - a.index) / (b.index - a.index)
+
+
+def centres_of(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
+    """Return the camera centres (K, 3) of keyframes in the world frame."""
+    return camera_centres(np.array([keyframe.T_camera_world for keyframe in keyframes]))

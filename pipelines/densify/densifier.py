@@ -122,10 +122,15 @@ class Densifier:
 
     def anchors_at(self, keyframes: Iterable[Keyframe]) -> NDArray[np.bool_]:
         """Return whether each anchor (A,) is one of these keyframes, or a frame after it and before the next one."""
+        wanted = np.isin(
+            [keyframe.index for keyframe in self.keyframes.selected], [keyframe.index for keyframe in keyframes]
+        )
+        return wanted[self.places_of_anchors()]
+
+    def places_of_anchors(self) -> NDArray[np.int64]:
+        """Return the place (A,) in `KeyframeStore.selected` of each anchor, or of the keyframe before it."""
         selected = [keyframe.index for keyframe in self.keyframes.selected]
-        wanted = np.isin(selected, [keyframe.index for keyframe in keyframes])
-        places = np.searchsorted(selected, [anchor.keyframe.index for anchor in self.anchors], side="right") - 1
-        return wanted[places]
+        return np.searchsorted(selected, [anchor.keyframe.index for anchor in self.anchors], side="right") - 1
 
     def restart_voxels(
         self,

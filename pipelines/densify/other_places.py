@@ -4,10 +4,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fields.map.keyframe import Keyframe
-from fields.map.keyframes import FAR
+from fields.map.keyframes import FAR, centres_of
 from fields.runtime.engine import ti
 from pipelines.densify.densifier import Densifier
 
@@ -33,26 +32,34 @@ class OtherPlaces:
     def __init__(self, densifier: Densifier) -> None:
         self.gaussians = densifier.gaussians
         self._densifier = densifier
+        self._centres = np.zeros((0, 3))
+        self._places = np.zeros(0, dtype=np.int64)
+
+    def look(self) -> None:
+        """Note where the keyframes are that have placed Gaussians. Call it before each step.
+
+        Does nothing, like `hold`, if the map has no places apart, see `KeyframeStore.place_begins`.
+        """
+        if self._has_places:
+            self._centres = centres_of(self._densifier.keyframes.selected)
+            self._places = self._densifier.places_of_anchors()
 
     def hold(self, views: Sequence[Keyframe]) -> None:
         """Limit the size of Gaussians with gradients, and clear the gradients of those far from each of the views.
 
-        A Gaussian is far if the view that placed it is. Does nothing if the map has no places apart, see
-        `KeyframeStore.place_begins`.
+        A Gaussian is far if the view that placed it is.
 
         Args:
             views: The views of an Adam step, whose gradients have been accumulated.
         """
-        store = self._densifier.keyframes
-        if self.gaussians.count and any(keyframe.begins_place for keyframe in store):
-            held = self._held(views).astype(np.int32)
-            self._hold(self.gaussians.count, held, float(np.log(LARGEST * store.scene_depth)))
+        if self.gaussians.count and self._has_places:
+            store = self._densifier.keyframes
+            held = store.far(self._centres, views)[self._places]
+            self._hold(self.gaussians.count, held.astype(np.int32), float(np.log(LARGEST * store.scene_depth)))
 
-    def _held(self, views: Sequence[Keyframe]) -> NDArray[np.bool_]:
-        """Return which anchors (A,) are far from each of the views."""
-        store = self._densifier.keyframes
-        far = store.far(store.selected, views)
-        return self._densifier.anchors_at([store.selected[place] for place in np.flatnonzero(far)])
+    @property
+    def _has_places(self) -> bool:
+        return any(keyframe.begins_place for keyframe in self._densifier.keyframes)
 
     @ti.kernel
     def _hold(self, count: ti.i32, held: ti.types.ndarray(dtype=ti.i32, ndim=1), largest: ti.f32):

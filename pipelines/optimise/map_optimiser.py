@@ -34,6 +34,7 @@ class MapOptimiser:
         settings: Settings of the mapping.
 
     Attributes:
+        before_step: Called before each step.
         before_views: Called with the views of each Adam step before they are rendered.
         before_update: Called with them when all gradients are known, before the Gaussians are updated.
     """
@@ -53,6 +54,7 @@ class MapOptimiser:
         self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
         self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
+        self.before_step: Callable[[], None] = lambda: None
         self.before_views: Callable[[list[Keyframe]], None] = lambda views: None
         self.before_update: Callable[[list[Keyframe]], None] = lambda views: None
 
@@ -114,6 +116,7 @@ class MapOptimiser:
         Returns:
             Mean PSNR of the views.
         """
+        self.before_step()
         size = self.settings.optimise.batch
         seen: list[tuple[Keyframe, LossValues]] = []
         for first in range(0, len(views), size):
