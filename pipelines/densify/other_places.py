@@ -22,8 +22,8 @@ class OtherPlaces:
 
     While a map is young at a place apart, Gaussians of other places show through its holes. A step would have them grow
     until they fill these: a Gaussian of redkitchen grew from 0.2 to 9.5 scene depths within ten keyframes of a copy 15
-    depths away, and its own views lost up to 7 dB. Those that fill a hole of their own place grow as well, but no view
-    beyond shows that they are wrong. One of 4.2 scene depths veiled the copy beside it, which lost 0.7 dB.
+    depths away, and its own views lost up to 7 dB. Gaussians also grow until they fill a hole at their own place, where
+    no view may show that they are too large: one of 4.2 scene depths veiled the copy beside it, which lost 0.7 dB.
 
     Args:
         densifier: Owner of the map's Gaussians and keyframes, and of the anchors.
