@@ -75,6 +75,11 @@ class KeyframeStore:
         """Index of the frame with which the latest place of its own began; 0 if there is none, see `begins_place`."""
         return max((k.index for k in self._keyframes if k.begins_place), default=0)
 
+    @property
+    def has_places(self) -> bool:
+        """Whether a further place has begun apart from the first one, see `begins_place`."""
+        return any(k.begins_place for k in self._keyframes)
+
     def bytes_of(self, frame: TrackedFrame) -> int:
         """Return the number of bytes that a frame would take as a keyframe."""
         return nbytes_of(self._kept(frame, self.levels), frame.points)
@@ -176,8 +181,7 @@ class KeyframeStore:
         """
         missing = np.fromiter((k.missing for k in self._keyframes), np.int64, len(self._keyframes))
         places = np.flatnonzero(missing <= self.most_missing)
-        apart = missing.any() or any(k.begins_place for k in self._keyframes)
-        if apart and len(places) and self.latest >= 0:
+        if (missing.any() or self.has_places) and len(places) and self.latest >= 0:
             centres = centres_of([self._keyframes[place] for place in places])
             places = places[~self.far(centres, [self._keyframes[self.latest]])]
         return places

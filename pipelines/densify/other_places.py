@@ -38,10 +38,11 @@ class OtherPlaces:
     def look(self) -> None:
         """Note where the keyframes are that have placed Gaussians. Call it before each step.
 
-        Does nothing, like `hold`, if the map has no places apart, see `KeyframeStore.place_begins`.
+        Does nothing, like `hold`, if the map has no places apart, see `KeyframeStore.has_places`.
         """
-        if self._has_places:
-            self._centres = centres_of(self._densifier.keyframes.selected)
+        store = self._densifier.keyframes
+        if store.has_places:
+            self._centres = centres_of(store.selected)
             self._places = self._densifier.places_of_anchors()
 
     def hold(self, views: Sequence[Keyframe]) -> None:
@@ -52,14 +53,10 @@ class OtherPlaces:
         Args:
             views: The views of an Adam step, whose gradients have been accumulated.
         """
-        if self.gaussians.count and self._has_places:
-            store = self._densifier.keyframes
+        store = self._densifier.keyframes
+        if self.gaussians.count and store.has_places:
             held = store.far(self._centres, views)[self._places]
             self._hold(self.gaussians.count, held.astype(np.int32), float(np.log(LARGEST * store.scene_depth)))
-
-    @property
-    def _has_places(self) -> bool:
-        return any(keyframe.begins_place for keyframe in self._densifier.keyframes)
 
     @ti.kernel
     def _hold(self, count: ti.i32, held: ti.types.ndarray(dtype=ti.i32, ndim=1), largest: ti.f32):
