@@ -14,14 +14,15 @@ class ProjectedGaussians:
 
     Attributes:
         gaussian: Index in the `GaussianField`. On the CPU it increases with the slot, so that memory is read in order.
+        slot: Slot of each Gaussian, -1 for none. On the CPU only.
         order: The slots, nearest first. On a GPU, the slots are in that order themselves.
         mean: Pixel position (2).
         conic: Inverse 2D covariance (3) as (xx, xy, yy) [1/px^2].
         opacity: Opacity after the anti-aliasing compensation.
         colour: Colour (3) as seen from the view.
         depth: z in the camera frame [scene units].
-        tangent: Camera tangent xi = 0 (6), one copy per slot, so that its gradient is gathered without contention and
-            in a fixed order.
+        tangent: Camera tangent xi = 0 (6), one copy per Gaussian on the CPU and per slot on a GPU, so that its gradient
+            is gathered without contention and in a fixed order.
         first_pair: Index of the slot's first tile pair.
         end_pair: Index after the slot's last tile pair.
         seen: Number of slots, as read by kernels.
@@ -34,6 +35,7 @@ class ProjectedGaussians:
         self.count = 0
         self.seen = ti.field(ti.i32)
         self.gaussian = ti.field(ti.i32)
+        self.slot = ti.field(ti.i32)
         self.order = ti.field(ti.i32)
         self.first_pair = ti.field(ti.i32)
         self.end_pair = ti.field(ti.i32)
@@ -49,4 +51,4 @@ class ProjectedGaussians:
         blocks.dense(ti.i, BLOCK).place(*composited)
         blocks.dense(ti.i, BLOCK).place(*(f.grad for f in composited))
         blocks.dense(ti.i, BLOCK).place(self.tangent, self.tangent.grad)
-        blocks.dense(ti.i, BLOCK).place(self.gaussian, self.order, self.first_pair, self.end_pair)
+        blocks.dense(ti.i, BLOCK).place(self.gaussian, self.slot, self.order, self.first_pair, self.end_pair)

@@ -2,6 +2,7 @@
 # pyright: reportInvalidTypeForm=false
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from fields.map.gaussians import SH_C0
 from fields.runtime.engine import ti
 
-__all__ = ["evaluate_sh", "sh_basis", "sh_rotation"]
+__all__ = ["add_sh_gradient", "evaluate_sh", "sh_basis", "sh_rotation"]
 
 # Number of directions in the fit of a rotation matrix, more than the 16 harmonics.
 DIRECTIONS = 64
@@ -61,6 +62,13 @@ def evaluate_sh(degree: ti.template(), sh: ti.template(), i, d):
     return SH_C0 * sh[i, 0] + band1 + band2 + band3
 
 
+@ti.func
+def add_sh_gradient(degree: ti.template(), sh_grad: ti.template(), i, d, g):
+    """Add d loss / d coefficients to sh_grad[i, k] (3), given d loss / d `evaluate_sh`, g (3), in direction d (3)."""
+    for k, function in ti.static(enumerate(_functions(degree, d[0], d[1], d[2]))):
+        sh_grad[i, k] = sh_grad[i, k] + function * g  # no atomic, since the caller has each i once
+
+
 def sh_basis(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Evaluate the harmonics in NumPy, see `evaluate_sh`.
 
@@ -71,10 +79,15 @@ def sh_basis(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64
     Returns:
         Basis functions (N, K), K = (degree + 1)^2.
     """
-    x, y, z = directions.T
+    functions = _functions(degree, *directions.T)
+    return np.stack([np.broadcast_to(function, len(directions)) for function in functions], axis=1)
+
+
+def _functions(degree: int, x: Any, y: Any, z: Any) -> list[Any]:
+    """Basis functions in the unit direction (x, y, z), which is of NumPy arrays or of expressions in a kernel."""
     xx, yy, zz = x * x, y * y, z * z
     bands = [
-        [np.full(len(x), SH_C0)],
+        [SH_C0],
         [0.4886025119029199 * b for b in (-y, z, -x)],
         [
             1.0925484305920792 * x * y,
@@ -93,7 +106,7 @@ def sh_basis(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64
             -0.5900435899266435 * x * (xx - 3.0 * yy),
         ],
     ]
-    return np.stack([b for band in bands[: degree + 1] for b in band], axis=1)
+    return [function for band in bands[: degree + 1] for function in band]
 
 
 def sh_rotation(degree: int, rotation: NDArray[np.float64]) -> NDArray[np.float64]:

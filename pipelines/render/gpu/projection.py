@@ -1,5 +1,5 @@
 """Projection on a GPU: depths are sorted on the device, and the number of visible Gaussians is known only there."""
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import numpy as np
 import torch
@@ -24,7 +24,11 @@ BLOCKS = 64
 
 @ti.data_oriented
 class DeviceProjection(Projection):
-    """Culls, sorts and projects `gaussians` into `projected`, with the differentiable kernels of the CPU."""
+    """Culls, sorts and projects `gaussians` into `projected`, with the formulas of the CPU.
+
+    The differentiable loops go over slots, which come in the order of depth: a GPU adds to gradients with atomics that
+    cost it little.
+    """
 
     def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
         self.gaussians = gaussians
@@ -33,7 +37,9 @@ class DeviceProjection(Projection):
         self._depths = torch.empty(0, dtype=torch.float32, device=torch_device())
         self._cull, self._assign = CompiledKernel(self._cull_all), CompiledKernel(self._assign_sorted)
         self._sum_tangents = CompiledKernel(self._sum_all_tangents)
-        self._prepare_differentiable()
+        self._project, self._project_back = (CompiledKernel(self._project_slots, reverse) for reverse in (False, True))
+        self._shade, self._shade_back = (CompiledKernel(self._shade_slots, reverse) for reverse in (False, True))
+        self._clear = CompiledKernel(self._clear_tangent_gradients)
         self._tangents = torch.zeros((BLOCKS, 6), dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
@@ -53,9 +59,15 @@ class DeviceProjection(Projection):
         # A stable sort keeps Gaussians of equal depth in order.
         ordered, gaussian = torch.sort(depths, stable=True)
         self._assign(ordered, gaussian)
-        self._project(n)
-        self._shade(n)
+        self._project()
+        self._shade()
         return n
+
+    def backward(self) -> None:
+        if self.projected.count:
+            self._clear()
+            self._shade_back()
+            self._project_back()
 
     def camera_gradient(self) -> np.ndarray:
         """Return d loss / d xi (6,) of T_camera_world, summed over slots in a fixed order. Waits for the device."""
@@ -90,6 +102,22 @@ class DeviceProjection(Projection):
                     self.projected.seen[None] = s + 1
             elif s == 0:
                 self.projected.seen[None] = 0
+
+    @ti.kernel
+    def _project_slots(self):
+        for s in range(self.projected.seen[None]):
+            self._project_one(self.projected.gaussian[s], s, s)
+
+    @ti.kernel
+    def _shade_slots(self):
+        for s in range(self.projected.seen[None]):
+            self._shade_one(self.projected.gaussian[s], s, s)
+
+    @ti.kernel
+    def _clear_tangent_gradients(self):
+        for s in range(self.projected.seen[None]):
+            self.projected.tangent.grad[s].fill(0.0)
+            self.gaussians.touched[self.projected.gaussian[s]] = 1
 
     @ti.kernel
     def _sum_all_tangents(self, out: ti.types.ndarray(dtype=ti.f32, ndim=2)):
