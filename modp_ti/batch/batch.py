@@ -158,6 +158,10 @@ class _Batch:
         except InputError as problem:
             here, error = False, str(problem)
         if here:
+            if answer.traceback:
+                self._table.note(
+                    f"{name}: {answer.error}, after its files were complete: see {LOGS}/{name}.traceback.txt"
+                )
             self._end(name, State.finished)
         elif answer.end is End.interrupted:
             self._end(name, State.waiting)

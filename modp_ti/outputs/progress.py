@@ -168,14 +168,14 @@ class ProgressLine:
             self._progress = None
 
     def summary(self, metrics: dict) -> None:
-        """Print the run's result in one line."""
+        """Print the run's result in one line. A run without scores has none there."""
         scores = metrics["refined"] or metrics["online"] or metrics["offline"]
         which = "held_out" if scores["held_out"]["count"] else "all"
-        lpips = scores[which]["lpips"]
+        psnr, ssim, lpips = (scores[which][name] for name in ("psnr", "ssim", "lpips"))
         self.note(
             f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {metrics['gaussians']:,} Gaussians, "
-            f"{metrics['frames_per_second']:.2f} frames/s; {which.replace('_', '-')} "
-            f"PSNR {scores[which]['psnr']:.2f} dB, SSIM {scores[which]['ssim']:.3f}"
+            f"{metrics['frames_per_second']:.2f} frames/s"
+            + ("" if psnr is None else f"; {which.replace('_', '-')} PSNR {psnr:.2f} dB, SSIM {ssim:.3f}")
             + ("" if lpips is None else f", LPIPS {lpips:.3f}")
         )
 

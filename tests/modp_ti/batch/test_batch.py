@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,9 +20,9 @@ from modp_ti.batch.results import State
 from modp_ti.batch.scenes import read_scenes, with_store
 from modp_ti.commands.app import app
 from modp_ti.files.errors import InputError
-from modp_ti.tasks import Resources
+from modp_ti.tasks import Ended, Resources, Running
 from modp_ti.tasks.local import LocalEngine
-from modp_ti.tasks.task import Work
+from modp_ti.tasks.task import Answer, End, Work
 from tests.modp_ti.batch.dying import lose_machine_once
 
 SAME = ("splats.ply", "trajectory.txt", "frames.json", "scores.csv")
@@ -44,6 +46,14 @@ class LosingEngine(LocalEngine):
         if name == scene:
             work = partial(lose_machine_once, work, 3, died, output)
         super().submit(name, work, resources)
+
+
+class FaultyEngine(LocalEngine):
+    """Its calls fail after they have done all."""
+
+    def events(self, wait: float) -> list[Running | Ended]:
+        fault = Answer(End.fault, error="a fault of the program (KeyError('x'))", traceback="KeyError: 'x'")
+        return [replace(event, answer=fault) if isinstance(event, Ended) else event for event in super().events(wait)]
 
 
 @pytest.fixture
@@ -132,6 +142,16 @@ def test_the_command_says_which_scenes_are_finished_by_its_exit_code(recordings:
         ("done", "finished before"),
         ("gone.yaml", "failed"),
     ]
+
+
+def test_a_fault_after_a_scene_is_finished_is_told(recordings: Path) -> None:
+    console = Console(file=io.StringIO(), width=200)
+    with FaultyEngine(jobs=1) as engine:
+        results = run_batch(read_scenes(scene_files(recordings)[1:2]), engine, recordings / "batch", console=console)
+    assert [result.state for result in results] == [State.finished]
+    said = "new: a fault of the program (KeyError('x')), after its files were complete: see logs/new.traceback.txt"
+    assert said in console.file.getvalue()
+    assert (recordings / "batch" / "logs" / "new.traceback.txt").read_text() == "KeyError: 'x'"
 
 
 def test_scenes_with_other_settings_are_not_taken_for_finished(recordings: Path) -> None:

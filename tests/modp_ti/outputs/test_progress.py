@@ -129,3 +129,16 @@ def test_who_watches_is_told_every_change_of_a_stage() -> None:
         ("mapping", 2, 3),
     ]
     assert "1,200 Gaussians  20.50 dB" in told[2].state and str(told[1]) == "mapping 0/2"
+
+
+@pytest.mark.parametrize(
+    ("count", "said"), [(2, "; held-out PSNR 25.00 dB, SSIM 0.900, LPIPS 0.100\n"), (0, ", 1.50 frames/s\n")]
+)
+def test_a_run_without_scores_ends_in_a_line_without_them(count: int, said: str) -> None:
+    scores = dict(zip(("psnr", "ssim", "lpips"), (25.0, 0.9, 0.1) if count else (None, None, None), strict=True))
+    stage = {"held_out": scores | {"count": count}, "all": scores | {"count": count}}
+    metrics = {"frames": 3, "keyframes": 2, "gaussians": 1200, "frames_per_second": 1.5, "refined": None}
+    console = Console(file=io.StringIO(), width=200)
+    ProgressLine(console).summary(metrics | {"online": stage, "offline": None})
+    assert console.file.getvalue().startswith("3 frames, 2 keyframes, 1,200 Gaussians, 1.50 frames/s")
+    assert console.file.getvalue().endswith(said)

@@ -59,6 +59,7 @@ def test_two_parts_make_one_map(scene: Path, monkeypatch: pytest.MonkeyPatch) ->
     out = scene.parent / "out"
     said = invoke(scene, "--parts", "2")
     assert "part-1: finished" in said and "merging the maps of 2 parts" in said
+    assert not list(out.rglob("*.traceback.txt"))
 
     # The output folder is that of an ordinary run, with the parts below it.
     assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "parts"])
