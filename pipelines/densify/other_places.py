@@ -46,9 +46,10 @@ class OtherPlaces:
             self._places = self._densifier.places_of_anchors()
 
     def hold(self, views: Sequence[Keyframe]) -> None:
-        """Limit the size of Gaussians with gradients, and clear the gradients of those far from each of the views.
+        """Limit the size of the Gaussians in memory, and clear the gradients of those far from each of the views.
 
-        A Gaussian is far if the view that placed it is.
+        A Gaussian is far if the view that placed it is. Sizes are limited as soon as a second place begins, not when a
+        view of that place first shows a Gaussian, so that what the camera has left stays as it was.
 
         Args:
             views: The views of an Adam step, whose gradients have been accumulated.
@@ -61,8 +62,8 @@ class OtherPlaces:
     @ti.kernel
     def _hold(self, count: ti.i32, held: ti.types.ndarray(dtype=ti.i32, ndim=1), largest: ti.f32):
         for i in range(count):
+            self.gaussians.log_scale[i] = ti.min(self.gaussians.log_scale[i], largest)
             if self.gaussians.touched[i] != 0:
-                self.gaussians.log_scale[i] = ti.min(self.gaussians.log_scale[i], largest)
                 anchor = self.gaussians.anchor[i]
                 if anchor >= 0 and held[ti.max(anchor, 0)] != 0:
                     self.gaussians.touched[i] = 0

@@ -37,19 +37,16 @@ def test_a_step_on_views_of_both_places_optimises_both(mapper: OnlineMapper) -> 
 
 
 @pytest.mark.parametrize(("apart", "largest"), [(True, 1.0), (False, 2.0)])
-def test_no_gaussian_in_view_reaches_from_one_place_to_the_next(
-    mapper: OnlineMapper, apart: bool, largest: float
-) -> None:
+def test_no_gaussian_reaches_from_one_place_to_the_next(mapper: OnlineMapper, apart: bool, largest: float) -> None:
     mapper.keyframes[2].begins_place = apart
     depth, state, anchor = mapper.keyframes.scene_depth, mapper.gaussians.to_numpy(), mapper.gaussians.anchors()
     giants = np.arange(len(mapper.gaussians)) % 7 == 0
     state["log_scale"][giants, 1] = np.log(2.0 * depth)
     mapper.gaussians.load(state | {"anchor": anchor})
-    seen = giants & changed(mapper, [2, 3])
-    # Those that the views must not change otherwise are among them.
-    assert (seen & (anchor == 0)).any()
-    assert (seen & (anchor == 2)).any()
-    sizes = np.exp(mapper.gaussians.to_numpy()["log_scale"][seen].max(axis=1)) / depth
+    changed(mapper, [2, 3])
+    # Among them are some out of view, and some that the views must not change otherwise.
+    assert {0, 2} <= set(anchor[giants])
+    sizes = np.exp(mapper.gaussians.to_numpy()["log_scale"].max(axis=1)) / depth
     assert sizes.max() == pytest.approx(largest, rel=0.1)
 
 
