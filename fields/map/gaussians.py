@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from fields.map.gaussian_arrays import read_numbers, read_values, write_integers, write_reals, write_values
-from fields.runtime.backend import growing, place, refuse_too_many_fields
+from fields.runtime.backend import growing, on_gpu, place, refuse_too_many_fields
 from fields.runtime.engine import ti
 
 __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
@@ -17,22 +17,21 @@ __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
 SH_C0 = 0.28209479177387814
 BLOCK = 1024
 NO_ANCHOR = -1
-# Suffixes of the names of Adam's first and second moments.
-MOMENTS = ("_m", "_v")
+MOMENTS = ("_m", "_v")  # suffixes of the names of Adam's first and second moments
 
 
 @ti.data_oriented
 class GaussianField:
     """Anisotropic Gaussians in the world frame, with their gradients and Adam moments.
 
-    Gaussians are always stored contiguously, at indices 0 to `count - 1`. A Gaussian takes 240 bytes at degree 0 in
-    float32. The SNode tree is pointer(blocks) over dense(1024): memory follows the number of Gaussians, and no kernel
-    is recompiled when the map grows. On a GPU the storage is dense and holds `max_gaussians` from the start. The values
-    have the Taichi type `real`, `ti.f32` or `ti.f64`.
+    Gaussians are stored at indices 0 to `count - 1`; one takes 292 bytes at degree 0 in float32. The SNode tree is
+    pointer(blocks) over dense(1024): memory follows the number of Gaussians, and no kernel is recompiled when the map
+    grows. On a GPU, the storage is dense and holds `max_gaussians` from the start.
 
     Args:
         sh_degree: Degree of the spherical harmonics of colour.
         max_gaussians: Size of the pool, rounded up to a multiple of 1024.
+        real: Taichi type of the values, `ti.f32` or `ti.f64`.
 
     Attributes:
         position: Means (3).
@@ -43,6 +42,7 @@ class GaussianField:
         steps: Number of Adam updates of each Gaussian.
         anchor: Number of the view that placed each Gaussian; NO_ANCHOR if it is not known.
         coverage: Largest coverage of each Gaussian in the views measured so far [px], see `Contribution`.
+        slot, tangent: On the CPU, slot (-1: none) and copy of the camera tangent in a view, see `Projection`.
         count: Number of Gaussians.
         capacity: Size of the pool.
 
@@ -80,15 +80,14 @@ class GaussianField:
         geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
         place(geometry, blocks, BLOCK)
         place([f.grad for f in geometry], blocks, BLOCK)
-        moments = (
-            self.position_m, self.position_v, self.log_scale_m, self.log_scale_v,
-            self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v,
-        )  # fmt: skip
-        place(moments, blocks, BLOCK)
+        place([getattr(self, name + moment) for name in _NAMES[:4] for moment in MOMENTS], blocks, BLOCK)
         place([self.sh], blocks, BLOCK, self.sh_count)
         place([self.sh.grad], blocks, BLOCK, self.sh_count)
         place([self.sh_m, self.sh_v], blocks, BLOCK, self.sh_count)
         place([self.steps, self.anchor, self.touched, self.coverage], blocks, BLOCK)
+        if not on_gpu():
+            self.slot, self.tangent = ti.field(ti.i32), vector(6, True)
+            place([self.slot, self.tangent, self.tangent.grad], blocks, BLOCK)
         builder.dense(ti.i, 2).place(self._caught)
         builder.finalize()
         refuse_too_many_fields(self._caught)
@@ -98,8 +97,9 @@ class GaussianField:
 
     @property
     def bytes_each(self) -> int:
-        """Bytes of one Gaussian: values, gradients, two moments, three integers and the coverage."""
-        return 4 * (11 + 3 * self.sh_count) * np.dtype(self.dtype).itemsize + 4 * 4
+        """Bytes of one Gaussian: all fields, with gradients and moments."""
+        numbers, integers = (0, 4) if on_gpu() else (12, 5)  # tangent and slot
+        return (4 * (11 + 3 * self.sh_count) + numbers) * np.dtype(self.dtype).itemsize + 4 * integers
 
     # ---- growing and shrinking -------------------------------------------------------------------------------
 

@@ -14,6 +14,9 @@ __all__ = ["OtherPlaces"]
 
 # Largest standard deviation of a Gaussian [scene depths]: three of them reach as far as a place.
 LARGEST = FAR / 3.0
+# What a larger one becomes, as a share of it. The scene depth changes as the map grows: what was limited once would
+# otherwise be limited again, by a little, long after the camera has left.
+SHRUNK = 0.8
 
 
 @ti.data_oriented
@@ -62,7 +65,9 @@ class OtherPlaces:
     @ti.kernel
     def _hold(self, count: ti.i32, held: ti.types.ndarray(dtype=ti.i32, ndim=1), largest: ti.f32):
         for i in range(count):
-            self.gaussians.log_scale[i] = ti.min(self.gaussians.log_scale[i], largest)
+            for axis in ti.static(range(3)):
+                if self.gaussians.log_scale[i][axis] > largest:
+                    self.gaussians.log_scale[i][axis] = largest + ti.static(float(np.log(SHRUNK)))
             if self.gaussians.touched[i] != 0:
                 anchor = self.gaussians.anchor[i]
                 if anchor >= 0 and held[ti.max(anchor, 0)] != 0:

@@ -50,7 +50,7 @@ def mapped(memory: float | None, frames: int = FRAMES) -> Mapped:
         [view.index for view in mapper.keyframes],
         mapper.caught(),
         mapper.budget.held(),
-        len(mapper.gaussians) * 240 + images + points + bricks * 256,
+        len(mapper.gaussians) * 292 + images + points + bricks * 256,
         mapper.renderer.view_renders,
     )
 
@@ -69,7 +69,8 @@ def test_a_gaussian_takes_what_its_fields_hold(taichi_on_the_cpu: None, sh_degre
         np.zeros((1, 3)), np.zeros((1, 3)), np.eye(4)[:1], np.zeros(1), np.zeros((1, gaussians.sh_count, 3))
     )
     values = sum(array.nbytes for array in gaussians.to_numpy().values())
-    assert gaussians.bytes_each == 4 * values + 4 * 4
+    # Values, gradients and two moments; four integers; slot, and tangent with its gradient.
+    assert gaussians.bytes_each == 4 * values + 4 * 4 + 4 + 2 * 6 * np.dtype(gaussians.dtype).itemsize
 
 
 def test_the_budget_adds_up_what_the_map_holds(free: Mapped) -> None:

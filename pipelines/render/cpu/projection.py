@@ -49,6 +49,7 @@ class Projection:
         self.gaussians = gaussians
         self.view = view
         self.projected = projected
+        self.tangent = gaussians.tangent
         self._keys = np.zeros(1, dtype=np.uint64)
         self._depths = np.zeros(1, dtype=np.float32)
         self._chunk_counts = np.zeros(1, dtype=np.int32)
@@ -191,11 +192,11 @@ class Projection:
                 bits = ti.cast(ti.bit_cast(depths[i], ti.u32), ti.u64)
                 keys[slot] = (bits << 32) | ti.cast(slot, ti.u64)
                 self.projected.gaussian[slot] = i
-                self.projected.slot[i] = slot
-                self.projected.tangent[i].fill(0.0)
+                self.gaussians.slot[i] = slot
+                self.tangent[i].fill(0.0)
                 slot += 1
             else:
-                self.projected.slot[i] = -1
+                self.gaussians.slot[i] = -1
 
     @ti.kernel
     def _set_sorted(self, alone: ti.template(), count: ti.i32, keys: ti.types.ndarray()):
@@ -212,7 +213,7 @@ class Projection:
         ti.loop_config(serialize=alone)
         for i in range(n):
             ti.stop_grad(self.gaussians.sh)  # `_begin_gradients` adds it: Taichi would use atomics
-            s = self.projected.slot[i]
+            s = self.gaussians.slot[i]
             if s >= 0:
                 self._project_one(i, s, i)
                 self._shade_one(i, s, i)
@@ -220,7 +221,7 @@ class Projection:
     @ti.func
     def _project_one(self, i, s, t):
         """Project Gaussian i to slot s, with the camera tangent t."""
-        xi = self.projected.tangent[t]
+        xi = self.tangent[t]
         rho, omega = ti.Vector([xi[0], xi[1], xi[2]]), ti.Vector([xi[3], xi[4], xi[5]])
         W = self.view.rotation[None]
         focal, limits = self.view.focal[None], self.view.limits[None]
@@ -265,7 +266,7 @@ class Projection:
     @ti.func
     def _direction(self, i, t):
         """Unit vector (3) from the camera to Gaussian i in the world frame, with the camera tangent t."""
-        xi = self.projected.tangent[t]
+        xi = self.tangent[t]
         # Rotating a camera does not move its centre, so only rho changes the direction: W'(p + rho).
         tracked = rotate(self.view.rotation[None], self.gaussians.position[i]) + self.view.translation[None]
         ray = rotate_back(self.view.rotation[None], tracked + ti.Vector([xi[0], xi[1], xi[2]]))
@@ -276,9 +277,9 @@ class Projection:
         """Clear the gradients of the tangents, mark what is seen, and add the gradients of the harmonics."""
         ti.loop_config(serialize=alone)
         for i in range(n):
-            s = self.projected.slot[i]
+            s = self.gaussians.slot[i]
             if s >= 0:
-                self.projected.tangent.grad[i].fill(0.0)
+                self.tangent.grad[i].fill(0.0)
                 self.gaussians.touched[i] = 1
                 colour, gradient = self.projected.colour[s], self.projected.colour.grad[s]
                 for c in ti.static(range(3)):
@@ -298,6 +299,6 @@ class Projection:
     def _sum_tangents_chunk(self, chunk, count, partial: ti.template()):
         total = ti.Vector.zero(self.projected.real, 6)
         for s in range(chunk * CHUNK, ti.min(count, (chunk + 1) * CHUNK)):
-            total += self.projected.tangent.grad[self.projected.gaussian[s]]
+            total += self.tangent.grad[self.projected.gaussian[s]]
         for c in ti.static(range(6)):
             partial[chunk, c] = total[c]

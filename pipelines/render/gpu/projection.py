@@ -34,6 +34,7 @@ class DeviceProjection(Projection):
         self.gaussians = gaussians
         self.view = view
         self.projected = projected
+        self.tangent = projected.tangent
         self._depths = torch.empty(0, dtype=torch.float32, device=torch_device())
         self._cull, self._assign = CompiledKernel(self._cull_all), CompiledKernel(self._assign_sorted)
         self._sum_tangents = CompiledKernel(self._sum_all_tangents)
@@ -97,7 +98,7 @@ class DeviceProjection(Projection):
         for s in range(n):
             if depths[s] < UNSEEN:
                 self.projected.gaussian[s] = ti.cast(gaussian[s], ti.i32)
-                self.projected.tangent[s].fill(0.0)
+                self.tangent[s].fill(0.0)
                 if s + 1 == n or depths[ti.min(s + 1, n - 1)] >= UNSEEN:
                     self.projected.seen[None] = s + 1
             elif s == 0:
@@ -116,7 +117,7 @@ class DeviceProjection(Projection):
     @ti.kernel
     def _clear_tangent_gradients(self):
         for s in range(self.projected.seen[None]):
-            self.projected.tangent.grad[s].fill(0.0)
+            self.tangent.grad[s].fill(0.0)
             self.gaussians.touched[self.projected.gaussian[s]] = 1
 
     @ti.kernel
@@ -127,7 +128,7 @@ class DeviceProjection(Projection):
             partial = ti.simt.block.SharedArray((6 * THREADS,), ti.f32)
             total = ti.Vector.zero(ti.f32, 6)
             for k in range((self.projected.seen[None] - first + BLOCKS * THREADS - 1) // (BLOCKS * THREADS)):
-                total += self.projected.tangent.grad[first + k * BLOCKS * THREADS]
+                total += self.tangent.grad[first + k * BLOCKS * THREADS]
             for c in ti.static(range(6)):
                 partial[c * THREADS + thread] = total[c]
             sum_over_block(partial, thread, 6)

@@ -36,7 +36,7 @@ def test_a_step_on_views_of_both_places_optimises_both(mapper: OnlineMapper) -> 
     assert min(shares(mapper, [1, 2])) > 0.5
 
 
-@pytest.mark.parametrize(("apart", "largest"), [(True, 1.0), (False, 2.0)])
+@pytest.mark.parametrize(("apart", "largest"), [(True, 0.8), (False, 2.0)])
 def test_no_gaussian_reaches_from_one_place_to_the_next(mapper: OnlineMapper, apart: bool, largest: float) -> None:
     mapper.keyframes[2].begins_place = apart
     depth, state, anchor = mapper.keyframes.scene_depth, mapper.gaussians.to_numpy(), mapper.gaussians.anchors()
@@ -48,6 +48,19 @@ def test_no_gaussian_reaches_from_one_place_to_the_next(mapper: OnlineMapper, ap
     assert {0, 2} <= set(anchor[giants])
     sizes = np.exp(mapper.gaussians.to_numpy()["log_scale"].max(axis=1)) / depth
     assert sizes.max() == pytest.approx(largest, rel=0.1)
+
+
+def test_a_size_that_was_limited_stays_when_the_scene_depth_changes(mapper: OnlineMapper) -> None:
+    store, depth, anchor = mapper.keyframes, mapper.keyframes.scene_depth, mapper.gaussians.anchors()
+    state = mapper.gaussians.to_numpy()
+    state["log_scale"][anchor == 0] = np.log(2.0 * depth)
+    mapper.gaussians.load(state | {"anchor": anchor})
+    changed(mapper, [2, 3])
+    for keyframe in store:
+        keyframe.median_depth *= 0.9
+    store.take_in_depths()
+    assert store.scene_depth == pytest.approx(0.9 * depth)
+    assert not changed(mapper, [2, 3])[anchor == 0].any()
 
 
 def test_in_a_map_of_one_place_nothing_is_held(mapper: OnlineMapper) -> None:
