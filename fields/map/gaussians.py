@@ -51,7 +51,7 @@ class GaussianField:
         gaussians.load(modp_ti.read_splats("out/room/splats.ply"))
     """
 
-    def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real=ti.f32) -> None:
+    def __init__(self, sh_degree: int = 0, max_gaussians: int = 1_500_000, real: object = ti.f32) -> None:
         self.sh_degree = sh_degree
         self.sh_count = (sh_degree + 1) ** 2
         self.real = real
