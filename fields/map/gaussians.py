@@ -24,9 +24,8 @@ MOMENTS = ("_m", "_v")  # suffixes of the names of Adam's first and second momen
 class GaussianField:
     """Anisotropic Gaussians in the world frame, with their gradients and Adam moments.
 
-    Gaussians are stored at indices 0 to `count - 1`; one takes 292 bytes at degree 0 in float32. The SNode tree is
-    pointer(blocks) over dense(1024): memory follows the number of Gaussians, and no kernel is recompiled when the map
-    grows. On a GPU, the storage is dense and holds `max_gaussians` from the start.
+    They are stored at indices 0 to `count - 1`, in a tree of pointer(blocks) over dense(1024), so that memory follows
+    their number. On a GPU, the storage is dense and holds `max_gaussians` from the start.
 
     Args:
         sh_degree: Degree of the spherical harmonics of colour.
@@ -80,10 +79,11 @@ class GaussianField:
         geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
         place(geometry, blocks, BLOCK)
         place([f.grad for f in geometry], blocks, BLOCK)
-        place([getattr(self, name + moment) for name in _NAMES[:4] for moment in MOMENTS], blocks, BLOCK)
-        place([self.sh], blocks, BLOCK, self.sh_count)
-        place([self.sh.grad], blocks, BLOCK, self.sh_count)
-        place([self.sh_m, self.sh_v], blocks, BLOCK, self.sh_count)
+        moments = [self.position_m, self.position_v, self.log_scale_m, self.log_scale_v]
+        moments += [self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v]
+        place(moments, blocks, BLOCK)
+        for fields in ([self.sh], [self.sh.grad], [self.sh_m, self.sh_v]):
+            place(fields, blocks, BLOCK, self.sh_count)
         place([self.steps, self.anchor, self.touched, self.coverage], blocks, BLOCK)
         if not on_gpu():
             self.slot, self.tangent = ti.field(ti.i32), vector(6, True)
