@@ -60,9 +60,9 @@ class FreeSpace:
         self._near = near
 
     def surface(self, number: int, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> ShownSurface:
-        """Return what the loaded map, which has this number, shows in a keyframe."""
-        view = self.renderer.render(camera, T_camera_world, self._near)
-        return ShownSurface(number, camera, T_camera_world, view.expected_depth(LEAST_OPACITY).astype(np.float32))
+        """Return what the map with this number shows in a keyframe, which must be the last rendered view."""
+        depth = self.renderer.rendered().expected_depth(LEAST_OPACITY)
+        return ShownSurface(number, camera, T_camera_world, depth.astype(np.float32))
 
     def floating(self, numbers: NDArray[np.integer], views: Sequence[ShownSurface]) -> NDArray[np.bool_]:
         """Return which of the loaded Gaussians (N,) float before the surfaces of other maps.

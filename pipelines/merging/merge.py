@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from fields.map.keyframe import Keyframe
 from pipelines.finished_map import FinishedMap, take_in_frames, take_in_gaussians
 from pipelines.merging.free_space import FreeSpace, ShownSurface
 from pipelines.merging.gauge import colour_changes, exposed_in, recoloured
@@ -24,8 +23,8 @@ EDGE = 1 / 16
 # Pyramid level at which it is measured how much of each Gaussian shows, which takes half as long as at the full size.
 COARSE = 1
 # How often Gaussians that float in free space are looked for. What they hid, and what the next owner of their place has
-# there, may float as well: 654, 148 and 23 Gaussians of four parts with 79,497.
-ROUNDS = 3
+# there, may float as well: 654 and 148 Gaussians of four parts with 79,497. A third time finds 23.
+ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -79,13 +78,17 @@ def merge(mapper: OnlineMap, parts: Sequence[MappedPart], frames: Iterable[Track
 
 def _kept(mapper: OnlineMap, parts: Sequence[MappedPart]) -> list[NDArray[np.bool_]]:
     """Return which Gaussians (N,) of each part are kept: what it owns, and no keyframe of another part sees through."""
-    space = FreeSpace(mapper.renderer, mapper.near)
+    space, contribution = FreeSpace(mapper.renderer, mapper.near), mapper.hidden.contribution
     shown: list[Shown] = []
     views: list[ShownSurface] = []
     for number, part in enumerate(parts):
-        own = [view for view in mapper.keyframes if view.index in part.own]
-        shown.append(_shown(mapper, part, own))
-        views += [space.surface(number, view.image(COARSE).camera, view.T_camera_world) for view in own]
+        mapper.gaussians.load(dict(part.gaussians))
+        contribution.begin()
+        for view in mapper.keyframes:
+            if view.index in part.own:
+                contribution.measure([view], mapper.near, COARSE)
+                views.append(space.surface(number, view.image(COARSE).camera, view.T_camera_world))
+        shown.append(Shown(part.gaussians["position"].astype(np.float64), mapper.gaussians.coverages()))
     numbers = np.repeat(np.arange(len(parts)), [len(each.position) for each in shown])
     ends = np.cumsum([len(each.position) for each in shown])[:-1]
     floating = np.zeros(len(numbers), dtype=np.bool_)
@@ -134,12 +137,3 @@ def _in_one_gauge(parts: Sequence[MappedPart]) -> list[MappedPart]:
         )
         for part, own, change in zip(parts, exposures, colour_changes(exposures), strict=True)
     ]
-
-
-def _shown(mapper: OnlineMap, part: MappedPart, own: Sequence[Keyframe]) -> Shown:
-    """Load the part's Gaussians, and measure how its own keyframes show them."""
-    mapper.gaussians.load(dict(part.gaussians))
-    contribution = mapper.hidden.contribution
-    contribution.begin()
-    contribution.measure(own, mapper.near, COARSE)
-    return Shown(part.gaussians["position"].astype(np.float64), mapper.gaussians.coverages())

@@ -195,4 +195,8 @@ class Renderer:
         self.images.background[None] = ti.Vector(background)
         self.forward(camera, T_camera_world, near)
         self.images.background[None] = ti.Vector((0.0, 0.0, 0.0))
+        return self.rendered()
+
+    def rendered(self) -> RenderedView:
+        """Return a copy of the last rendered view."""
         return RenderedView(self.images.colour_to_numpy(), self.images.depth_to_numpy(), self.images.opacity_to_numpy())

@@ -13,6 +13,7 @@ import torch
 from fields.buffers.images import PAD, ImageBuffers
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import refuse_too_many_fields
+from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
@@ -40,6 +41,7 @@ class PhotometricModel:
         self._sums = np.zeros((images.max_height, 12))
         self._loaded: tuple[int, int, int] | None = None  # the vignette in the buffer: its id and size
         self._resized: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray]] = {}
+        self._apply, self._apply_back = CompiledKernel(self._forward), CompiledKernel(self._backward)
 
     def forward(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
         """Apply exposure and vignette to the last rendered image.
@@ -72,10 +74,10 @@ class PhotometricModel:
         return AsyncReadback(torch.from_numpy(self.exposure_gradient()))
 
     def _develop(self) -> None:
-        self._forward(self.images.width, self.images.height, self._exposure)
+        self._apply(self.images.width, self.images.height, self._exposure)
 
     def _undevelop(self) -> None:
-        self._backward(self.images.width, self.images.height, self._exposure, self._sums)
+        self._apply_back(self.images.width, self.images.height, self._exposure, self._sums)
 
     def _make_buffers(self) -> None:
         if self._made:

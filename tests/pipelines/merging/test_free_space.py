@@ -79,6 +79,7 @@ def test_fog_before_a_wall_floats_unless_the_map_that_shows_the_wall_has_it(
     renderer, state = renderers(), wall_and_fog()
     space = FreeSpace(renderer, NEAR)
     renderer.gaussians.load({name: values[:400] for name, values in state.items()})
+    renderer.forward(CAMERA, POSE, NEAR)
     surface = space.surface(0, CAMERA, POSE)
     assert 3.5 < np.median(surface.depth) < 4.1
     renderer.gaussians.load(state)
