@@ -260,6 +260,7 @@ class ImageBuffers:
     @ti.kernel
     def _read_planes(self, width: ti.i32, height: ti.i32, buffer: ti.template(), out: ti.types.ndarray()):
         channels = out.shape[2]
-        for i in range(width * height * channels):
-            c, x, y = i % channels, i // channels % width, i // channels // width
-            out[y, x, c] = buffer[c * self.plane + (y + PAD) * self.stride + PAD + x]
+        for i in range(width * height):
+            x, y = i % width, i // width
+            for c in range(channels):
+                out[y, x, c] = buffer[c * self.plane + (y + PAD) * self.stride + PAD + x]
