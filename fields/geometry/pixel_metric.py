@@ -33,7 +33,8 @@ def pixel_jacobian(camera: PinholeCamera, points: NDArray[np.float64]) -> NDArra
     return np.concatenate([by_point, by_point @ turned], axis=2)
 
 
-@lru_cache(maxsize=4096)  # more than a map has keyframes in use, each of which has a depth of its own
+# Each keyframe has a depth of its own, and a refinement draws from all of them.
+@lru_cache(maxsize=4096)
 def pixel_metric(camera: PinholeCamera, median_depth: float) -> NDArray[np.float64]:
     """Coordinates of a pose's tangent in which step lengths are in pixels.
 
