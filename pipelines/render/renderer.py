@@ -198,5 +198,5 @@ class Renderer:
         return self.rendered()
 
     def rendered(self) -> RenderedView:
-        """Return a copy of the last rendered view."""
+        """Return a copy of the last rendered view, with its exposure and vignette if it was developed with them."""
         return RenderedView(self.images.colour_to_numpy(), self.images.depth_to_numpy(), self.images.opacity_to_numpy())

@@ -13,7 +13,7 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.paging import Paging
-from pipelines.render.renderer import RenderedView, Renderer
+from pipelines.render.renderer import Renderer
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 from pipelines.transients.masks import soft_mask
 
@@ -48,9 +48,7 @@ def compared(
     image = view.whole_image(1)
     renderer.forward(image.camera, T_camera_world, near)
     renderer.develop(exposure, view.vignette)
-    images = renderer.images
-    render = RenderedView(images.colour_to_numpy(), images.depth_to_numpy(), images.opacity_to_numpy())
-    return coarse_view(render, image.rgba, image.camera, T_camera_world)
+    return coarse_view(renderer.rendered(), image.rgba, image.camera, T_camera_world)
 
 
 def latest(keyframes: KeyframeStore) -> list[Keyframe]:
