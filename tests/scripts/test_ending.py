@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
-import mesh_accuracy
-import mesh_picture
 import pytest
 from ending import documented_ending
 
@@ -48,13 +43,3 @@ def test_what_ends_well_goes_on() -> None:
     with documented_ending():
         pass
 
-
-@pytest.mark.parametrize("script", [mesh_accuracy, mesh_picture])
-def test_the_scripts_about_meshes_refuse_what_is_no_run(script, tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(sys, "argv", ["script", str(tmp_path), *(["p.png"] if script is mesh_picture else [])])
-    with pytest.raises(SystemExit) as ended:
-        script.main()
-    assert ended.value.code == 2
-    assert capsys.readouterr().err == (
-        f"error: {tmp_path}: no run has left anything here: name the output folder of a finished run\n"
-    )
