@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.online_map import OnlineMap
 from pipelines.select.views import global_probabilities
@@ -57,7 +56,6 @@ def refine(
     progress: Callable[[int, float], None] | None = None,
     done: int = 0,
     schedule: Schedule | None = None,
-    weights: NDArray[np.float64] | None = None,
 ) -> None:
     """Optimise a finished map on error-weighted draws from all keyframes.
 
@@ -73,7 +71,6 @@ def refine(
         done: Number of steps made before the mapper was restored. The remaining steps are the same as without the
             interruption.
         schedule: When the refinement ends, and how far the rates have decayed; None for what the settings say.
-        weights: Factor (K,) on the probability of each keyframe; None for 1.
 
     Example:
         mapper.finish()
@@ -101,9 +98,6 @@ def refine(
         moves = poses.enabled and (settings.poses or passed < settings.hold)
         with mapper.stopwatch.measure("refine"):
             p = global_probabilities(store, views.error_weight, 0.0, groups[group])
-            if weights is not None:
-                p *= weights[groups[group]]
-                p /= p.sum()
             batch = [int(j) for j in mapper.rng.choice(groups[group], settings.views, p=p)]
             slower = settings.position_decay**decayed
             rates = mapper.optimiser.rates(

@@ -19,4 +19,3 @@ PAGE = (PROJECT / "docs" / "live.md").read_text()
 def test_the_command_is_a_valid_call(command: str) -> None:
     _, name, *arguments = shlex.split(command, comments=True)
     typer.main.get_command(cli.app).commands[name].make_context(name, arguments)  # raises for options it does not have
-

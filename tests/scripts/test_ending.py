@@ -42,4 +42,3 @@ def test_a_fault_shows_where_it_happened(capsys) -> None:
 def test_what_ends_well_goes_on() -> None:
     with documented_ending():
         pass
-

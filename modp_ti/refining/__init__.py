@@ -1,1 +1,0 @@
-"""Refining: a finished map is refined region by region, by tasks that run side by side."""
