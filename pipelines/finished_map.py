@@ -97,7 +97,7 @@ def take_in_gaussians(mapper: OnlineMap, gaussians: Mapping[str, NDArray]) -> No
     mapper.gaussians.load(dict(gaussians))
     _restore_anchors(mapper, gaussians["position"].astype(np.float64))
     for view in mapper.keyframes:
-        mapper.paging.gather([view])
+        mapper.paging.before_views([view])
         values = mapper.optimiser.compare(view, mapper.keyframes.scene_depth)
         if np.isfinite(values.l1):
             view.error = values.l1

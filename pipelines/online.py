@@ -132,11 +132,8 @@ class OnlineMapper(OnlineMap):
             self.densifier.add_error_pixels(image, warming_up, plan.pixels)
         psnr = self.optimise(plan.steps, level)
         with self.stopwatch.measure("remove"):
-            if plan.swept is None:
-                self.hidden.sweep_when_due(self.near)
-            else:
-                self.hidden.sweep(plan.swept, self.near)
-        self.mask_latest()
+            for companion in self.companions:
+                companion.after_keyframe(self.near, plan.swept)
         return psnr, plan.steps
 
     def _draw_level(self, view: Keyframe) -> int:
@@ -253,7 +250,7 @@ class OnlineMapper(OnlineMap):
         """Make a part of the passes of `finish`."""
         places = part.places
         if self.settled == part.first:
-            self.mask_contradicted(places)
+            self.begin_passes(places)
         views = np.resize(places[np.argsort(places * GOLDEN_RATIO % 1.0)], part.end - part.first)
         count, psnr = self.settings.views.per_step, None
         while self.settled < part.end:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
-from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
 from pipelines.blocks.paging import Paging
+from pipelines.companions import Companion
 from pipelines.corrections import MapCorrector
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
@@ -31,7 +31,7 @@ from pipelines.select.views import LocalGlobalViews, ViewSelection
 from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
 from pipelines.transients.changes import ChangeSweep, EarlierVisit
-from pipelines.transients.sweep import EVERY, YOUNG, TransientSweep, latest
+from pipelines.transients.sweep import TransientSweep
 
 __all__ = ["OnlineMap"]
 
@@ -52,8 +52,7 @@ class OnlineMap(Pipeline):
     Attributes:
         frame_count: Number of frames processed so far.
         settled: Number of views that `finish` has optimised since the last frame.
-        transients: Masks what moves; None if the settings disable it.
-        changes: Masks what has changed since an earlier visit; None for the map of one visit.
+        companions: Paging, places, hidden Gaussians, masks: what the loop calls at fixed places, in order.
     """
 
     can_be_refined: ClassVar[bool] = True
@@ -74,7 +73,8 @@ class OnlineMap(Pipeline):
         self.stopwatch = Stopwatch()
         self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
         self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
-        self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings)
+        self.companions: list[Companion] = []  # filled below: some need the optimiser
+        self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings, self.companions)
         self.loss = self.optimiser.loss
         self.trajectory = Trajectory()
         self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side, self.trajectory)
@@ -84,15 +84,12 @@ class OnlineMap(Pipeline):
         self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
         self.budget = self.densifier.budget
         self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
-        self.optimiser.before_views = self.paging.gather
-        places = OtherPlaces(self.densifier)
-        self.optimiser.before_step, self.optimiser.before_update = places.look, places.hold
         contribution = Contribution(self.gaussians, self.renderer)
         self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
-        self.transients = None
+        self.companions += [self.paging, OtherPlaces(self.densifier), self.hidden]
         if settings.transients:
             self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
-        self.changes: ChangeSweep | None = None
+            self.companions.append(self.transients)
         self.pace = pace or CompletePace(settings)
         self.views = views or LocalGlobalViews(settings.views, self.rng)
         self.corrector = MapCorrector(self.keyframes, self.densifier, self.paging)
@@ -123,32 +120,15 @@ class OnlineMap(Pipeline):
         """
         return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
 
-    def mask_contradicted(self, places: NDArray[np.int64]) -> None:
-        """Mask in keyframes what moves, and what has changed since an earlier visit, and remove its Gaussians.
-
-        Does nothing if the settings disable the first, and there was no earlier visit.
+    def begin_passes(self, places: NDArray[np.int64]) -> None:
+        """Let the companions look at keyframes before passes over them, see `Companion.before_passes`.
 
         Args:
-            places: Places of the keyframes in the store.
+            places: Places (N,) of the keyframes in the store.
         """
-        views = [self.keyframes[place] for place in places.tolist()]
-        self._mask(views, views)
-
-    def mask_latest(self) -> None:
-        """Do so in the latest keyframes, if enough have come since the last time.
-
-        The last few have been optimised too little, and are only asked about the others.
-        """
-        views = latest(self.keyframes)
-        self._mask(views, views[-2 * EVERY : -YOUNG], YOUNG)
-
-    def _mask(self, views: Sequence[Keyframe], witnesses: Sequence[Keyframe], young: int = 0) -> None:
-        """Mask what moves in `views`, of which the last `young` stay as they are, and what `witnesses` show changed."""
         with self.stopwatch.measure("remove"):
-            if self.transients is not None and views:
-                self.transients.sweep(views, self.near, young)
-            if self.changes is not None:
-                self.changes.sweep(witnesses, self.near)
+            for companion in self.companions:
+                companion.before_passes(places, self.near)
 
     def watch_changes(self, earlier: EarlierVisit) -> None:
         """Mask from now on, in the keyframes of an earlier visit, what has changed since.
@@ -156,7 +136,8 @@ class OnlineMap(Pipeline):
         Args:
             earlier: The map of the earlier visit.
         """
-        self.changes = ChangeSweep(earlier, self.gaussians, self.keyframes, self.renderer, self.paging)
+        changes = ChangeSweep(earlier, self.gaussians, self.keyframes, self.renderer, self.paging)
+        self.companions.append(changes)
 
     def caught(self) -> Safeguards:
         """Return the safeguards' counts so far. Waits for the device."""

@@ -85,7 +85,7 @@ def refine(
     step, share = done, schedule(done)
     removes = settings.min_contribution > 0 and not (by_the_clock and len(store) > MOST_SWEPT)
     if not done and share is not None:
-        mapper.mask_contradicted(np.arange(len(store)))
+        mapper.begin_passes(np.arange(len(store)))
     if removes and not done and share is not None:
         with mapper.stopwatch.measure("refine"):
             mapper.hidden.remove(settings.min_contribution, mapper.near)

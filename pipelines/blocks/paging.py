@@ -16,6 +16,7 @@ from fields.map.keyframes import KeyframeStore
 from fields.runtime.heap import give_back_heap
 from pipelines.blocks.away import CHUNK, BlocksOnDisk, planes_of_views
 from pipelines.blocks.groups import grouped
+from pipelines.companions import Companion
 from pipelines.memory_budget import OBSERVATION, MemoryBudget
 from pipelines.settings import MappingSettings
 
@@ -35,7 +36,7 @@ MISSING = 0.5
 VOXELS_EACH = 128
 
 
-class Paging:
+class Paging(Companion):
     """Keeps the resident part of a map within its limits, `max_gaussians` and `memory`.
 
     Space is divided into cubes. When a new keyframe lacks room, the blocks that it does not see go to disk, the
@@ -181,8 +182,8 @@ class Paging:
             self.plan()
         return [np.flatnonzero(self.group == number) for number in range(self.group.max(initial=-1) + 1)]
 
-    def gather(self, views: Sequence[Keyframe]) -> None:
-        """Bring in what keyframes see, before they are rendered. Call it between two steps.
+    def before_views(self, views: Sequence[Keyframe]) -> None:
+        """Bring in what keyframes see, before they are rendered.
 
         Raises:
             BlockError: If a block's file is missing or damaged. The map is then without it.

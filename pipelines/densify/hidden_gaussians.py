@@ -8,6 +8,7 @@ import numpy as np
 
 from fields.map.keyframe import Keyframe
 from pipelines.blocks.paging import Paging
+from pipelines.companions import Companion
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
 from pipelines.pace.pace import FIRST_SWEEP
@@ -20,7 +21,7 @@ YOUNG = 10
 COARSE = 1
 
 
-class HiddenGaussians:
+class HiddenGaussians(Companion):
     """Sweeps over the keyframes, a few at a time or all at once, and then removes what hardly showed in any of them.
 
     A sweep spares the Gaussians that were placed in the `YOUNG` keyframes before it or while it went on. It leaves out
@@ -48,6 +49,12 @@ class HiddenGaussians:
         self._swept = 0
         self._left_out: list[Keyframe] = []
         self._young: Keyframe
+
+    def after_keyframe(self, near: float, swept: int | None) -> None:
+        if swept is None:
+            self.sweep_when_due(near)
+        else:
+            self.sweep(swept, near)
 
     def sweep_when_due(self, near: float) -> None:
         """Sweep over all keyframes that are near, if half as many have come since the last such sweep.
@@ -114,7 +121,7 @@ class HiddenGaussians:
 
         def complete() -> Iterator[Keyframe]:
             for view in views:
-                self._paging.gather([view])
+                self._paging.before_views([view])
                 yield view
 
         self.contribution.measure(complete(), near, level)

@@ -8,6 +8,7 @@ import numpy as np
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import FAR, centres_of
 from fields.runtime.engine import ti
+from pipelines.companions import Companion
 from pipelines.densify.densifier import Densifier
 
 __all__ = ["OtherPlaces"]
@@ -20,7 +21,7 @@ SHRUNK = 0.8
 
 
 @ti.data_oriented
-class OtherPlaces:
+class OtherPlaces(Companion):
     """Holds the Gaussians of other places while views of one place are optimised, and limits the size of all.
 
     While a map is young at a place apart, Gaussians of other places show through its holes. A step would have them grow
@@ -38,17 +39,17 @@ class OtherPlaces:
         self._centres = np.zeros((0, 3))
         self._places = np.zeros(0, dtype=np.int64)
 
-    def look(self) -> None:
-        """Note where the keyframes are that have placed Gaussians. Call it before each step.
+    def before_step(self) -> None:
+        """Note where the keyframes are that have placed Gaussians.
 
-        Does nothing, like `hold`, if the map has no places apart, see `KeyframeStore.has_places`.
+        Does nothing, like `before_update`, if the map has no places apart, see `KeyframeStore.has_places`.
         """
         store = self._densifier.keyframes
         if store.has_places:
             self._centres = centres_of(store.selected)
             self._places = self._densifier.places_of_anchors()
 
-    def hold(self, views: Sequence[Keyframe]) -> None:
+    def before_update(self, views: Sequence[Keyframe]) -> None:
         """Limit the size of the Gaussians in memory, and clear the gradients of those far from each of the views.
 
         A Gaussian is far if the view that placed it is. Sizes are limited as soon as a second place begins, not when a

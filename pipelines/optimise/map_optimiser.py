@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -13,6 +13,7 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.async_readback import AsyncReadback
+from pipelines.companions import Companion
 from pipelines.optimise.adam import Adam, LearningRates
 from pipelines.optimise.exposure import ExposureRefinement
 from pipelines.optimise.gpu_losses import photometric_loss
@@ -32,14 +33,16 @@ class MapOptimiser:
         gaussians: The Gaussians of the map.
         renderer: Renderer of the map.
         settings: Settings of the mapping.
-
-    Attributes:
-        before_step: Called before each step.
-        before_views: Called with the views of each Adam step before they are rendered.
-        before_update: Called with them when all gradients are known, before the Gaussians are updated.
+        companions: What is called before steps, views and updates, in order.
     """
 
-    def __init__(self, gaussians: GaussianField, renderer: Renderer, settings: MappingSettings) -> None:
+    def __init__(
+        self,
+        gaussians: GaussianField,
+        renderer: Renderer,
+        settings: MappingSettings,
+        companions: Sequence[Companion] = (),
+    ) -> None:
         self.gaussians = gaussians
         self.renderer = renderer
         self.settings = settings
@@ -54,9 +57,7 @@ class MapOptimiser:
         self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
         self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
-        self.before_step: Callable[[], None] = lambda: None
-        self.before_views: Callable[[list[Keyframe]], None] = lambda views: None
-        self.before_update: Callable[[list[Keyframe]], None] = lambda views: None
+        self.companions = companions
 
     def rates(
         self, scene_depth: float, position_factor: float = 1.0, scale_factor: float = 1.0, other_factor: float = 1.0
@@ -116,11 +117,14 @@ class MapOptimiser:
         Returns:
             Mean PSNR of the views.
         """
-        self.before_step()
+        for companion in self.companions:
+            companion.before_step()
         size = self.settings.optimise.batch
         seen: list[tuple[Keyframe, LossValues]] = []
         for first in range(0, len(views), size):
-            self.before_views([store[j] for j in views[first : first + size]])
+            batch = [store[j] for j in views[first : first + size]]
+            for companion in self.companions:
+                companion.before_views(batch)
             seen += self._step(store, views[first : first + size], rates, pose_rate, level)
         self.loss.send()
         self._unread.append(seen)
@@ -181,7 +185,9 @@ class MapOptimiser:
             if view.exposure is not None and not begins:
                 exposure_gradients.setdefault(j, []).append(self.renderer.async_exposure_gradient())
         self.aspect.backward(o.aspect_weight, store.scene_depth)
-        self.before_update([view for view, _ in seen])
+        rendered = [view for view, _ in seen]
+        for companion in self.companions:
+            companion.before_update(rendered)
         self.adam.step(rates, len(views), largest=EXPLODED * store.scene_depth)
         for j, gradients in pose_gradients.items():
             move = partial(self._move_pose, store[j], gradients, pose_rate)

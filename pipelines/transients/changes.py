@@ -13,10 +13,11 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.paging import Paging
+from pipelines.companions import Companion
 from pipelines.render.renderer import Renderer
 from pipelines.transients.evidence import SAME_DEPTH, CoarseView, votes
 from pipelines.transients.masks import soft_mask
-from pipelines.transients.sweep import compared
+from pipelines.transients.sweep import EVERY, YOUNG, compared, latest
 
 __all__ = ["ChangeSweep", "EarlierVisit"]
 
@@ -34,7 +35,7 @@ class EarlierVisit:
     frames: int
 
 
-class ChangeSweep:
+class ChangeSweep(Companion):
     """Masks what has changed since an earlier visit in its keyframes, and removes the Gaussians of what is gone.
 
     Keyframes of both visits ask for the place as they saw it, so that the map would become a mixture. Where they
@@ -62,6 +63,12 @@ class ChangeSweep:
         self.keyframes = keyframes
         self.renderer = renderer
         self.paging = paging
+
+    def after_keyframe(self, near: float, swept: int | None) -> None:
+        self.sweep(latest(self.keyframes)[-2 * EVERY : -YOUNG], near)
+
+    def before_passes(self, places: NDArray[np.int64], near: float) -> None:
+        self.sweep([self.keyframes[place] for place in places.tolist()], near)
 
     def sweep(self, views: Sequence[Keyframe], near: float) -> None:
         """Mask in the keyframes of the earlier visit what these views show to have changed.
@@ -99,7 +106,7 @@ class ChangeSweep:
 
         now = []
         for view in views:
-            self.paging.gather([view])
+            self.paging.before_views([view])
             now.append(compare(view))
         with self._earlier_map():
             return now, [compare(view) for view in views]

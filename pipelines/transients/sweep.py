@@ -13,6 +13,7 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.paging import Paging
+from pipelines.companions import Companion
 from pipelines.render.renderer import Renderer
 from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 from pipelines.transients.masks import soft_mask
@@ -63,7 +64,7 @@ def neighbours(place: int, count: int) -> list[int]:
     return sorted(other for other in both if 0 <= other < count)
 
 
-class TransientSweep:
+class TransientSweep(Companion):
     """Masks what moves in keyframes, and removes its Gaussians.
 
     Args:
@@ -79,6 +80,12 @@ class TransientSweep:
         self.renderer = renderer
         self.paging = paging
 
+    def after_keyframe(self, near: float, swept: int | None) -> None:
+        self.sweep(latest(self.keyframes), near, YOUNG)
+
+    def before_passes(self, places: NDArray[np.int64], near: float) -> None:
+        self.sweep([self.keyframes[place] for place in places.tolist()], near)
+
     def sweep(self, views: Sequence[Keyframe], near: float, young: int = 0) -> None:
         """Mask what moves in keyframes, and remove the Gaussians that most of them contradict.
 
@@ -87,11 +94,11 @@ class TransientSweep:
             near: Depth below which nothing is drawn [scene units].
             young: Number of the last ones whose masks stay as they are.
         """
-        if len(self.gaussians) == 0:
+        if not views or len(self.gaussians) == 0:
             return
         coarse = []
         for view in views:
-            self.paging.gather([view])
+            self.paging.before_views([view])
             coarse.append(compared(self.renderer, view, view.T_camera_world, view.exposure, near))
         masks = [view.transient for view in views]
         for _ in range(ROUNDS):

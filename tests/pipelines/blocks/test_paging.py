@@ -43,7 +43,7 @@ def walk(mapper: OnlineMapper, first: int = 0, end: int = len(STEPS)) -> OnlineM
 def mean_psnr(mapper: OnlineMapper) -> float:
     found = []
     for view in mapper.keyframes:
-        mapper.paging.gather([view])
+        mapper.paging.before_views([view])
         found.append(mapper.optimiser.compare(view, mapper.keyframes.scene_depth).psnr)
     return float(np.mean(found))
 
@@ -81,7 +81,7 @@ def test_a_part_that_is_left_is_found_as_it_was_left(taichi_on_the_cpu: None) ->
     assert still
     for block in still:
         np.testing.assert_array_equal(mapper.paging.away.read(block), left[block.number])
-    mapper.paging.gather([mapper.keyframes[int(still[0].viewers[0])]])
+    mapper.paging.before_views([mapper.keyframes[int(still[0].viewers[0])]])
     here, was = mapper.gaussians.to_numpy() | mapper.gaussians.history(), left[still[0].number]
     place = np.flatnonzero((here["position"] == was["position"][0]).all(axis=1))[0]
     for name, array in here.items():
@@ -194,7 +194,7 @@ def test_a_damaged_block_is_named_and_the_map_goes_on_without_it(taichi_on_the_c
     content[block.stored.first + 5] ^= 1
     path.write_bytes(content)
     with pytest.raises(BlockError, match=rf"{path}: a block of the map is damaged \({block.stored.count}"):
-        mapper.paging.gather([mapper.keyframes[int(block.viewers[0])]])
+        mapper.paging.before_views([mapper.keyframes[int(block.viewers[0])]])
     assert mapper.gaussian_count == count - block.stored.count
     walk(mapper, OUT, OUT + 2)
 

@@ -1,0 +1,45 @@
+"""`Companion`: what goes with the paper's loop and is no part of it, such as paging, places and masks of what moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.map.keyframe import Keyframe
+
+__all__ = ["Companion"]
+
+
+class Companion:
+    """A part of the mapper that the loop calls at fixed places. All methods do nothing here.
+
+    A mapper has a list of companions, which are called in its order. One that draws random numbers draws them from the
+    mapper's generator, so that the order is part of the result.
+    """
+
+    def before_step(self) -> None:
+        """Called before each optimisation step."""
+
+    def before_views(self, views: Sequence[Keyframe]) -> None:
+        """Called with the views of each Adam step before they are rendered."""
+
+    def before_update(self, views: Sequence[Keyframe]) -> None:
+        """Called with these views when all gradients are known, before the Gaussians are updated."""
+
+    def after_keyframe(self, near: float, swept: int | None) -> None:
+        """Called after the steps of a new keyframe.
+
+        Args:
+            near: Depth below which nothing is drawn [scene units].
+            swept: Number of keyframes to sweep for hidden Gaussians, see `Plan.swept`.
+        """
+
+    def before_passes(self, places: NDArray[np.int64], near: float) -> None:
+        """Called before the passes over keyframes that finish or refine a map.
+
+        Args:
+            places: Places (N,) of the keyframes in the store.
+            near: Depth below which nothing is drawn [scene units].
+        """
