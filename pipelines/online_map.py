@@ -25,7 +25,7 @@ from pipelines.optimise.safeguards import Safeguards
 from pipelines.pace import CompletePace, Pace
 from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import Renderer
-from pipelines.select.frame_gate import FrameGate
+from pipelines.select.gate import FrameGate
 from pipelines.select.keyframes import KeyframeSelector
 from pipelines.select.views import LocalGlobalViews, ViewSelection
 from pipelines.settings import MappingSettings

@@ -14,8 +14,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from pipelines.blocks.shown_map import ShownMap
 from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import RenderedView
-from pipelines.transients.evidence import CoarseView, coarse_view, moving
-from pipelines.transients.masks import soft_mask
+from pipelines.transients.evidence import CoarseView, coarse_view, moving, soft_mask
 from pipelines.transients.sweep import compared, neighbours, place_of, without
 
 __all__ = ["StillScore", "StillScorer"]

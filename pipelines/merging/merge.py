@@ -1,22 +1,122 @@
-"""`merge`: the maps of overlapping parts of a recording become one online map."""
+"""Merging of the maps of a recording's parts: one gauge of colour, an owner of each place, one map."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
+from fields.map.gaussians import SH_C0
 from pipelines.finished_map import FinishedMap, take_in_frames, take_in_gaussians
 from pipelines.merging.free_space import FreeSpace, ShownSurface
-from pipelines.merging.gauge import colour_changes, exposed_in, recoloured
-from pipelines.merging.ownership import Shown, owned
 from pipelines.online_map import OnlineMap
 from pipelines.render.cpu.photometric_model import IDENTITY
 
-__all__ = ["MappedPart", "merge"]
+__all__ = ["MappedPart", "Shown", "colour_changes", "exposed_in", "merge", "owned", "recoloured"]
+
+Exposures = Mapping[int, NDArray[np.float64]]
+
+
+def colour_changes(maps: Sequence[Exposures]) -> list[NDArray[np.float64]]:
+    """Return the transforms (3, 4) of the colours of each map to those of the first one.
+
+    Each map is compared with the one before it, in the frames that both have an exposure of; it takes over the
+    transform of that one if there are none.
+
+    Args:
+        maps: Exposure (3, 4) of each frame of each map, by frame index.
+    """
+    changes = [np.array(IDENTITY)]
+    for before, here in pairwise(maps):
+        found = [_after(_inverse(before[i]), here[i]) for i in sorted(set(before) & set(here))]
+        change = np.mean(found, axis=0) if found else np.array(IDENTITY)
+        changes.append(_after(changes[-1], change))
+    return changes
+
+
+def recoloured(sh: NDArray[np.floating], change: NDArray[np.float64]) -> NDArray[np.floating]:
+    """Return the coefficients (N, K, 3) of colours after a transform (3, 4) of these colours."""
+    changed = sh.astype(np.float64) @ change[:, :3].T
+    changed[:, 0] += (change[:, :3].sum(axis=1) * 0.5 + change[:, 3] - 0.5) / SH_C0
+    return changed.astype(sh.dtype)
+
+
+def exposed_in(exposure: NDArray[np.float64], change: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the exposure (3, 4) with which a frame's image stays the same when the colours are transformed (3, 4)."""
+    return _after(exposure, _inverse(change))
+
+
+def _after(second: NDArray[np.float64], first: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The transform (3, 4) that applies `first`, and then `second`."""
+    return np.column_stack([second[:, :3] @ first[:, :3], second[:, :3] @ first[:, 3] + second[:, 3]])
+
+
+def _inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
+    A = np.asarray(np.linalg.inv(transform[:, :3]), dtype=np.float64)
+    return np.column_stack([A, -A @ transform[:, 3]])
+
+
+NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+# Cubes farther from the origin than this are taken as one. Three such coordinates fit into 63 bits.
+FARTHEST = (1 << 20) - 2
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How the own keyframes of a map show its Gaussians.
+
+    Attributes:
+        position: Positions (N, 3) in the world frame.
+        coverage: Pixels (N,) that each covers where it shows most, see `Contribution`.
+    """
+
+    position: NDArray[np.floating]
+    coverage: NDArray[np.floating]
+
+
+def owned(maps: Sequence[Shown], edge: float) -> list[NDArray[np.bool_]]:
+    """Return which Gaussians (N,) of each map lie in a cube of that map.
+
+    Gaussians that do not show are not kept. Of equal scores, that of the first map counts.
+
+    Args:
+        maps: The maps.
+        edge: Edge of a cube [scene units].
+    """
+    cubes = [_cubes(each.position, edge) for each in maps]
+    keys, places = np.unique(_keys(np.concatenate(cubes)), return_inverse=True)
+    at = np.split(places.reshape(-1), np.cumsum([len(each) for each in cubes])[:-1])
+    owner, best = np.full(len(keys), -1), np.zeros(len(keys))
+    for number, each in enumerate(maps):
+        score = np.bincount(at[number], each.coverage, len(keys)).astype(np.float64)
+        around = _around(keys, score)
+        wins = (score > 0.0) & (around > best)
+        owner[wins], best[wins] = number, around[wins]
+    return [(owner[at[number]] == number) & (each.coverage > 0.0) for number, each in enumerate(maps)]
+
+
+def _cubes(position: NDArray[np.floating], edge: float) -> NDArray[np.int64]:
+    """Return the integer coordinates (N, 3) of the cubes of positions."""
+    return np.floor(np.clip(position / edge, -FARTHEST, FARTHEST)).astype(np.int64)
+
+
+def _keys(cubes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return one number (N,) for each cube. Those of two cubes differ by a sum over their coordinates."""
+    return cubes @ np.array([1 << 42, 1 << 21, 1])
+
+
+def _around(keys: NDArray[np.int64], score: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum (M,) of the scores of each cube and its neighbours, of those that are among the sorted `keys`."""
+    total = np.zeros(len(keys))
+    for step in _keys(NEIGHBOURS):
+        there = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
+        total += np.where(keys[there] == keys + step, score[there], 0.0)
+    return total
+
 
 # Edge of the cubes in which the maps compete for space [scene depths].
 EDGE = 1 / 16
@@ -54,7 +154,7 @@ def merge(mapper: OnlineMap, parts: Sequence[MappedPart], frames: Iterable[Track
     """Put the maps of the parts of a recording into a new online map.
 
     Every frame has the pose and the exposure that the part has found that it belongs to, and every Gaussian comes from
-    the part that owns its place, see `pipelines.merging.ownership`. What floats where another part sees free space is
+    the part that owns its place, see `pipelines.merging.merge`. What floats where another part sees free space is
     left out, see `pipelines.merging.free_space`.
 
     Args:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pipelines.pace.pace import CompletePace, Pace, Plan
-from pipelines.pace.realtime import RealtimePace
-from pipelines.pace.recorded import RecordedPace
+from pipelines.pace.realtime import RealtimePace, RecordedPace
 
 __all__ = ["CompletePace", "Pace", "Plan", "RealtimePace", "RecordedPace"]

@@ -1,12 +1,42 @@
-"""`RealtimePace`: gives every keyframe the work that there is time for."""
+"""`Costs`: running means of what the parts of a frame's work cost."""
 
 from __future__ import annotations
 
-from pipelines.pace.costs import Costs
+from collections.abc import Iterable
+
 from pipelines.pace.pace import FIRST_SWEEP, Plan
 from pipelines.settings import MappingSettings, OptimiseSettings
 
-__all__ = ["RealtimePace", "bounded_last_views"]
+__all__ = ["Costs", "RealtimePace", "RecordedPace", "bounded_last_views"]
+
+# Weight of a new measurement. The mean follows a growing map within some ten keyframes, and one hiccup moves it little.
+COST_WEIGHT = 0.15
+
+
+class Costs:
+    """Running means of measured times by kind of work.
+
+    The first measurements are averaged, later ones have the weight `COST_WEIGHT`.
+    """
+
+    def __init__(self) -> None:
+        self._mean: dict[str, float] = {}
+        self._count: dict[str, int] = {}
+
+    def learn(self, kind: str, seconds: float) -> None:
+        """Add a measurement of one unit of this kind [s]."""
+        count = self._count[kind] = self._count.get(kind, 0) + 1
+        before = self._mean.get(kind, seconds)
+        self._mean[kind] = before + max(COST_WEIGHT, 1.0 / count) * (seconds - before)
+
+    def of(self, kind: str, unknown: float) -> float:
+        """Return the mean of a kind [s], or `unknown` before its first measurement."""
+        return self._mean.get(kind, unknown)
+
+    def known(self) -> dict[str, float]:
+        """Return all means [s] by kind."""
+        return dict(self._mean)
+
 
 # Lag at the start of a keyframe that the pace holds, as a share of `max_lag`, and share of a deviation from it that is
 # made up for within one keyframe. A share between 0 and 1 lets the lag approach the goal without oscillating.
@@ -199,3 +229,39 @@ def _pixels_for(cost: float) -> float:
     """Return the share of the pixels whose depth has this relative cost, 0 if that is too few."""
     pixels = min(1.0, (cost - FIXED_DEPTH) / (1.0 - FIXED_DEPTH))
     return round(pixels, 3) if pixels >= LEAST_PIXELS else 0.0
+
+
+class RecordedPace:
+    """Repeats recorded decisions in their order, so that the same frames give the same map.
+
+    Args:
+        settings: Settings of the mapping.
+        decisions: For every frame that should have become a keyframe, its plan, or None if it was merged.
+    """
+
+    def __init__(self, settings: MappingSettings, decisions: Iterable[Plan | None]) -> None:
+        self._settings = settings
+        self._decisions = iter(decisions)
+        self._next: Plan | None = None
+
+    def takes_keyframe(self) -> bool:
+        """Return the next decision.
+
+        Raises:
+            ValueError: If the recording has no further decision, so that its frames were other ones.
+        """
+        try:
+            self._next = next(self._decisions)
+        except StopIteration:
+            raise ValueError("the recorded decisions end before the frames: these are other frames") from None
+        return self._next is not None
+
+    def plan(self, level: int, keyframes: int, frames: int) -> Plan:
+        assert self._next is not None, "takes_keyframe comes first, and was True"
+        return self._next
+
+    def steps_after_correction(self, keyframes: int, frames: int) -> int:
+        return 0
+
+    def last_views(self, keyframes: int) -> int:
+        return bounded_last_views(self._settings.optimise, keyframes)

@@ -11,7 +11,7 @@ from fields.map.covisibility import SeenPoints, covisibility
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
-from pipelines.select.sharpness import sharpness
+from pipelines.select.gate import sharpness
 from pipelines.settings import KeyframeSettings
 
 __all__ = ["KeyframeSelector"]

@@ -15,8 +15,7 @@ from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.paging import Paging
 from pipelines.companions import Companion
 from pipelines.render.renderer import Renderer
-from pipelines.transients.evidence import SAME_DEPTH, CoarseView, votes
-from pipelines.transients.masks import soft_mask
+from pipelines.transients.evidence import SAME_DEPTH, CoarseView, soft_mask, votes
 from pipelines.transients.sweep import EVERY, YOUNG, compared, latest
 
 __all__ = ["ChangeSweep", "EarlierVisit"]

@@ -15,8 +15,7 @@ from fields.map.keyframes import KeyframeStore
 from pipelines.blocks.paging import Paging
 from pipelines.companions import Companion
 from pipelines.render.renderer import Renderer
-from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
-from pipelines.transients.masks import soft_mask
+from pipelines.transients.evidence import CoarseView, coarse_view, moving, soft_mask, votes
 
 __all__ = ["EVERY", "YOUNG", "TransientSweep", "compared", "latest", "neighbours", "place_of", "without"]
 

@@ -14,7 +14,7 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, Convention
 from modp_ti.inputs.inspection.epipolar import MatchedPair, matched_pair
 from modp_ti.inputs.multiview.features import Features, detect_features
-from pipelines.select.sharpness import sharpness
+from pipelines.select.gate import sharpness
 
 __all__ = ["FrameRecord", "Survey", "survey"]
 
@@ -39,7 +39,7 @@ class FrameRecord:
         held_out: Whether it is held out.
         points: Number of tracked points.
         depth: Their median depth [scene units]; NaN without points.
-        sharpness: Sharpness as in `pipelines.select.sharpness`.
+        sharpness: Sharpness as in `pipelines.select.gate`.
         change: Mean difference to the frame before of the same view [grey levels of 255] at thumbnail size; NaN for the
             first frame.
         masked: Share of masked pixels.

@@ -1,4 +1,4 @@
-"""Gaussian processes on the log depths of a view's tracked points, over the image plane and guided by colour."""
+"""Covariance functions of Gaussian processes over the image plane, in PyTorch."""
 
 from __future__ import annotations
 
@@ -11,12 +11,117 @@ import torch
 from numpy.typing import NDArray
 
 from fields.map.keyframe import Keyframe
-from pipelines.densify.depth.covariance import matern32
-from pipelines.densify.depth.estimate import DepthEstimate, unknown_depth
-from pipelines.densify.depth.regression import MIN_POINTS, conditioning_points, regress_log_depth
+from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
 from pipelines.settings import DepthSettings
 
-__all__ = ["GaussianProcessDepth", "ImageGuidedDepth"]
+__all__ = [
+    "MIN_POINTS",
+    "GaussianProcessDepth",
+    "ImageGuidedDepth",
+    "conditioning_points",
+    "matern32",
+    "nonstationary_matern32",
+    "nonstationary_variance",
+    "regress_log_depth",
+]
+
+EPSILON = 1e-8
+
+
+def matern32(distance: torch.Tensor) -> torch.Tensor:
+    """Matern 3/2 correlation at `distance`, in units of the length scale."""
+    r = np.sqrt(3.0) * distance
+    return (1.0 + r) * torch.exp(-r)
+
+
+def nonstationary_matern32(p: torch.Tensor, E: torch.Tensor, q: torch.Tensor, F: torch.Tensor) -> torch.Tensor:
+    """Correlation of a non-stationary Matern 3/2 process [Paciorek 2003; Dexheimer 2023].
+
+    The correlation is C (1 + r) exp(-r) with d = p - q, S = E + F, Q = d' S^-1 d / 2, r = sqrt(3 (Q + eps)),
+    C = 2 (|E| |F|)^(1/4) / sqrt(|S| + eps) and eps = 1e-8. Where the covariances vary slowly, it approaches the
+    stationary Matern process that they describe.
+
+    Args:
+        p: Points (N, 2).
+        E: Covariances (N, 3) at p as (xx, xy, yy), positive definite, with the axes of p.
+        q: Points (M, 2).
+        F: Covariances (M, 3) at q, likewise.
+
+    Returns:
+        Correlation (N, M).
+    """
+    d = p[:, None] - q[None]
+    S = E[:, None] + F[None]
+    det = _determinant(S)
+    Q = 0.5 * (S[..., 2] * d[..., 0] ** 2 - 2.0 * S[..., 1] * d[..., 0] * d[..., 1] + S[..., 0] * d[..., 1] ** 2) / det
+    C = 2.0 * (_determinant(E)[:, None] * _determinant(F)[None]) ** 0.25 / torch.sqrt(det + EPSILON)
+    return C * matern32(torch.sqrt(Q + EPSILON))
+
+
+def nonstationary_variance(E: torch.Tensor) -> torch.Tensor:
+    """Diagonal (N,) of `nonstationary_matern32`(p, E, p, E), which is 1 except for eps."""
+    det = _determinant(E)
+    C = 2.0 * torch.sqrt(det) / torch.sqrt(4.0 * det + EPSILON)
+    return C * matern32(torch.full_like(det, EPSILON).sqrt())
+
+
+def _determinant(A: torch.Tensor) -> torch.Tensor:
+    return A[..., 0] * A[..., 2] - A[..., 1] ** 2
+
+
+# Minimum number of points to condition a process on. Fewer contain no information about the shape of the scene.
+MIN_POINTS = 3
+
+
+def conditioning_points(
+    view: Keyframe, max_points: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Select tracked points to condition a process on.
+
+    Args:
+        view: The view.
+        max_points: Maximum number of points. If there are more, a random subset is used.
+        rng: Random generator.
+
+    Returns:
+        Pixels (M, 2) and depths (M,) of the points.
+    """
+    places, z = point_depths(view)
+    if len(z) > max_points:
+        some = np.sort(rng.choice(len(z), max_points, replace=False))
+        places, z = places[some], z[some]
+    return places, z
+
+
+def regress_log_depth(
+    depth: NDArray[np.float64],
+    K: torch.Tensor,
+    noise: float,
+    k: torch.Tensor,
+    prior: torch.Tensor | float,
+) -> DepthEstimate:
+    """Predict depth at N points from M known depths, by the covariances of a process on log depth (float64).
+
+    With y the known log depths and mu their mean (Section 3.2.2; Dexheimer 2023):
+    mean = mu + k (K + noise I)^-1 (y - mu), variance = prior - diag(k (K + noise I)^-1 k'), depth = exp(mean).
+
+    Args:
+        depth: Known depths (M,), positive.
+        K: Covariance (M, M) of the known points.
+        noise: Noise variance of the known log depths.
+        k: Covariance (N, M) between the predicted and the known points.
+        prior: Prior variance of the predicted points, (N,) or a scalar.
+
+    Returns:
+        Depth (N,) and deviation (N,).
+    """
+    y = torch.from_numpy(np.log(depth))
+    mu = y.mean()
+    L = torch.linalg.cholesky(K + noise * torch.eye(len(y), dtype=K.dtype))
+    mean = mu + k @ torch.cholesky_solve((y - mu)[:, None], L)[:, 0]
+    half = torch.linalg.solve_triangular(L, k.T, upper=False)
+    variance = prior - (half * half).sum(0)
+    return DepthEstimate(torch.exp(mean).numpy(), variance.clamp_min(0.0).sqrt().numpy())
 
 
 class GaussianProcessDepth:

@@ -6,11 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipelines.densify.depth.depthcov import DepthCov
-from pipelines.densify.depth.depthcov_checkpoint import load_depthcov
+from pipelines.densify.depth.depthcov import DepthCov, load_depthcov
 from pipelines.densify.depth.epipolar import EpipolarDepth
-from pipelines.densify.depth.estimate import DepthEstimator
-from pipelines.densify.depth.fusion import FusedDepth
+from pipelines.densify.depth.estimate import DepthEstimator, FusedDepth
 from pipelines.densify.depth.gaussian_process import GaussianProcessDepth, ImageGuidedDepth
 from pipelines.densify.depth.map_depth import MapDepth
 from pipelines.render.renderer import Renderer

@@ -9,7 +9,7 @@ import pytest
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframes import KeyframeStore
-from pipelines.optimise.light import CHANGED, light_changes
+from pipelines.optimise.exposure import CHANGED, light_changes
 from tests.pipelines.wall import CAMERA, frame
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.select.sharpness import sharpness
+from pipelines.select.gate import sharpness
 
 
 def photograph(seed: int, size: tuple[int, int] = (120, 160)) -> np.ndarray:

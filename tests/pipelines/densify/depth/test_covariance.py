@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pipelines.densify.depth.covariance import matern32, nonstationary_matern32, nonstationary_variance
+from pipelines.densify.depth.gaussian_process import matern32, nonstationary_matern32, nonstationary_variance
 
 
 def covariances(count: int, seed: int) -> torch.Tensor:

@@ -14,7 +14,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.densify.depth import DepthCov, load_depthcov
-from pipelines.densify.depth.depthcov_checkpoint import DepthCovWeights
+from pipelines.densify.depth.depthcov import DepthCovWeights
 from pipelines.settings import DepthSettings
 
 

@@ -8,7 +8,7 @@ import torch
 from torch.nn import functional
 
 from pipelines.densify.depth import load_depthcov
-from pipelines.densify.depth.depthcov_network import pixel_covariances
+from pipelines.densify.depth.depthcov import pixel_covariances
 
 Entries = dict[str, torch.Tensor]
 

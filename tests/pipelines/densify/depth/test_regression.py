@@ -7,7 +7,7 @@ import torch
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
-from pipelines.densify.depth.regression import conditioning_points, regress_log_depth
+from pipelines.densify.depth.gaussian_process import conditioning_points, regress_log_depth
 
 CAMERA = PinholeCamera(50.0, 50.0, 32.0, 24.0, 64, 48)
 
