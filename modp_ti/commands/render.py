@@ -38,7 +38,7 @@ def render(
             "--output",
             "-o",
             metavar="PATH",
-            help="a video, by its ending .mp4 (quick) or .webm (for browsers), or else a new folder of pictures; "
+            help="a video, by its ending .mp4 (H.264) or .webm (VP9, smaller), or else a new folder of pictures; "
             "empty: OUT/PATH-NAME.mp4",
         ),
     ] = None,

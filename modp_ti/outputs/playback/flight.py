@@ -44,14 +44,6 @@ class Flight:
     frames_per_second: float
     exposures: list[NDArray[np.float64]] | None = None
 
-    def even(self) -> Flight:
-        """Return the flight with even picture sizes, as videos require. An odd last row or column is cropped."""
-        cameras = [
-            PinholeCamera(c.fx, c.fy, c.cx, c.cy, max(c.width // 2 * 2, 2), max(c.height // 2 * 2, 2))
-            for c in self.cameras
-        ]
-        return replace(self, cameras=cameras)
-
 
 def plan_flight(
     run: FinishedRun,
@@ -118,7 +110,6 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
         InputError: If the output cannot be written. This is checked before rendering.
     """
     require_writable(output)
-    flight = flight.even() if is_video(output) else flight
     with line.working("loading the map"):
         gaussians = run.gaussians
         start_device(device)
