@@ -8,7 +8,7 @@ import typer
 
 from fields.runtime.engine import EngineError, engine
 from modp_ti.commands import batch, cameras, check, convert, export, locate, refine, render, run, view, warmup
-from modp_ti.commands.shared import examples
+from modp_ti.commands.shared import MARKUP, CommandGroup, examples
 from modp_ti.version import __version__
 
 __all__ = ["app"]
@@ -31,6 +31,8 @@ ENDS = (
 
 app = typer.Typer(
     name="modp-ti",
+    cls=CommandGroup,
+    rich_markup_mode=MARKUP,
     help="Photorealistic 3D Gaussian maps from one RGB camera, built while the frames arrive.",
     epilog=f"{OVERVIEW}\n\n{ENDS}",
     no_args_is_help=True,
