@@ -63,13 +63,16 @@ def read_any_splats(path: Path) -> dict[str, NDArray[np.float32]]:
     return state
 
 
-def convert_splats(source: Path, target: Path, spz_version: int = DEFAULT_VERSION) -> int:
+def convert_splats(
+    source: Path, target: Path, spz_version: int = DEFAULT_VERSION, note: Callable[[str], object] = str
+) -> int:
     """Read splats and write them in the format that the target's name tells. Its folder is made.
 
     Args:
         source: The file to read.
         target: The file to write, another one.
         spz_version: Version of an `.spz` file.
+        note: Called with a note for the user, if there is one.
 
     Returns:
         The number of Gaussians.
@@ -86,7 +89,8 @@ def convert_splats(source: Path, target: Path, spz_version: int = DEFAULT_VERSIO
     try:
         target.absolute().parent.mkdir(parents=True, exist_ok=True)
         if suffix == ".spz":
-            write_spz(target, state, spz_version)
+            if said := write_spz(target, state, spz_version):
+                note(said)
         else:
             WRITERS[suffix](target, state)
     except OSError as error:

@@ -99,7 +99,9 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
     last = list(run.versions.values())[-1]
     plan = plan_of(last.trajectory)
     floor = floor_plan(plan, last.gaussians, camera_centres(last.trajectory))
-    drawings = {"psnr": plots.psnr_of_frames(run.scores, run.record.frames)}
+    drawings = {}
+    if run.scores or any(note.mapped_psnr is not None for note in run.record.frames):
+        drawings["psnr"] = plots.psnr_of_frames(run.scores, run.record.frames)
     if run.record.frames and run.config.mode == "online":
         drawings["growth"] = plots.growth(run.record.frames)
     if any(note.lag is not None for note in run.record.frames):
