@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 __all__ = [
+    "BAD_INPUT",
     "MARKUP",
     "Address",
     "AsJson",
@@ -211,25 +212,23 @@ def examples(*lines: str) -> str:
 class Command(TyperCommand):
     """A command whose wrong options are said as any other wrong input is: in one line, and in JSON with `--json`."""
 
-    def main(self, args: Sequence[str] | None = None, **settings: Any) -> Any:
-        _parsed(super().main, sys.argv[1:] if args is None else args, settings)
+    def main(self, *args: Any, **settings: Any) -> Any:
+        _parsed(super().main, *args, **settings)
 
 
 class CommandGroup(TyperGroup):
-    """A group of commands, with errors as `Command` has them. Without any word, it prints its help."""
+    """A group of commands, with errors as `Command` has them."""
 
-    def main(self, args: Sequence[str] | None = None, **settings: Any) -> Any:
-        given = sys.argv[1:] if args is None else args
-        return _parsed(super().main, given, settings) if given else super().main(given, **settings)
+    def main(self, *args: Any, **settings: Any) -> Any:
+        _parsed(super().main, *args, **settings)
 
 
-def _parsed(main: Callable[..., Any], given: Sequence[str], settings: dict[str, Any]) -> NoReturn:
+def _parsed(main: Callable[..., Any], args: Sequence[str] | None = None, **settings: Any) -> NoReturn:
     """Run the `main` of a command with what was typed, and exit."""
+    given = sys.argv[1:] if args is None else args
     try:
         sys.exit(main(given, **settings | {"standalone_mode": False}) or 0)
-    except Exception as error:
-        if not isinstance(error, USAGE_ERROR):
-            raise
+    except USAGE_ERROR as error:
         message = one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
         with suppress(typer.Exit):
             _end(BAD_INPUT, f"{message}; see --help", "--json" in given)

@@ -22,7 +22,7 @@ from modp_ti.outputs.formats.web_splat import read_web_splat, write_web_splat
 __all__ = ["convert_splats", "read_any_splats"]
 
 # By the end of the name, the longer first.
-WRITERS: dict[str, Callable[[Path, dict[str, NDArray]], None]] = {
+WRITERS: dict[str, Callable[[Path, dict[str, NDArray]], object]] = {
     ".compressed.ply": write_compressed_ply,
     ".ply": write_splats,
     ".spz": write_spz,

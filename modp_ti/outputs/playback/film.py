@@ -99,6 +99,7 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
         InputError: If the video cannot be written.
     """
     import av
+    import av.error
 
     codec, options, layout = VIDEO_SUFFIXES[path.suffix.lower()]
     pictures = iter(pictures)
@@ -117,7 +118,7 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
                 file.mux(stream.encode(frame.reformat(format="yuv420p", interpolation=UNBIASED, **tagged)))
             file.mux(stream.encode(None))
-    except (OSError, av.FFmpegError) as error:
+    except (OSError, av.error.FFmpegError) as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
