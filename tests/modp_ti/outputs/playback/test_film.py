@@ -55,3 +55,17 @@ def test_a_video_that_fails_leaves_nothing(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(InputError, match="no more"):
         write_video(tmp_path / f"film{suffix}", pictures(), 10)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", VIDEO_SUFFIXES)
+def test_a_full_disk_is_said(tmp_path: Path, suffix: str) -> None:
+    resource = pytest.importorskip("resource")
+    noise = np.random.default_rng(0).integers(0, 256, (8, 48, 64, 3), dtype=np.uint8)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, limits[1]))  # larger files fail, as on a full disk
+    try:
+        with pytest.raises(InputError, match="cannot be written"):
+            write_video(tmp_path / f"film{suffix}", noise, 10)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
