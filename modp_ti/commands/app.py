@@ -8,7 +8,7 @@ import typer
 
 from fields.runtime.engine import EngineError, engine
 from modp_ti.commands import batch, cameras, check, convert, export, locate, refine, render, run, view, warmup
-from modp_ti.commands.shared import examples
+from modp_ti.commands.shared import BAD_INPUT, MARKUP, CommandGroup, examples
 from modp_ti.version import __version__
 
 __all__ = ["app"]
@@ -31,9 +31,10 @@ ENDS = (
 
 app = typer.Typer(
     name="modp-ti",
+    cls=CommandGroup,
+    rich_markup_mode=MARKUP,
     help="Photorealistic 3D Gaussian maps from one RGB camera, built while the frames arrive.",
     epilog=f"{OVERVIEW}\n\n{ENDS}",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 
@@ -48,13 +49,16 @@ def _print_version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and end")
     ] = False,
 ) -> None:
-    pass
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        raise typer.Exit(BAD_INPUT)
 
 
 app.command("run", epilog=run.EXAMPLES)(run.run)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from modp_ti.commands.shared import AsJson, Quiet, examples, outcome, progress_console
+from modp_ti.files.errors import InputError
 
 __all__ = ["EXAMPLES", "convert"]
 
@@ -22,7 +23,9 @@ def convert(
         Path,
         typer.Argument(metavar="B", help="file to write: .ply, .compressed.ply, .spz, .sog, .splat, .ksplat, .glb"),
     ],
-    spz_version: Annotated[int, typer.Option(min=2, max=4, help="version of an .spz file, 2 to 4")] = 3,
+    spz_version: Annotated[
+        int | None, typer.Option(min=2, max=4, help="version of an .spz file, 2 to 4; empty: 3")
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -30,9 +33,14 @@ def convert(
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.outputs.formats.splat_files import convert_splats
+        from modp_ti.outputs.formats.spz import DEFAULT_VERSION
         from modp_ti.outputs.progress import ProgressLine
 
-        with ProgressLine(progress_console(quiet)).working("converting"):
-            count = convert_splats(source.expanduser(), target.expanduser(), spz_version)
+        if spz_version is not None and target.suffix.lower() != ".spz":
+            raise InputError(f"--spz-version: is for .spz files, not for {target}: leave it out")
+        line = ProgressLine(progress_console(quiet))
+        with line.working("converting"):
+            given = source.expanduser(), target.expanduser(), spz_version or DEFAULT_VERSION
+            count = convert_splats(*given, lambda text: line.note(f"note: {text}"))
         result.text = f"written to {target}"
         result.data = {"output": str(target.absolute()), "gaussians": count}

@@ -61,7 +61,9 @@ def export(
     texture: Annotated[
         bool, typer.Option("--texture", help="`mesh`: with a texture, as GLB (needs the extra `texture`)")
     ] = False,
-    spz_version: Annotated[int, typer.Option(min=2, max=4, help="`spz`: version of the format, 2 to 4")] = 3,
+    spz_version: Annotated[
+        int | None, typer.Option(min=2, max=4, help="`spz`: version of the format, 2 to 4; empty: 3")
+    ] = None,
     device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -73,7 +75,7 @@ def export(
         from modp_ti.outputs.playback.finished_run import open_run
         from modp_ti.outputs.progress import ProgressLine
 
-        options = ExportOptions(voxel or None, texture, device.value, spz_version)
+        options = ExportOptions(voxel, texture, device.value, spz_version)
         line = ProgressLine(progress_console(quiet))
         with line.working("reading the run"):
             run = open_run(out)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from modp_ti.commands.shared import AsJson, Device, Quiet, examples, one_line, outcome, progress_console
+from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
     from modp_ti.outputs.locating.locator import Location
@@ -53,6 +54,11 @@ def locate(
         console = progress_console(quiet)
         line = ProgressLine(console)
         given = None if camera is None else given_camera(camera)
+        for picture in pictures:
+            if not picture.is_file():
+                raise InputError(
+                    f"{picture}: {'is a folder' if picture.is_dir() else 'no such picture'}; name image files"
+                )
         locator = Locator(out, device.value, console)
         found = [locator.locate(picture, given) for picture in line.through("locating", pictures, len(pictures))]
         for note in dict.fromkeys(location.note for location in found):

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from modp_ti.commands.shared import AsJson, Device, Quiet, examples, outcome, picture_size, progress_console
+from modp_ti.files.errors import InputError
 
 __all__ = ["EXAMPLES", "render"]
 
@@ -38,7 +39,7 @@ def render(
             "--output",
             "-o",
             metavar="PATH",
-            help="a video, by its ending .mp4 (quick) or .webm (for browsers), or else a new folder of pictures; "
+            help="a video, by its ending .mp4 (H.264) or .webm (VP9, smaller), or else a new folder of pictures; "
             "empty: OUT/PATH-NAME.mp4",
         ),
     ] = None,
@@ -59,8 +60,9 @@ def render(
         int | None, typer.Option(min=1, help="pictures of a smoothed path or an orbit; empty: 240 or more")
     ] = None,
     smooth: Annotated[
-        float, typer.Option(min=0, help="of a smoothed path: frames around each that it is averaged with (deviation)")
-    ] = 5.0,
+        float | None,
+        typer.Option(min=0, help="of a smoothed path: frames around each that it is averaged with; empty: 5"),
+    ] = None,
     fps: Annotated[
         float | None, typer.Option(min=1, max=120, help="frames per second of a video; empty: as recorded, else 30")
     ] = None,
@@ -74,6 +76,7 @@ def render(
     """Render a finished map along the recorded path, a smoothed one, an orbit, or any path of your own."""
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
+        from modp_ti.outputs.playback.film import is_video
         from modp_ti.outputs.playback.finished_run import open_run
         from modp_ti.outputs.playback.flight import film, plan_flight
         from modp_ti.outputs.progress import ProgressLine
@@ -81,11 +84,13 @@ def render(
         line = ProgressLine(progress_console(quiet))
         with line.working("reading the run"):
             run = open_run(out)
+        depth = show is Shown.depth
+        target = output or run.folder / f"{Path(path).stem}{'-depth' if depth else ''}.mp4"
+        if fps is not None and not is_video(target):
+            raise InputError(f"--fps: is for videos, and {target} is a folder of pictures: leave it out")
         flight = plan_flight(
             run, path, picture_size(size) if size is not None else None, fov, frames, fps, smooth, exposure
         )
-        depth = show is Shown.depth
-        target = output or run.folder / f"{Path(path).stem}{'-depth' if depth else ''}.mp4"
         film(run, flight, target, depth, device.value, line)
         result.text = f"written to {target}"
         result.data = {"output": str(target.absolute()), "pictures": len(flight.poses)}

@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from fields.runtime.engine import EngineError
 from modp_ti.config.presets import PRESETS
@@ -23,9 +25,12 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 __all__ = [
+    "BAD_INPUT",
+    "MARKUP",
     "Address",
     "AsJson",
     "Best",
+    "CommandGroup",
     "Device",
     "Fast",
     "Outcome",
@@ -44,6 +49,12 @@ __all__ = [
 
 # Exit codes; docs/commands.md lists all of them. 1 has its own meaning in `check` and `locate`.
 BAD_INPUT, FAULT, INTERRUPTED = 2, 3, 130
+
+# Boxes on a narrow terminal cut the names of options.
+MARKUP: Any = "rich" if shutil.get_terminal_size().columns >= 60 else None
+
+# The errors of parsing, whose class typer does not export: a base of one that it does.
+USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
 # Longest error message in characters, since messages may quote the content of a damaged file.
 MAX_MESSAGE = 1000
@@ -94,7 +105,8 @@ Overrides = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="sets a key of the scene file, for example --set source.scale=0.5; repeatable",
+        help="sets a key of the scene file, for example --set source.scale=0.5; repeatable; paths are relative to the "
+        "current folder",
         autocompletion=matching_settings,
     ),
 ]
@@ -193,13 +205,40 @@ def progress_console(quiet: bool) -> Console:
 
 def examples(*lines: str) -> str:
     """Format example calls, each optionally followed by its meaning, as the epilog of a help text."""
-    return "\n".join(["Examples:", *(f"  {line}" for line in lines)])
+    kept = [] if MARKUP else ["\b"]  # without markup, this keeps the lines
+    return "\n".join([*kept, "Examples:", *(f"  {line}" for line in lines)])
+
+
+class Command(TyperCommand):
+    """A command whose wrong options are said as any other wrong input is: in one line, and in JSON with `--json`."""
+
+    def main(self, *args: Any, **settings: Any) -> Any:
+        _parsed(super().main, *args, **settings)
+
+
+class CommandGroup(TyperGroup):
+    """A group of commands, with errors as `Command` has them."""
+
+    def main(self, *args: Any, **settings: Any) -> Any:
+        _parsed(super().main, *args, **settings)
+
+
+def _parsed(main: Callable[..., Any], args: Sequence[str] | None = None, **settings: Any) -> NoReturn:
+    """Run the `main` of a command with what was typed, and exit."""
+    given = sys.argv[1:] if args is None else args
+    try:
+        sys.exit(main(given, **settings | {"standalone_mode": False}) or 0)
+    except USAGE_ERROR as error:
+        message = one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
+        with suppress(typer.Exit):
+            _end(BAD_INPUT, f"{message}; see --help", "--json" in given)
+        sys.exit(BAD_INPUT)
 
 
 def standalone(command: Callable[..., None], epilog: str) -> None:
     """Run one command as a separate program, as `python -m modp_ti.run` does."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command(epilog=epilog)(command)
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=MARKUP)
+    app.command(epilog=epilog, cls=Command)(command)
     app()
 
 

@@ -30,8 +30,8 @@ INTRODUCTION = """\
 
 This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`
 for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the
-nearest right one. Units are in square brackets. To override a key on the command line, use `--set`; `--fast` and
-`--best` set several at once ([Presets](#presets)):
+nearest right one. Units are in square brackets. To override a key on the command line, use `--set`, whose paths are
+relative to the folder where the command is typed; `--fast` and `--best` set several at once ([Presets](#presets)):
 
 ```sh
 modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000

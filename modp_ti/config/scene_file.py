@@ -7,7 +7,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,6 +30,9 @@ __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
 M = TypeVar("M", bound=BaseModel)
 
+# How the origin of an overridden key begins, in messages.
+OVERRIDE = "--set "
+
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
     """Read a scene file.
@@ -40,8 +43,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
         preset: Name of a preset, whose settings replace defaults only: "fast" or "best". None for the defaults.
 
     Returns:
-        The settings, with absolute paths. Relative paths, including those of overrides, are resolved against the
-        scene file's folder.
+        The settings, with absolute paths. Relative paths of the file are resolved against its folder, and those of
+        overrides, which are typed in a shell, against the working directory.
 
     Raises:
         InputError: With a one-line message, if the file is unreadable, a key or the preset is unknown, or a value is
@@ -70,7 +73,9 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
             f"{file}: a scene file has keys such as `source:`, `tracker:` and `output:`; this one holds none"
         )
     where = {key: f"{file}:{line}" for key, line in lines.items()}
-    return _with_absolute_paths(_resolved(data, where, str(file), overrides, preset), file.resolve().parent)
+    config = _resolved(data, where, str(file), overrides, preset)
+    typed = {key for key, origin in where.items() if origin.startswith(OVERRIDE)}
+    return _with_absolute_paths(config, file.resolve().parent, typed)
 
 
 def scene_from_data(
@@ -92,13 +97,15 @@ def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
     replace_text(path, text)
 
 
-def _with_absolute_paths(model: M, base: Path) -> M:
+def _with_absolute_paths(model: M, base: Path, typed: Collection[str] = (), section: str = "") -> M:
+    """Resolve paths against `base`, and those of the dotted keys or sections `typed` against the working directory."""
     update: dict[str, Any] = {}
     for name, value in model:
+        here = Path.cwd() if section + name in typed else base
         if isinstance(value, Path):
-            update[name] = _absolute_path(value, base, name)
+            update[name] = _absolute_path(value, here, name)
         elif isinstance(value, BaseModel):
-            update[name] = _with_absolute_paths(value, base)
+            update[name] = _with_absolute_paths(value, here, typed, f"{section}{name}.")
     return model.model_copy(update=update)
 
 
@@ -268,7 +275,7 @@ def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any
 
 def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
     """Write one "section.key=value" into the raw data."""
-    origin = f"--set {override}"
+    origin = f"{OVERRIDE}{override}"
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:

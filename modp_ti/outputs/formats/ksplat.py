@@ -39,6 +39,8 @@ __all__ = ["read_ksplat", "write_ksplat"]
 HEADER, SECTION_HEADER = 4096, 1024
 # The written level, and the harmonics' range of files that state none.
 LEVEL, HARMONIC = 1, 1.5
+# The largest float16.
+HALF = 65504.0
 # Positions in a bucket: 0 to 2 * RANGE over its size. A bucket holds at most BUCKET Gaussians.
 RANGE, BUCKET = 32767, 256
 CODES = 1 << 16
@@ -80,7 +82,7 @@ def write_ksplat(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> 
     count, degree = len(order), min(round(state["sh"].shape[1] ** 0.5) - 1, 2)
     table = np.zeros(count, _record(LEVEL, degree))
     table["position"] = np.clip(np.round(offset * (RANGE / (size / 2)) + RANGE), 0, CODES - 1)
-    table["scale"] = np.exp(state["log_scale"].astype(np.float64))
+    table["scale"] = np.exp(np.minimum(state["log_scale"].astype(np.float64), np.log(HALF)))
     table["rotation"] = unit_quaternions(state)
     table["rgba"][:, :3] = to_bits(0.5 + SH_C0 * state["sh"][:, 0], 8)
     table["rgba"][:, 3] = to_bits(opacities(state), 8)

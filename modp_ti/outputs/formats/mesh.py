@@ -210,7 +210,8 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh) -> None:
         return
     o3d = open3d()
     mesh.compute_vertex_normals()
-    with written_aside(path) as partial:
+    level = o3d.utility.VerbosityLevel.Error  # OBJ has no normals of triangles, which needs no word
+    with written_aside(path) as partial, o3d.utility.VerbosityContextManager(level):
         if not o3d.io.write_triangle_mesh(str(partial), mesh):
             raise OSError(None, "Open3D could not write the mesh")
 

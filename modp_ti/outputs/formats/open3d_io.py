@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,10 +31,11 @@ def open3d() -> ModuleType:
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """Yield a temporary path with the same suffix, in small letters, whose file replaces `path` on exit."""
-    partial = path.with_name(f"{path.stem}.partial{path.suffix.lower()}")
-    try:
+    """Yield a path in a temporary folder, whose file replaces `path` on exit.
+
+    Its name is the same, which some writers store, but for the suffix, which is in small letters.
+    """
+    with tempfile.TemporaryDirectory(prefix=".partial-", dir=path.parent) as folder:
+        partial = Path(folder) / f"{path.stem}{path.suffix.lower()}"
         yield partial
         os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from modp_ti.outputs.formats.web_splat import read_web_splat, write_web_splat
 __all__ = ["convert_splats", "read_any_splats"]
 
 # By the end of the name, the longer first.
-WRITERS: dict[str, Callable[[Path, dict[str, NDArray]], None]] = {
+WRITERS: dict[str, Callable[[Path, dict[str, NDArray]], object]] = {
     ".compressed.ply": write_compressed_ply,
     ".ply": write_splats,
     ".spz": write_spz,
@@ -63,13 +63,16 @@ def read_any_splats(path: Path) -> dict[str, NDArray[np.float32]]:
     return state
 
 
-def convert_splats(source: Path, target: Path, spz_version: int = DEFAULT_VERSION) -> int:
+def convert_splats(
+    source: Path, target: Path, spz_version: int = DEFAULT_VERSION, note: Callable[[str], object] = str
+) -> int:
     """Read splats and write them in the format that the target's name tells. Its folder is made.
 
     Args:
         source: The file to read.
         target: The file to write, another one.
         spz_version: Version of an `.spz` file.
+        note: Called with a note for the user, if there is one.
 
     Returns:
         The number of Gaussians.
@@ -86,7 +89,8 @@ def convert_splats(source: Path, target: Path, spz_version: int = DEFAULT_VERSIO
     try:
         target.absolute().parent.mkdir(parents=True, exist_ok=True)
         if suffix == ".spz":
-            write_spz(target, state, spz_version)
+            if said := write_spz(target, state, spz_version):
+                note(said)
         else:
             WRITERS[suffix](target, state)
     except OSError as error:

@@ -54,6 +54,8 @@ TABLE_START = 32
 # Resolution of positions, as a fraction of the size (largest axis) that 95 percent of the Gaussians exceed. A finer one
 # would store noise that does not compress.
 FINEST = 1 / 32
+# Resolution that is coarse enough for a note, as a fraction of the same size.
+COARSEST = 1 / 4
 # A rotation by 180 degrees around x flips the sign of the harmonics that are odd in (y, z): degree 1, 2, 3.
 TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float64)
 HALF_TURN = np.array([1.0, -1.0, -1.0])
@@ -61,13 +63,16 @@ HALF_TURN = np.array([1.0, -1.0, -1.0])
 MOST, GZIP_RATIO, MOST_EXTRA = 100_000_000, 1040, 1 << 20
 
 
-def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray], version: int = DEFAULT_VERSION) -> None:
+def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray], version: int = DEFAULT_VERSION) -> str:
     """Write Gaussians, marked as trained with anti-aliasing.
 
     Args:
         path: The file.
         state: Gaussians by name, as from `GaussianField.to_numpy`.
         version: 2, 3 or 4. Version 4 needs the package `zstandard`.
+
+    Returns:
+        A note for the user if the map is so far from the origin that small Gaussians move visibly, else "".
 
     Raises:
         InputError: If the map's extent exceeds 24-bit positions, or a package is missing.
@@ -80,6 +85,13 @@ def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray], versio
     if fitting < 0:
         raise InputError(
             f"the map reaches {extent:.3g} units from the origin, beyond what .spz holds: take another form"
+        )
+    step = 2.0**-fractional
+    note = ""
+    if step > COARSEST * small:
+        note = (
+            f"the map reaches {extent:.3g} units from the origin, so that .spz rounds positions to {step:.2g}: move it "
+            "to the origin, or take another form"
         )
     fixed = np.round(position * 2.0**fractional).astype("<i4")
     degree = round(state["sh"].shape[1] ** 0.5) - 1
@@ -97,13 +109,14 @@ def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray], versio
     if version < 4:
         header = HEADER.pack(MAGIC, version, len(position), degree, fractional, ANTIALIASED, 0)
         replace_file(path, gzip.compress(header + b"".join(parts), mtime=0))
-        return
+        return note
     parts = [part for part in parts if part]
     streams = [_zstandard().ZstdCompressor(level=12).compress(part) for part in parts]
     header = HEADER.pack(MAGIC, version, len(position), degree, fractional, ANTIALIASED, len(parts))
     header += struct.pack("<I", TABLE_START) + bytes(12)
     table = b"".join(TABLE_ENTRY.pack(len(there), len(here)) for there, here in zip(streams, parts, strict=True))
     replace_file(path, header + table + b"".join(streams))
+    return note
 
 
 def read_spz(data: bytes, path: Path) -> dict[str, NDArray]:

@@ -63,13 +63,13 @@ class ExportOptions:
         voxel: Edge of the mesh's voxels [scene units], None for VOXEL times the scene's depth.
         texture: Whether the mesh gets a texture instead of a colour per vertex.
         device: Device for rendering.
-        spz_version: Version of `.spz` to write.
+        spz_version: Version of `.spz` to write, None for the default.
     """
 
     voxel: float | None = None
     texture: bool = False
     device: str = "auto"
-    spz_version: int = DEFAULT_VERSION
+    spz_version: int | None = None
 
 
 def export_map(run: FinishedRun, format: str, output: Path | None, options: ExportOptions, line: ProgressLine) -> Path:
@@ -88,9 +88,11 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     Raises:
         InputError: If the export is not possible.
     """
+    given = {"voxel": options.voxel is not None, "texture": options.texture, "spz-version": options.spz_version}
+    for option, of in (("voxel", "mesh"), ("texture", "mesh"), ("spz-version", "spz")):
+        if given[option] and format != of:
+            raise InputError(f"--{option}: --format {format} has none; use --format {of}, or leave it out")
     if options.texture:
-        if format != "mesh":
-            raise InputError(f"--texture: --format {format} has no texture; use --format mesh")
         output = run.folder / TEXTURED_NAME if output is None else output
     target = _target(run, format, output)
     if options.texture:
@@ -109,7 +111,9 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
             write_web_splat(target, with_plain_colours(run, line))
         elif format == "spz":
             with line.working("writing splats"):
-                write_spz(target, run.gaussians, options.spz_version)
+                note = write_spz(target, run.gaussians, options.spz_version or DEFAULT_VERSION)
+            if note:
+                line.note(f"note: {note}")
         elif format in SPLATS:
             with line.working("writing splats"):
                 SPLATS[format](target, run.gaussians)

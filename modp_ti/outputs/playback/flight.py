@@ -26,6 +26,7 @@ PATHS = ("recorded", "smoothed", "orbit")
 # Number of pictures and frame rate of paths that do not define their own.
 DEFAULT_FRAMES = 240
 DEFAULT_FPS = 30.0
+DEVIATION = 5.0
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,6 @@ class Flight:
     frames_per_second: float
     exposures: list[NDArray[np.float64]] | None = None
 
-    def even(self) -> Flight:
-        """Return the flight with even picture sizes, as videos require. An odd last row or column is cropped."""
-        cameras = [
-            PinholeCamera(c.fx, c.fy, c.cx, c.cy, max(c.width // 2 * 2, 2), max(c.height // 2 * 2, 2))
-            for c in self.cameras
-        ]
-        return replace(self, cameras=cameras)
-
 
 def plan_flight(
     run: FinishedRun,
@@ -60,7 +53,7 @@ def plan_flight(
     fov: float | None = None,
     frames: int | None = None,
     fps: float | None = None,
-    deviation: float = 5.0,
+    deviation: float | None = None,
     exposure: bool = False,
 ) -> Flight:
     """Plan a flight along a path.
@@ -72,16 +65,19 @@ def plan_flight(
         fov: Horizontal field of view [degrees], None for the recorded one.
         frames: Number of pictures of a smoothed path or an orbit, None for the default.
         fps: Frame rate, None for that of the path's time stamps.
-        deviation: Standard deviation of the smoothing [frames].
+        deviation: Standard deviation of the smoothing of a smoothed path [frames], None for the default.
         exposure: Apply each frame's exposure. Only for the recorded path.
 
     Raises:
-        InputError: If the path is unknown, its file is invalid, `frames` is given for a path with its own poses, or the
-            exposures are not available.
+        InputError: If the path is unknown, its file is invalid, `frames` is given for a path with its own poses,
+            `deviation` for another path than a smoothed one, or the exposures are not available.
     """
     exposures = _exposures(run, path) if exposure else None
     times = None
+    if deviation is not None and path != "smoothed":
+        raise InputError(f"--smooth is for the path `smoothed`, not for {path}: leave it out")
     if path == "smoothed":
+        deviation = DEVIATION if deviation is None else deviation
         poses = smoothed(run.poses[run.way], frames or max(DEFAULT_FRAMES, len(run.way)), deviation)
     elif path == "orbit":
         poses = orbit(run.poses[run.record.keyframes], run.record.scene_depth, frames or DEFAULT_FRAMES)
@@ -118,7 +114,6 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
         InputError: If the output cannot be written. This is checked before rendering.
     """
     require_writable(output)
-    flight = flight.even() if is_video(output) else flight
     with line.working("loading the map"):
         gaussians = run.gaussians
         start_device(device)

@@ -75,7 +75,7 @@ def write_report(path: Path, run: ReportedRun) -> None:
         started=time.strftime("%d %B %Y, %H:%M", time.localtime(run.record.started)),
         stage=facts.last_stage(run.metrics),
         maps=[stage for stage in ("online", "refined", "offline") if run.metrics[stage] is not None],
-        remarks=facts.remarks(run.metrics, run.record.notes),
+        remarks=facts.remarks(run.config, run.metrics, run.record.notes),
         drawings={name: as_uri("svg+xml", svg.encode("utf-8")) for name, svg in _drawings(run).items()},
         scale=_scale(),
         full_scale=FULL_SCALE,
@@ -99,7 +99,9 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
     last = list(run.versions.values())[-1]
     plan = plan_of(last.trajectory)
     floor = floor_plan(plan, last.gaussians, camera_centres(last.trajectory))
-    drawings = {"psnr": plots.psnr_of_frames(run.scores, run.record.frames)}
+    drawings = {}
+    if run.scores or any(note.mapped_psnr is not None for note in run.record.frames):
+        drawings["psnr"] = plots.psnr_of_frames(run.scores, run.record.frames)
     if run.record.frames and run.config.mode == "online":
         drawings["growth"] = plots.growth(run.record.frames)
     if any(note.lag is not None for note in run.record.frames):

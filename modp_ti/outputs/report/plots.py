@@ -42,6 +42,11 @@ STYLE = {
     "lines.linewidth": 1.3,
     "figure.constrained_layout.use": True,
 }
+# A page in dark colours shows the drawings in them, too: black becomes light, white disappears.
+DARK = """@media screen and (prefers-color-scheme: dark) { text { fill: #ddd !important }
+[style*="fill: #ffffff"] { fill: none !important } [style*="stroke: #e4e4e4"] { stroke: #34373c !important }
+[style*="stroke: #000000"] { stroke: #bbb !important } [style*="stroke: #666666"] { stroke: #aaa !important }
+[style*="stroke: #0072b2"] { stroke: #4aa8e0 !important } [style*="fill: #0072b2"] { fill: #4aa8e0 !important } }"""
 
 
 def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:
@@ -58,7 +63,7 @@ def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:
         with matplotlib.style.context(["default", STYLE]):  # ignore the user's matplotlib settings
             about = dict.fromkeys(("Date", "Creator", "Format", "Type"))
             draw(*values, **named).savefig(file, format="svg", dpi=130, metadata=about)
-        return file.getvalue()
+        return file.getvalue().replace("</style>", f"{DARK}</style>", 1)
 
     return svg
 
@@ -91,13 +96,15 @@ def psnr_of_frames(scores: Sequence[FrameScore], frames: Sequence[FrameNote] = (
         if held_out.any():
             axes.plot(x[held_out], y[held_out], "o", ms=3.2, color=OF_STAGE[stage], label=f"{stage}, held out")
     _label(axes, "frame", "PSNR [dB]")
-    axes.legend(ncols=4, loc="lower right", bbox_to_anchor=(1, 1))
+    axes.legend(ncols=5, loc="lower right", bbox_to_anchor=(1, 1))
     return figure
 
 
 @_drawn
 def growth(frames: Sequence[FrameNote]) -> Figure:
     """Plot the number of Gaussians, frames per second and the PSNR of the optimised views over the frames."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     mapped = [note for note in frames if note.psnr is not None]
     window = max(5, len(frames) // 20)
     figure, axes = _panels(1.75, 3 if mapped else 2)
@@ -109,6 +116,9 @@ def growth(frames: Sequence[FrameNote]) -> Figure:
         axes[0].legend(loc="upper left")
     _line(axes[1], x, frame_rate(frames, window), "frame-rate", color=GREEN)
     axes[1].set_yscale("log")  # frames that are not keyframes are a hundred times faster
+    axes[1].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes[1].yaxis.set_major_formatter("{x:g}")
+    axes[1].yaxis.set_minor_formatter(NullFormatter())
     _label(axes[1], "" if mapped else "frame", f"frames per second\n(last {window})")
     if mapped:
         _line(axes[2], *_xy(mapped, "index", "psnr"), "view-psnr", color=ORANGE)
@@ -168,7 +178,7 @@ def trajectory(
     if truth is not None:
         ways["truth"] = plan.on_page(truth)
     around = np.concatenate(list(ways.values()))
-    figure, (whole, close) = _panels(4.4, columns=2)
+    figure, (whole, close) = _panels(4.6, columns=2)
     if len(floor[0]):
         size = float(np.clip(30_000 / len(floor[0]), 1.0, 14.0))
         whole.scatter(*floor[0].T, s=size, c=floor[1], alpha=0.6, linewidths=0, rasterized=True)
@@ -212,8 +222,10 @@ def pose_changes(
     x = np.arange(len(tracked), dtype=float)
     for stage, poses in versions.items():
         shifts, turns = shifts_and_turns(tracked, poses)
-        _line(above, x, 100 * shifts / scene_depth, f"shift-{stage}", color=OF_STAGE[stage], label=stage)
-        _line(below, x, turns, f"turn-{stage}", color=OF_STAGE[stage])
+        # The last version is often close to the one before, which stays visible as a broad line below it.
+        style = {"color": OF_STAGE[stage]} | ({} if stage == list(versions)[-1] else {"lw": 4.0})
+        _line(above, x, 100 * shifts / scene_depth, f"shift-{stage}", label=stage, **style)
+        _line(below, x, turns, f"turn-{stage}", **style)
     _label(above, "", "shift\n[% of scene depth]")
     _label(below, "frame", "turn [degrees]")
     for axes in (above, below):

@@ -66,11 +66,12 @@ def invoke(*arguments: str | Path):
 
 
 @pytest.fixture
-def scene(plane_scene):
+def scene(plane_scene, monkeypatch):
     import numpy as np
 
     plane_scene.write_colmap(np.random.default_rng(0).uniform(-1, 1, (30, 3)) * [1.8, 1.8, 0])
     file = plane_scene.folder.parent / "scene.yaml"
+    monkeypatch.chdir(file.parent)
     file.write_text("source: {path: images}\ntracker: {kind: colmap}\noutput: out\n")
     return file
 
@@ -277,11 +278,47 @@ def test_ctrl_c_ends_a_real_process_with_130_and_leaves_nothing(scene):
     assert sorted(p.name for p in scene.parent.iterdir()) == ["images", "scene.yaml", "sparse"]
 
 
-@pytest.mark.parametrize("arguments", [["run"], ["run", "a.yaml", "--nonsense"], ["export", "out"], ["nonsense"]])
-def test_wrong_options_end_with_two(arguments):
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run"],
+        ["run", "a.yaml", "--nonsense"],
+        ["run", "a.yaml", "--parts", "1"],
+        ["run", "a.yaml", "--set"],
+        ["export", "out"],
+        ["export", "out", "--format", "nonsense"],
+        ["convert", "a", "b", "c"],
+        ["check"],
+        ["locate", "out"],
+        ["nonsense"],
+        ["--nonsense"],
+    ],
+)
+def test_wrong_options_end_with_two_in_one_line_and_in_json(arguments):
     result = CliRunner().invoke(cli.app, arguments)
     assert (result.exit_code, result.stdout) == (2, "")
-    assert "Usage:" in result.stderr
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+    error = result.stderr.removeprefix("error: ").rstrip("\n")
+    result = CliRunner().invoke(cli.app, [arguments[0], "--json", *arguments[1:]])
+    assert result.exit_code == 2
+    told = json.loads(result.stdout)
+    assert told["exit_code"] == 2 and told["error"]
+    if arguments[0].isalpha() and arguments != ["nonsense"]:  # a group has no --json, which is the first mistake then
+        assert told["error"] == error
+
+
+def test_without_a_word_the_program_prints_its_help():
+    result = CliRunner().invoke(cli.app, [])
+    assert "Usage:" in result.output and "Examples:" in result.output
+
+
+def test_help_on_a_narrow_terminal_names_whole_options():
+    command = [sys.executable, "-m", "modp_ti.commands.app", "export", "--help"]
+    narrow = {**os.environ, "COLUMNS": "40"}
+    text = subprocess.run(command, env=narrow, cwd=PROJECT, capture_output=True, text=True, check=True).stdout
+    for option in ("--format", "--output", "--texture", "--spz-version", "--device"):
+        assert f"{option} " in text.replace("\n", " ")
+    assert "\u2026" not in text
 
 
 COMMANDS = ["run", "batch", "refine", "cameras", "check", "render", "export", "convert", "locate", "view", "warmup"]

@@ -309,7 +309,9 @@ def failure(*arguments: str | Path) -> str:
     [
         (["--format", "mesh", "-o", "m.stl"], "--format mesh writes a file in .ply, .glb, .obj"),
         (["--format", "mesh", "--texture", "-o", "m.ply"], "m.ply: a mesh with --texture is written as .glb"),
-        (["--format", "points", "--texture"], "--texture: --format points has no texture; use --format mesh"),
+        (["--format", "points", "--texture"], "--texture: "),
+        (["--format", "spz", "--voxel", "0.1"], "--voxel: "),
+        (["--format", "html", "--spz-version", "3"], "--spz-version: "),
         (["--format", "spz", "-o", "{out}/splats.ply/here.spz"], "cannot be made: "),
         (["--format", "points", "-o", "{out}/splats.ply"], "is the map itself"),
         (["--format", "video", "-o", "film.avi"], "in .mp4 or .webm"),
@@ -328,6 +330,8 @@ def test_an_export_that_cannot_be_is_refused_in_one_line(out: Path, arguments: l
         (["--size", "640"], "write it as WIDTHxHEIGHT"),
         (["--size", "5000x100"], "at most 2048 pixels"),
         (["--frames", "5"], "--frames is for the paths"),
+        (["--smooth", "5"], "--smooth "),
+        (["--fps", "5", "-o", "pictures"], "--fps: "),
         (["-o", "{out}"], "is not empty"),
     ],
 )

@@ -52,5 +52,8 @@ def test_a_picture_that_cannot_be_read_is_wrong_input(out: Path, tmp_path: Path)
     (tmp_path / "text.png").write_text("no picture")
     result = CliRunner().invoke(app, ["locate", str(out), str(tmp_path / "text.png"), "--device", "cpu"])
     assert result.exit_code == 2 and "text.png" in result.stderr
+    for missing in (tmp_path / "nope.jpg", tmp_path):  # said before the map is rendered, which takes seconds
+        said = CliRunner().invoke(app, ["locate", str(out), str(tmp_path / "text.png"), str(missing)])
+        assert said.exit_code == 2 and said.stderr.startswith(f"error: {missing}: ") and said.stderr.count("\n") == 1
     result = CliRunner().invoke(app, ["locate", str(out), str(tmp_path / "text.png"), "--camera", "fx=5,focus=3"])
     assert result.exit_code == 2 and "focus" in result.stderr

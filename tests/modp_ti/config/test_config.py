@@ -243,7 +243,7 @@ def test_what_a_kind_of_tracker_does_not_take_is_named_with_its_line(scene, trac
 def test_the_kind_that_counts_is_the_one_after_all_overrides(scene):
     file = scene(MINIMAL)
     tracker = load_scene(file, ["tracker.points=p.ply", "tracker.kind=tum"]).tracker
-    assert isinstance(tracker, TumSettings) and tracker.points == file.parent / "p.ply"
+    assert isinstance(tracker, TumSettings) and tracker.points == Path.cwd() / "p.ply"
     assert isinstance(load_scene(file, ["tracker.path=m", "tracker={kind: klt}"]).tracker, KltSettings)
     message = failure(file, "tracker.path=m", "tracker.kind=klt")
     assert message.startswith("--set tracker.path=m: unknown key `tracker.path`")
@@ -292,8 +292,25 @@ def test_overrides_win_over_the_file_and_later_ones_over_earlier_ones(scene):
     assert load_scene(file, ["mapping.keyframes.max_gap=9"]).mapping.keyframes.max_gap == 9
 
 
-def test_override_path_is_relative_to_the_file(scene, tmp_path):
-    assert load_scene(scene(MINIMAL), ["output=there"]).output == (tmp_path / "there").resolve()
+def test_what_is_typed_is_relative_to_the_shell_and_the_rest_to_the_file(scene, tmp_path, monkeypatch):
+    file, shell = scene(MINIMAL), tmp_path / "sh ell"
+    shell.mkdir()
+    monkeypatch.chdir(shell)
+    there, here = file.resolve().parent, shell.resolve()
+    plain = load_scene(file)
+    assert (plain.source.path, plain.output) == (there / "images", there / "out/here")
+    typed = load_scene(file, ["output=there", "source.scale=0.5", "source.masks=../m", "tracker={kind: tum, path: p}"])
+    assert (typed.output, typed.source.masks, typed.tracker.path) == (
+        here / "there",
+        tmp_path.resolve() / "m",
+        here / "p",
+    )
+    assert typed.source.path == there / "images", "the rest of a section is the file's"
+    assert load_scene(file, ["output=~/there"]).output == (Path.home() / "there").resolve()
+    assert load_scene(file, ["tracker.kind=tum", "tracker.path=/p"]).tracker.path == Path("/p").resolve()
+    dump_scene(typed, there / "config.yaml")
+    monkeypatch.chdir("/")
+    assert load_scene(there / "config.yaml") == typed
 
 
 def test_written_configuration_gives_the_same_run_from_wherever_it_lies(scene, tmp_path, monkeypatch):

@@ -97,7 +97,7 @@ def test_two_parts_make_one_map(scene: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert {name: (out / name).read_bytes() for name in SAME} == kept
 
     # As good as one map.
-    invoke(scene, "--set", "output=whole", "--quiet")
+    invoke(scene, "--set", f"output={scene.parent / 'whole'}", "--quiet")
     whole = json.loads((scene.parent / "whole" / "metrics.json").read_text())
     assert metrics["refined"]["held_out"]["psnr"] > whole["refined"]["held_out"]["psnr"] - WORSE
     assert len(read_scores(out / "scores.csv")) == len(read_scores(scene.parent / "whole" / "scores.csv"))

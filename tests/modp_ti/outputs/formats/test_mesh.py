@@ -195,11 +195,13 @@ def tetrahedron() -> o3d.geometry.TriangleMesh:
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
 def test_another_program_reads_places_triangles_and_colours(
-    tmp_path: Path, tetrahedron: o3d.geometry.TriangleMesh, suffix: str
+    tmp_path: Path, tetrahedron: o3d.geometry.TriangleMesh, capfd: pytest.CaptureFixture[str], suffix: str
 ) -> None:
     path = tmp_path / f"mesh{suffix}"
     write_mesh(path, open3d().geometry.TriangleMesh(tetrahedron))
+    assert capfd.readouterr() == ("", "")
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert b"partial" not in path.read_bytes(), "a name that it had only while it was written"
     back = open3d().io.read_triangle_mesh(str(path))
     vertices, colours = np.asarray(back.vertices), np.asarray(back.vertex_colors)
     if suffix == ".glb":

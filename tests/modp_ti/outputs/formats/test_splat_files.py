@@ -89,6 +89,37 @@ def test_a_ksplat_holds_the_splats_up_to_degree_2(ply: Path, tmp_path: Path) -> 
     assert same_rotation(there["quaternion"], here["quaternion"]) > 1 - 1e-5
 
 
+@pytest.mark.filterwarnings("error")
+def test_huge_splats_are_the_largest_that_a_ksplat_holds(tmp_path: Path) -> None:
+    state = splats(5, degree=1)
+    state["log_scale"][0] = 80.0
+    write_splats(tmp_path / "a.ply", state)
+    convert_splats(tmp_path / "a.ply", tmp_path / "a.ksplat")
+    back = read_any_splats(tmp_path / "a.ksplat")["log_scale"]
+    assert back.max() == pytest.approx(np.log(65504), abs=1e-3)
+
+
+@pytest.mark.parametrize(("origin", "noted"), [(0.0, False), (100.0, False), (1e5, True)])
+def test_a_map_far_from_the_origin_is_noted_where_spz_moves_its_splats(
+    tmp_path: Path, origin: float, noted: bool
+) -> None:
+    state = splats(200)
+    state["position"] += np.float32(origin)
+    note = write_spz(tmp_path / "a.spz", state)
+    moved = np.abs(read_any_splats(tmp_path / "a.spz")["position"] - state["position"]).max()
+    small = np.exp(np.quantile(state["log_scale"].max(axis=1), 0.05))
+    assert bool(note) == noted == (moved > small / 8)
+    notes: list[str] = []
+    write_splats(tmp_path / "a.ply", state)
+    convert_splats(tmp_path / "a.ply", tmp_path / "b.spz", note=notes.append)
+    assert notes == ([note] if noted else [])
+
+
+def test_an_option_of_another_format_is_refused(ply: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["convert", str(ply), str(tmp_path / "a.ply"), "--spz-version", "3"])
+    assert result.exit_code == 2 and result.stderr.startswith("error: --spz-version: ")
+
+
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_every_level_of_ksplat_is_read(tmp_path: Path, level: int) -> None:
     """Written here from the layout: two sections of four Gaussians, in a full bucket and a partly filled one."""

@@ -79,7 +79,7 @@ def test_the_numbers_are_those_of_the_metrics(made) -> None:
             s = m[which]
             expected += [f"{s['psnr']:.2f}", f"{s['ssim']:.3f}", "–", f"{s['detail']:.2f}", str(s["count"])]
         assert rows[stage] == [*expected, f"{m['gaussians']:,}", f"{m['view_renders']:,}"]
-    assert rows["trajectory error after mapping"] == ["0.0123"]
+    assert rows["trajectory error after mapping [units of the ground truth]"] == ["0.0123"]
     assert rows["most memory held"] == ["1,234 MB"]
     kept = run.metrics["retention"]["refined"]
     assert rows["keyframes at the end, against just mapped"] == [
@@ -172,13 +172,13 @@ def test_the_pictures_are_those_of_the_held_out_frames_the_worst_first(made) -> 
 
 
 def test_the_settings_that_were_changed_are_named_with_their_defaults(made) -> None:
-    run, page, _ = made
+    _, page, _ = made
     rows = {row[0]: row[1:] for row in page.tables["settings"][1:]}
     assert rows["source.scale"] == ["0.5", '"auto"']
     assert rows["source.holdout"] == ["4", "empty"]
     assert rows["tracker.kind"] == ['"transforms"', "none"]
-    assert rows["output"] == [f'"{run.config.output}"', "none"]
-    assert rows["source.path"] == [f'"{run.config.source.path}"', "empty"]
+    assert rows["output"] == ['"out"', "none"]
+    assert rows["source.path"] == ['"images"', "empty"]
     assert len(rows) == 5
     made_with = {row[0]: row[1] for row in page.tables["machine"]}
     assert made_with["backend"] == "CPU" and str(engine()) in made_with["libraries"]
@@ -201,6 +201,46 @@ def test_passwords_of_streams_are_left_out(tmp_path) -> None:
     note = "frames come from rtsp://user:secret@camera:554/live"
     _, html = written(tmp_path, made_up_run(tmp_path, frames=5, refine=0, notes=(note,)))
     assert "secret" not in html and "rtsp://camera:554/live" in html
+
+
+def test_folders_of_the_sender_are_left_out(tmp_path, monkeypatch) -> None:
+    home = tmp_path / "sam doe"
+    scene, elsewhere = home / "my fox", tmp_path / "elsewhere"
+    scene.mkdir(parents=True)
+    monkeypatch.setenv("HOME", str(home))
+    notes = [
+        f"no weights in {home}/.cache/torch/checkpoints (see evaluation.lpips_weights)",
+        f"{scene}/images/a b.png: damaged; '{elsewhere}/masks/7.png' is missing",
+        "topic /camera_left/image_raw at http://camera.local/live/1: 3/4 of it",
+    ]
+    run = made_up_run(scene, frames=5, refine=0, notes=tuple(notes))
+    tracker = run.config.tracker.model_copy(update={"path": scene / "sparse/0/transforms.json"})
+    config = run.config.model_copy(update={"tracker": tracker, "onto": elsewhere / "earlier"})
+    page, html = written(tmp_path, dataclasses.replace(run, config=config))
+    for folder in (tmp_path, home, scene):
+        assert str(folder) not in html and folder.name not in html
+    shown = "\n".join(page.text)
+    for kept in ("no weights in checkpoints (see", "images/a b.png: damaged; '7.png' is missing", notes[2]):
+        assert kept in shown
+    rows = {row[0]: row[1] for row in page.tables["settings"][1:]}
+    assert (rows["tracker.path"], rows["onto"]) == ('"sparse/0/transforms.json"', '"earlier"')
+
+
+def test_a_run_without_scores_has_its_page(tmp_path, recwarn) -> None:
+    run = made_up_run(tmp_path, frames=5, refine=0, holdout=0)
+    run.record.frames[:] = [dataclasses.replace(note, mapped_psnr=None) for note in run.record.frames]
+    page, _ = written(tmp_path, dataclasses.replace(run, scores=(), comparisons=()))
+    assert page.curves() and not [str(w.message) for w in recwarn]
+
+
+def test_drawings_have_plain_numbers_and_cut_no_text(made) -> None:
+    _, page, _ = made
+    for data in page.embedded("curves", "svg+xml") + page.embedded("trajectory", "svg+xml"):
+        svg = data.decode()
+        assert "mathdefault" not in svg and "<tspan" not in svg
+        height = float(re.search(r'viewBox="0 0 \S+ (\S+)"', svg)[1])
+        baselines = [float(y) for y in re.findall(r'<text [^>]*\by="(\S+)"', svg)]
+        assert baselines and max(baselines) < height - 1
 
 
 @pytest.mark.parametrize(
