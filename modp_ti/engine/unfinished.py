@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from fields.runtime.engine import EngineError
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.interruption import RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.results import Results
 from modp_ti.engine.snapshots import Checkpointer
@@ -22,13 +27,22 @@ class Unfinished:
         mapper: The mapper.
         tracker: The tracker.
         checkpointer: Writes the run's snapshots.
+        say: Called with one line on an error that is no `InputError`.
     """
 
-    def __init__(self, config: SceneConfig, mapper: Mapper, tracker: Tracker, checkpointer: Checkpointer) -> None:
+    def __init__(
+        self,
+        config: SceneConfig,
+        mapper: Mapper,
+        tracker: Tracker,
+        checkpointer: Checkpointer,
+        say: Callable[[str], None],
+    ) -> None:
         self._config = config
         self._mapper = mapper
         self._tracker = tracker
         self._checkpointer = checkpointer
+        self._say = say
 
     def interrupted(self) -> KeyboardInterrupt:
         """Save a snapshot and the map after Ctrl-C."""
@@ -40,9 +54,24 @@ class Unfinished:
         """Save the map without a block whose file was damaged. The last snapshot stays as it was."""
         return InputError(f"{error}{self._save()}{self._checkpointer.way_on()}")
 
+    @contextmanager
+    def naming_snapshot(self) -> Iterator[None]:
+        """Add to errors inside this context how to go on from the snapshot, if there is one."""
+        try:
+            yield
+        except (RunStopped, BlockError):
+            raise
+        except (InputError, EngineError) as error:
+            error.args = (f"{error}{self._checkpointer.way_on()}",)
+            raise
+        except Exception:
+            if way_on := self._checkpointer.way_on():
+                self._say(f"the run ends by an error{way_on}")
+            raise
+
     def way_on(self, version: MapVersion) -> str:
         """Return the part of an error message that says how to go on, or where the map is."""
-        if self._checkpointer.possible:
+        if self._checkpointer.usable:
             return self._checkpointer.way_on()
         pipeline = self._mapper.pipeline
         return self._results().elsewhere(version, pipeline.keyframes, pipeline.near)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import list_files, refuse_foreign
 from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
 from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, TRUNCATION, extracted, fused, supported, write_mesh
@@ -86,13 +87,16 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         The path that was written.
 
     Raises:
-        InputError: If the export is not possible.
+        InputError: If the export is not possible, or would replace a file of the run's folder that is none of ours.
     """
+    default = output is None
     if options.texture:
         if format != "mesh":
             raise InputError(f"--texture: --format {format} has no texture; use --format mesh")
         output = run.folder / TEXTURED_NAME if output is None else output
     target = _target(run, format, output)
+    if default and format not in FOLDERS:
+        refuse_foreign(run.folder, [target.name])
     if options.texture:
         if target.suffix.lower() != ".glb":
             raise InputError(f"{target}: a mesh with --texture is written as .glb")
@@ -125,6 +129,8 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
             _dataset(run, target, format, line)
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
+    if default and format not in FOLDERS:
+        list_files(run.folder, [target.name])
     return target
 
 
