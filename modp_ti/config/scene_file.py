@@ -25,7 +25,6 @@ from modp_ti.config.unknown_keys import refuse_unknown_keys
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
-from modp_ti.files.run_folder import SETTINGS_HEADER
 
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
@@ -88,7 +87,8 @@ def scene_from_data(
 def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
     """Write every setting with absolute paths, so that the file gives the same run from any folder."""
     resolved = _with_absolute_paths(config, Path.cwd())
-    text = SETTINGS_HEADER + yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    text = "# Every setting of this run: `modp-ti run` on this file gives the same map.\n"
+    text += yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     replace_text(path, text)
 
 

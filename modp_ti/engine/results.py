@@ -19,7 +19,7 @@ from modp_ti.config.scene_file import dump_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text, write_picture
 from modp_ti.files.errors import InputError
-from modp_ti.files.run_folder import appearing
+from modp_ti.files.run_folder import appearing, is_run_folder
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.undistortion import Undistorter
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
@@ -75,8 +75,13 @@ class Results:
         with appearing(self.config.output, ("renders",)) as self.folder:
             (self.folder / "renders").mkdir()
             yield
-            if not (self.config.output / "splats.ply").is_file():
+            if not self.map_is_there:
                 raise InputError(f"{self.config.output}: the finished map is gone")
+
+    @property
+    def map_is_there(self) -> bool:
+        """Whether the map is in the output folder, after `writing_map`."""
+        return is_run_folder(self.config.output) and (self.config.output / "splats.ply").is_file()
 
     def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> None:
         """Write the map. Raises InputError if `splats.ply` is not read back as it was written."""

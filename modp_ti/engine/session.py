@@ -163,7 +163,7 @@ class _Session:
             self._make_mapper(first.camera)
             self.mapper.pipeline.stopwatch.seconds["track"] = prepared
             self._open_keeper(resumed, arriving)
-            self.unfinished = Unfinished(self.config, self.mapper, self.tracker, self.checkpointer, self._say)
+            self.unfinished = Unfinished(self.config, self.mapper, self.tracker, self.checkpointer)
             self.observer.begin(self.mapper, self.tracker.frame_count)
             self.clock.begin_mapping()
             self.stop.begin()
@@ -324,7 +324,7 @@ class _Session:
         except RunStopped:
             raise KeyboardInterrupt(f"interrupted{unscored}") from None
         except InputError as error:
-            if not (output / "splats.ply").is_file():
+            if not results.map_is_there:
                 unscored = self.unfinished.way_on(versions[last])
             raise InputError(f"{error}{unscored}") from None
         self.checkpointer.remove()

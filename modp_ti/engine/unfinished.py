@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
-from fields.runtime.engine import EngineError
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.interruption import RunStopped
 from modp_ti.engine.mapper import Mapper
@@ -27,22 +26,13 @@ class Unfinished:
         mapper: The mapper.
         tracker: The tracker.
         checkpointer: Writes the run's snapshots.
-        say: Called with one line on an error that is no `InputError`.
     """
 
-    def __init__(
-        self,
-        config: SceneConfig,
-        mapper: Mapper,
-        tracker: Tracker,
-        checkpointer: Checkpointer,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, config: SceneConfig, mapper: Mapper, tracker: Tracker, checkpointer: Checkpointer) -> None:
         self._config = config
         self._mapper = mapper
         self._tracker = tracker
         self._checkpointer = checkpointer
-        self._say = say
 
     def interrupted(self) -> KeyboardInterrupt:
         """Save a snapshot and the map after Ctrl-C."""
@@ -61,12 +51,9 @@ class Unfinished:
             yield
         except (RunStopped, BlockError):
             raise
-        except (InputError, EngineError) as error:
-            error.args = (f"{error}{self._checkpointer.way_on()}",)
-            raise
-        except Exception:
+        except Exception as error:
             if way_on := self._checkpointer.way_on():
-                self._say(f"the run ends by an error{way_on}")
+                error.args = (f"{error}{way_on}",)
             raise
 
     def way_on(self, version: MapVersion) -> str:

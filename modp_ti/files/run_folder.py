@@ -12,7 +12,7 @@ import shutil
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from modp_ti.files.atomic import replace_text, sync_folder
@@ -22,7 +22,6 @@ from modp_ti.files.sole_use import sole_use
 
 __all__ = [
     "PRIVATE",
-    "SETTINGS_HEADER",
     "appearing",
     "is_run_folder",
     "list_files",
@@ -35,22 +34,19 @@ __all__ = [
 PRIVATE = ".modp-ti"
 """Name of the subfolder of the list and of temporary files."""
 
-SETTINGS_HEADER = "# Every setting of this run: `modp-ti run` on this file gives the same map.\n"
-"""First line of `config.yaml`, by which a folder without a list is known to be of an earlier version or a copy."""
-
 LIST = "files.json"
+# Moved last and removed first, so that a folder that has it is complete.
+LAST = "metrics.json"
 # What a run may write to its folder.
 OF_A_RUN = (
     "config.yaml splats.ply trajectory.txt frames.json exposure.json metrics.json scores.csv report.html session.zip "
     "snapshot.npz colmap masks renders sfm"
 ).split()
-# Moved last and removed first, so that a folder that has it is complete.
-LAST = "metrics.json"
-# What a run writes, for folders without a list.
-WRITTEN = re.compile(
-    r"(config\.yaml|splats\.ply|trajectory\.txt|frames\.json|exposure\.json|metrics\.json|scores\.csv|report\.html"
-    r"|session\.zip|snapshot\.npz|(renders|masks)/[0-9]+\.png|(colmap|sfm)/(cameras|images|points3D|rigs|frames)\.bin"
-    r"|sfm/made_of\.txt|colmap/(images|masks)/.+\.png)"
+# A folder without a list whose config.yaml begins like this is a copy or of an earlier version: these files are listed.
+SETTINGS = b"# Every setting of this run: "
+RECOGNISED = re.compile(
+    rf"{'|'.join(map(re.escape, OF_A_RUN))}|(renders|masks)/[0-9]+\.png|colmap/(images|masks)/.+\.png|sfm/made_of\.txt"
+    r"|(colmap|sfm)/(cameras|images|points3D|rigs|frames)\.bin"
 )
 # What file managers put into folders. It is left alone.
 OF_THE_SYSTEM = re.compile(r"\..*|Thumbs\.db|desktop\.ini", re.IGNORECASE)
@@ -64,8 +60,8 @@ class _Record:
 
     Attributes:
         files: What runs have written, relative to the folder.
-        staged: Name of the temporary folder whose files are being moved to their places; empty for none.
-        gone: Files that are removed with this move.
+        staged: Temporary folder whose files are being moved to their places, while those of `gone` are removed.
+        gone: Files of an earlier run.
     """
 
     files: frozenset[str] = frozenset()
@@ -75,9 +71,7 @@ class _Record:
 
 @contextmanager
 def run_folder(output: Path, adopted: Collection[str] = ()) -> Iterator[None]:
-    """Lock the output folder of a run, and check that all that the run will write can be written there.
-
-    The folder is created. If the run leaves nothing there, it is removed again.
+    """Create and lock the output folder of a run, which is removed again if the run leaves nothing there.
 
     Args:
         output: The folder.
@@ -119,44 +113,37 @@ def appearing(output: Path, outdated: Collection[str] = ()) -> Iterator[Path]:
         with sole_use(output):
             require_whole(output)
             _private(output).mkdir(exist_ok=True)
-            staged = Path(tempfile.mkdtemp(prefix="new-", dir=_private(output)))
+            staged = Path(tempfile.mkdtemp(prefix="new-", dir=output / PRIVATE))
             try:
                 yield staged
                 _commit(output, staged, outdated)
             finally:
-                # Left where the move has begun: it is completed later.
-                if not _record(output).staged:
+                if not _record(output).staged:  # otherwise, the move has begun, and is completed later
                     shutil.rmtree(staged, ignore_errors=True)
                 with suppress(OSError):
-                    _private(output).rmdir()
+                    (output / PRIVATE).rmdir()
     except OSError as error:
         raise InputError(f"{output}: cannot be written: {error.strerror}") from None
 
 
 def list_files(output: Path, names: Collection[str]) -> None:
-    """Add files to the list that are written to their places at once or are there already.
-
-    Raises:
-        InputError: If the list cannot be written.
-    """
-    try:
-        with sole_use(output):
-            _private(output).mkdir(exist_ok=True)
-            record = _record(output)
-            if not record.files.issuperset(names):
-                _write(output, _Record(record.files | set(names), record.staged, record.gone))
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written: {error.strerror}") from None
+    """Add files that are in a folder to its list. Raises OSError if it cannot be written."""
+    with sole_use(output):
+        record = _record(output)
+        _write(output, _Record(record.files.union(names), record.staged, record.gone))
 
 
 def refuse_foreign(output: Path, names: Iterable[str]) -> None:
     """Raise InputError if there is something of these names in a folder that no run has written."""
     own = _record(output).files
     for name in names:
+        for place in (output / part for part in PurePosixPath(name).parents[:-1]):
+            if os.path.islink(place) or os.path.isfile(place):
+                raise _foreign(place)
         for file in _files(output / name):
             inside = file.relative_to(output).as_posix()
             if inside not in own and (inside == name or not OF_THE_SYSTEM.fullmatch(file.name)):
-                raise InputError(_foreign(file))
+                raise _foreign(file)
 
 
 def require_usable(output: Path, adopted: Collection[str] = ()) -> None:
@@ -164,12 +151,12 @@ def require_usable(output: Path, adopted: Collection[str] = ()) -> None:
 
     Args:
         output: The folder.
-        adopted: Files in it that are those of a run, whatever the list says.
+        adopted: As for `run_folder`.
     """
-    if os.path.lexists(output) and not os.path.isdir(output):
+    there = next(place for place in (output, *output.absolute().parents) if os.path.lexists(place))
+    if there == output and not os.path.isdir(output):
         raise InputError(f"{output}: output must be a folder, this is a file")
     refuse_foreign(output, [name for name in OF_A_RUN if name not in adopted])
-    there = next(place for place in (output, *output.absolute().parents) if os.path.lexists(place))
     try:
         with tempfile.TemporaryDirectory(prefix=".modp-ti-", dir=there) as folder:
             (Path(folder) / "test").write_bytes(bytes(4096))
@@ -178,7 +165,7 @@ def require_usable(output: Path, adopted: Collection[str] = ()) -> None:
 
 
 def require_whole(output: Path) -> None:
-    """Complete the move of files to their places that a killed process has left half done.
+    """Complete the move of files that a killed process has left half done. Every reader of a run's files calls it.
 
     Raises:
         InputError: If it cannot be completed, or another process is moving them.
@@ -187,8 +174,7 @@ def require_whole(output: Path) -> None:
         return
     try:
         with sole_use(output, PATIENCE):
-            record = _record(output)
-            if record.staged:
+            if (record := _record(output)).staged:
                 _move(output, record)
     except OSError as error:
         raise InputError(f"{output}: a run has ended while it moved its files here: {error.strerror}") from None
@@ -203,38 +189,33 @@ def is_run_folder(folder: Path) -> bool:
 
 
 def _commit(output: Path, staged: Path, outdated: Collection[str]) -> None:
-    """Move the files of `staged` to the output folder."""
+    """Move the files of `staged` to the output folder, if they replace nothing but files of a run."""
     record = _record(output)
     new = {file.relative_to(staged).as_posix() for file in _files(staged)}
     below = tuple(f"{name}/" for name in outdated)
     gone = {name for name in record.files - new if name in outdated or name.startswith(below)}
-    for name in sorted(new | gone):
-        places = [output / part for part in reversed(PurePosixPath(name).parents[:-1])]
-        for place in places:
-            if os.path.lexists(place) and (place.is_symlink() or not place.is_dir()):
-                raise InputError(_foreign(place))
-        target = output / name
-        if os.path.lexists(target) and (name not in record.files or (target.is_dir() and not target.is_symlink())):
-            raise InputError(_foreign(target))
+    refuse_foreign(output, new | gone)
     if not new and not gone:
         return
-    after = _Record(record.files | new, staged.name if len(new) + len(gone) > 1 else "", frozenset(gone))
-    if after.staged or not new <= record.files or not os.path.exists(_private(output) / LIST):
-        _write(output, after)
-    _move(output, _Record(after.files, staged.name, after.gone))
+    if len(new) + len(gone) > 1 or not new <= record.files or not os.path.isfile(output / PRIVATE / LIST):
+        record = _Record(record.files | new, staged.name, frozenset(gone))
+        _write(output, record)
+    _move(output, _Record(record.files, staged.name, frozenset(gone)))
 
 
 def _move(output: Path, record: _Record) -> None:
-    """Do what a record says, and note that it is done. It may have been done in part already."""
-    staged = _private(output) / record.staged
+    """Do what a record says. It may have been done in part already."""
     for name in sorted(record.gone, key=lambda name: (name != LAST, name)):
         (output / name).unlink(missing_ok=True)
         with suppress(OSError):  # those that still hold something stay
-            for place in PurePosixPath(name).parents[:-1]:
-                (output / place).rmdir()
+            for folder in PurePosixPath(name).parents[:-1]:
+                (output / folder).rmdir()
+    staged = output / PRIVATE / record.staged
     for file in sorted(_files(staged), key=lambda file: (file.name == LAST, file)):
         target = output / file.relative_to(staged)
         target.parent.mkdir(parents=True, exist_ok=True)
+        if target.is_dir() and not target.is_symlink():
+            target.rmdir()  # an empty one
         os.replace(file, target)
     sync_folder(output)
     if record.gone or _record(output).staged:
@@ -245,7 +226,7 @@ def _private(output: Path) -> Path:
     """Return the private subfolder. Raises InputError if something else is in its place."""
     private = output / PRIVATE
     if os.path.islink(private) or os.path.isfile(private):
-        raise InputError(_foreign(private))
+        raise _foreign(private)
     return private
 
 
@@ -253,49 +234,46 @@ def _record(output: Path) -> _Record:
     """Read the list of a folder, or make that of a folder without one. Raises InputError if it is damaged."""
     file = _private(output) / LIST
     if not os.path.lexists(file):
-        return _Record(_recognised(output))
-    data = read_json(file, "the list of the files that runs have written")
-    damaged = InputError(f"{file}: damaged: remove it, or name another folder (output)")
+        names = [each.relative_to(output).as_posix() for each in _files(output)] if _is_recognised(output) else []
+        return _Record(frozenset(name for name in names if RECOGNISED.fullmatch(name)))
+    data, damaged = read_json(file, "of runs"), InputError(f"{file}: damaged: remove it, or name another folder")
     try:
         record = _Record(frozenset(data["files"]), data["staged"], frozenset(data["gone"]))
     except (TypeError, KeyError):
         raise damaged from None
-    if not all(map(_is_inside, record.files | record.gone)) or (record.staged != "" and not _is_inside(record.staged)):
+    names = [*record.files, *record.gone, record.staged or "new"]
+    if not all(isinstance(name, str) and not BEYOND.search(name) for name in names):
         raise damaged
     return record
 
 
-def _is_inside(name: object) -> bool:
-    """Whether a name from a list is that of a file below the folder, and none of the private ones."""
-    parts = name.split("/") if isinstance(name, str) else [""]
-    return not {"", ".", ".."}.intersection(parts) and parts[0] != PRIVATE and "\0" not in str(name)
+# Names in a list that are not those of files below the folder, or of private ones.
+BEYOND = re.compile(rf"^$|^/|//|/$|\0|(^|/)\.\.?(/|$)|^{re.escape(PRIVATE)}(/|$)")
 
 
-def _recognised(output: Path) -> frozenset[str]:
-    """Return the files of a run in a folder without a list, which an earlier version or a copy has left."""
+def _is_recognised(output: Path) -> bool:
     try:
         with (output / "config.yaml").open("rb") as file:
-            if file.readline(200).decode() != SETTINGS_HEADER:
-                return frozenset()
-    except (OSError, UnicodeDecodeError):
-        return frozenset()
-    names = (file.relative_to(output).as_posix() for file in _files(output))
-    return frozenset(name for name in names if WRITTEN.fullmatch(name))
+            return file.read(len(SETTINGS)) == SETTINGS
+    except OSError:
+        return False
 
 
 def _write(output: Path, record: _Record) -> None:
-    content = {name: sorted(value) if isinstance(value, frozenset) else value for name, value in asdict(record).items()}
-    replace_text(_private(output) / LIST, json.dumps(content, indent=1) + "\n")
+    content = {"files": sorted(record.files), "staged": record.staged, "gone": sorted(record.gone)}
+    _private(output).mkdir(exist_ok=True)
+    replace_text(output / PRIVATE / LIST, json.dumps(content, indent=1) + "\n")
 
 
 def _files(place: Path) -> Iterator[Path]:
     """Yield a file, or the files of a folder and its subfolders. A symbolic link is a file."""
-    if os.path.isfile(place) or os.path.islink(place):
+    if os.path.lexists(place) and (os.path.islink(place) or not os.path.isdir(place)):
         yield place
-    for folder, subfolders, files in os.walk(place) if not os.path.islink(place) else ():
+        return
+    for folder, subfolders, files in os.walk(place):
         links = [name for name in subfolders if os.path.islink(os.path.join(folder, name))]
         yield from (Path(folder) / name for name in (*files, *links))
 
 
-def _foreign(path: Path) -> str:
-    return f"{path}: is there already, and no run has written it: move it, or name another folder (output)"
+def _foreign(path: Path) -> InputError:
+    return InputError(f"{path}: is there already, and no run has written it: move it, or name another folder (output)")

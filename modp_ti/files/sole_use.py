@@ -39,14 +39,13 @@ def sole_use(folder: Path, patience: float = 20.0) -> Iterator[None]:
     folder = folder.absolute()
     missing = list(takewhile(lambda place: not os.path.lexists(place), (folder, *folder.parents)))
     until = time.monotonic() + patience
-    while (key := _locked(folder)) is None:
+    while (handle := _locked(folder)) is None:
         if time.monotonic() > until:
             raise InputError(
                 f"{folder}: another process is at work there: wait for it, end it, or name another folder (output)"
             )
         time.sleep(0.1)
-    handle, *owner = key
-    holder = threading.get_ident(), owner[0], owner[1]
+    holder = _holder(handle)
     again = holder in _held
     _held.add(holder)
     try:
@@ -54,38 +53,37 @@ def sole_use(folder: Path, patience: float = 20.0) -> Iterator[None]:
     finally:
         if not again:
             _held.discard(holder)
-        with suppress(OSError):  # one that holds something, and its parents, stay
+        with suppress(OSError):  # one that holds something stays, and so do its parents
             for place in missing:
                 place.rmdir()
-        if handle is not None:
-            os.close(handle)
+        os.close(handle)
 
 
-def _locked(folder: Path) -> tuple[int | None, int, int] | None:
-    """Make, open and lock a folder without waiting; return None if another process holds the lock.
+def _holder(handle: int) -> tuple[int, int, int]:
+    there = os.fstat(handle)
+    return threading.get_ident(), there.st_dev, there.st_ino
 
-    Returns:
-        The open folder, None on Windows, and its device and inode.
-    """
+
+def _locked(folder: Path) -> int | None:
+    """Make, open and lock a folder without waiting; return None if another process holds the lock."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if sys.platform == "win32":
-            return None, 0, hash(folder)
-        handle = os.open(folder, os.O_RDONLY)
+        handle = os.open(os.devnull if sys.platform == "win32" else folder, os.O_RDONLY)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    if sys.platform == "win32" or _holder(handle) in _held:
+        return handle
     import fcntl
 
-    there = os.fstat(handle)
     try:
-        if (threading.get_ident(), there.st_dev, there.st_ino) not in _held:
-            with suppress(FileNotFoundError):
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.path.samestat(there, os.stat(folder)):  # otherwise, the process that held it has removed it
-            return handle, there.st_dev, there.st_ino
-    except (BlockingIOError, FileNotFoundError):
-        pass
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        return None
     except OSError:  # not on this file system
-        return handle, there.st_dev, there.st_ino
-    os.close(handle)
+        return handle
+    with suppress(FileNotFoundError):
+        if os.path.samestat(os.fstat(handle), os.stat(folder)):
+            return handle
+    os.close(handle)  # of a folder that the process that held it has removed
     return None

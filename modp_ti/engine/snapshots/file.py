@@ -64,13 +64,7 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 
 def of_another_program(path: Path, program: object, difference: str) -> InputError:
-    """Return the error for a snapshot that another version of the program has written.
-
-    Args:
-        path: The file.
-        program: The version of the program, None if the file does not say.
-        difference: How it shows.
-    """
+    """Return the error for a snapshot of another version of the program, None if it is unknown, with its difference."""
     wrote = f"MODP-Ti {program}" if isinstance(program, str) else "an earlier version of MODP-Ti"
     return InputError(
         f"{path}: {wrote} has written this snapshot, and MODP-Ti {__version__} cannot resume it ({difference}); "

@@ -87,15 +87,15 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
         The path that was written.
 
     Raises:
-        InputError: If the export is not possible, or would replace a file of the run's folder that is none of ours.
+        InputError: If the export is not possible.
     """
-    default = output is None
+    default = output is None and format not in FOLDERS
     if options.texture:
         if format != "mesh":
             raise InputError(f"--texture: --format {format} has no texture; use --format mesh")
         output = run.folder / TEXTURED_NAME if output is None else output
     target = _target(run, format, output)
-    if default and format not in FOLDERS:
+    if default:
         refuse_foreign(run.folder, [target.name])
     if options.texture:
         if target.suffix.lower() != ".glb":
@@ -127,10 +127,10 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
             film(run, plan_flight(run, "recorded"), target, False, options.device, line)
         else:
             _dataset(run, target, format, line)
+        if default:
+            list_files(run.folder, [target.name])
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
-    if default and format not in FOLDERS:
-        list_files(run.folder, [target.name])
     return target
 
 

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from modp_ti.config.scene_file import dump_scene
+from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import (
     PRIVATE,
-    SETTINGS_HEADER,
     appearing,
     is_run_folder,
     refuse_foreign,
@@ -168,7 +169,7 @@ def test_a_list_from_a_stranger_reaches_nothing_outside(tmp_path: Path, record: 
 def test_a_folder_of_an_earlier_version_is_known_by_its_settings(tmp_path: Path) -> None:
     output = _tree(tmp_path / "out", FIRST | {"colmap/mine.db": "mine"})
     assert not is_run_folder(output)
-    (output / "config.yaml").write_text(SETTINGS_HEADER)
+    dump_scene(SceneConfig(source={"path": "images"}, tracker={"kind": "klt"}, output=output), output / "config.yaml")
     assert is_run_folder(output)
     refuse_foreign(output, ["splats.ply", "masks"])
     with pytest.raises(InputError, match=r"mine\.db"):

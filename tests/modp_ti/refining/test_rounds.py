@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from modp_ti.commands.app import app
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import PRIVATE
 from modp_ti.outputs.formats.scores_csv import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.finished_run import open_run
@@ -163,7 +165,7 @@ def test_an_interrupted_scoring_leaves_the_run_as_it_was(out: Path, monkeypatch:
     with pytest.raises(KeyboardInterrupt, match="is as it was"):
         refine_run(out, Plan(rounds=1), HereAndNow(False, counted))
     assert contents(out) == before
-    assert not out.with_name("out.partial").exists()
+    assert os.listdir(out / PRIVATE) == ["files.json"]
 
 
 def refused(*arguments: str | Path) -> str:
