@@ -14,15 +14,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "not_through_links",
-    "replace_file",
-    "replace_text",
-    "replacing",
-    "sync_folder",
-    "write_picture",
-    "written_aside",
-]
+__all__ = ["replace_file", "replace_text", "replacing", "sync_folder", "write_picture", "written_aside"]
 
 
 @contextmanager
@@ -106,11 +98,6 @@ def written_aside(path: Path) -> Iterator[Path]:
         partial = Path(folder) / f"{path.stem}{path.suffix.lower()}"
         yield partial
         os.replace(partial, path)
-
-
-def not_through_links(path: str, flags: int) -> int:
-    """Open a file as the `opener` of `open`, but not through a symbolic link."""
-    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def sync_folder(folder: Path) -> None:

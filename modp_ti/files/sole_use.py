@@ -41,9 +41,7 @@ def sole_use(folder: Path, patience: float = 20.0) -> Iterator[None]:
     until = time.monotonic() + patience
     while (handle := _locked(folder)) is None:
         if time.monotonic() > until:
-            raise InputError(
-                f"{folder}: another process is at work there: wait for it, end it, or name another folder (output)"
-            )
+            raise InputError(f"{folder}: another process is at work there: wait for it, end it, or name another folder")
         time.sleep(0.1)
     holder = _holder(handle)
     again = holder in _held

@@ -94,7 +94,7 @@ class Storage:
             found = [str(file) for file in self._files.find(self._root)]
         for file in found:
             name = file.removeprefix(f"{self._root}/")
-            if file.endswith(".partial") or Path(name).is_absolute() or ".." in Path(name).parts:
+            if file.endswith(".partial") or Path(name).is_absolute() or {"..", PRIVATE}.intersection(Path(name).parts):
                 continue
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             self.get(name, folder / name)

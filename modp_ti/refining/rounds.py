@@ -18,6 +18,7 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import require_usable
 from modp_ti.files.sole_use import sole_use
 from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
@@ -79,6 +80,7 @@ def refine_run(folder: Path, plan: Plan, engine: Engine, console: Console | None
     run = open_run(folder)
     config = _settings_of(run, plan)
     with sole_use(folder):
+        require_usable(folder)
         metrics = read_json(folder / "metrics.json", "of a finished run")
         line = ProgressLine(console or Console(quiet=True))
         try:

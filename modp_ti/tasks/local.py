@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -16,7 +17,6 @@ from platform import node
 from typing import Any, cast
 
 from fields.runtime.parallel import available_cores
-from modp_ti.files.atomic import not_through_links
 from modp_ti.files.child_environment import child_environment
 from modp_ti.files.reading import available_memory
 from modp_ti.tasks.engine import Ended, Engine, Running
@@ -138,7 +138,7 @@ class LocalEngine(Engine):
             output: Any = subprocess.DEVNULL
             if self._logs is not None:
                 self._logs.mkdir(parents=True, exist_ok=True)
-                output = held.enter_context((self._logs / f"{name}.log").open("ab", opener=not_through_links))
+                output = held.enter_context((self._logs / f"{name}.log").open("ab", opener=_not_through_links))
             process = _started(theirs.fileno(), max(1, int(resources.cpus)), output)
         call = _Call(resources, process, cast(Connection, ours))
         try:
@@ -161,6 +161,10 @@ class LocalEngine(Engine):
             del self._running[name]
             found.append(Ended(name, message, self._machine))
         return found
+
+
+def _not_through_links(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def _started(descriptor: int, threads: int, output: Any) -> subprocess.Popen[bytes]:
