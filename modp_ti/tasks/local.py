@@ -138,7 +138,7 @@ class LocalEngine(Engine):
             output: Any = subprocess.DEVNULL
             if self._logs is not None:
                 self._logs.mkdir(parents=True, exist_ok=True)
-                output = held.enter_context((self._logs / f"{name}.log").open("ab", opener=_not_through_links))
+                output = held.enter_context(open(self._logs / f"{name}.log", "ab", opener=_not_through_links))
             process = _started(theirs.fileno(), max(1, int(resources.cpus)), output)
         call = _Call(resources, process, cast(Connection, ours))
         try:

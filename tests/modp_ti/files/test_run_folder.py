@@ -169,7 +169,8 @@ def test_a_list_from_a_stranger_reaches_nothing_outside(tmp_path: Path, record: 
 def test_a_folder_of_an_earlier_version_is_known_by_its_settings(tmp_path: Path) -> None:
     output = _tree(tmp_path / "out", FIRST | {"colmap/mine.db": "mine"})
     assert not is_run_folder(output)
-    dump_scene(SceneConfig(source={"path": "images"}, tracker={"kind": "klt"}, output=output), output / "config.yaml")
+    scene = {"source": {"path": "images"}, "tracker": {"kind": "klt"}, "output": "out"}
+    dump_scene(SceneConfig.model_validate(scene), output / "config.yaml")
     assert is_run_folder(output)
     refuse_foreign(output, ["splats.ply", "masks"])
     with pytest.raises(InputError, match=r"mine\.db"):
