@@ -147,6 +147,7 @@ def _run(
     tasks: tuple[Where, str | None] | None,
 ) -> Path:
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
+    from modp_ti.files.run_folder import require_usable
     from modp_ti.inputs.bare_recording import is_recording
     from modp_ti.inputs.scene_paths import refuse_output_in_input
 
@@ -161,6 +162,7 @@ def _run(
         config = _new_scene(scene, stream, overrides, preset)
         at = Path.cwd() if scene is None or is_recording(scene) else scene.resolve().parent
         refuse_output_in_input(config, at)
+        require_usable(config.output)  # once more in the run: here, before Taichi is loaded
     if config.parts is not None:
         from modp_ti.parts.mapping import map_in_parts
 

@@ -99,7 +99,9 @@ def elsewhere(_: object) -> None:
 def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     make = results.tempfile.mkdtemp
     monkeypatch.setattr(
-        results.tempfile, "mkdtemp", lambda **how: full() if how["prefix"] == "modp-ti-map-" else make(**how)
+        results.tempfile,
+        "mkdtemp",
+        lambda *at, **how: full() if how.get("prefix") == "modp-ti-map-" else make(*at, **how),
     )
 
 
