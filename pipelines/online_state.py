@@ -101,11 +101,8 @@ def restore(mapper: OnlineMap, state: MapState, frames: Iterable[TrackedFrame]) 
         raise ValueError("a Gaussian has an anchor that the state does not contain")
     if mapper.densifier.voxels is not None:
         coarsest, origin = state.numbers["coarsest"], np.array(state.numbers["origin"])
-        if state.numbers.get("voxels_made_again", False):  # the marks of an earlier version had another layout
-            mapper.densifier.restart_voxels(coarsest, origin, *mapper.paging.placed())
-        else:
-            mapper.densifier.voxels.settle(coarsest, origin)
-            mapper.densifier.voxels.restore(**state.group("voxels"))
+        mapper.densifier.voxels.settle(coarsest, origin)
+        mapper.densifier.voxels.restore(**state.group("voxels"))
     previous = state.group("previous")
     mapper.selector.previous = int(previous["index"]) if previous else None
     if previous and mapper.selector.previous not in mapper.trajectory:

@@ -18,6 +18,7 @@ from modp_ti.batch.summary_page import write_summary_page
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing
 from modp_ti.outputs.progress import StageProgress
 from modp_ti.tasks import Answer, End, Ended, Engine, Resources, Retried, Running, Stopping, Task, Watched, run_tasks
 
@@ -170,10 +171,11 @@ class _Batch:
 
     def _keep_traceback(self, name: str, text: str) -> None:
         try:
-            (self._folder / LOGS).mkdir(exist_ok=True)
-            replace_text(self._folder / LOGS / f"{name}.traceback.txt", text)
-        except OSError as error:
-            self._table.note(f"{name}: its traceback cannot be written: {error.strerror}")
+            with appearing(self._folder) as staged:
+                (staged / LOGS).mkdir()
+                replace_text(staged / LOGS / f"{name}.traceback.txt", text)
+        except InputError as error:
+            self._table.note(f"{name}: its traceback cannot be written: {error}")
 
     def _end(self, name: str, state: State, error: str = "") -> None:
         metrics = finished_metrics(self._configs[name]) if state in (State.finished, State.before) else None
@@ -188,13 +190,13 @@ class _Batch:
         """Write tables and page. Once the batch runs, a disk that is full only delays them."""
         results, before = list(self._results.values()), self._unwritten
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            write_csv(self._folder / CSV, results)
-            write_parquet(self._folder / PARQUET, results)
-            write_summary_page(self._folder / PAGE, results)
+            with appearing(self._folder) as staged:
+                write_csv(staged / CSV, results)
+                write_parquet(staged / PARQUET, results)
+                write_summary_page(staged / PAGE, results)
             self._unwritten = ""
-        except OSError as error:
-            self._unwritten = f"{self._folder}: cannot be written: {error.strerror}"
+        except InputError as error:
+            self._unwritten = str(error)
             if self._unwritten != before:
                 self._table.note(self._unwritten)
 

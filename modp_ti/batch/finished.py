@@ -10,6 +10,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import require_whole
 from modp_ti.files.storage import Storage
 
 __all__ = ["finished_metrics", "is_stored"]
@@ -25,6 +26,7 @@ def finished_metrics(config: SceneConfig) -> dict[str, Any] | None:
     A run with further maps (`tracker.maps: all`) is finished when all of them are.
     """
     try:
+        require_whole(config.output)
         metrics = read_json(config.output / METRICS, METRICS)
         written = load_scene(config.output / SETTINGS)
         further = int(metrics.get("further_maps", 0))

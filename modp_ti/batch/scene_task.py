@@ -11,6 +11,7 @@ from modp_ti.batch.finished import finished_metrics, is_stored
 from modp_ti.config.scene_file import scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing
 from modp_ti.files.sole_use import sole_use
 from modp_ti.files.storage import Storage, StorageError
 from modp_ti.tasks import Report
@@ -93,8 +94,6 @@ def fetch_finished(config: SceneConfig) -> bool:
     with tempfile.TemporaryDirectory(prefix="modp-ti-batch-") as folder:
         if not is_stored(config, storage, Path(folder)):
             return False
-    from modp_ti.outputs.formats.map_folder import appearing
-
     with appearing(config.output) as folder:
         storage.get_folder(folder)
     return finished_metrics(config) is not None

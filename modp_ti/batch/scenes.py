@@ -11,6 +11,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bare_recording import is_recording, recorded_scene
+from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.tasks import Resources
 
 __all__ = ["SNAPSHOT_EVERY", "Scene", "for_a_task", "read_scenes", "with_resources", "with_store"]
@@ -68,6 +69,7 @@ def _read(path: Path, overrides: Sequence[str], preset: str | None, taken: list[
         config = recorded_scene(path, overrides, preset, taken)
     else:
         config = load_scene(path, overrides, preset)
+    refuse_output_in_input(config, Path.cwd() if is_recording(path) else path.parent)
     if config.is_live:
         raise InputError(f"{path}: a live source has no place in a batch: map it with `modp-ti run`")
     if config.parts is not None:

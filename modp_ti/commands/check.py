@@ -39,11 +39,16 @@ def check(
         from rich.console import Console
 
         from modp_ti.config.scene_file import load_scene
+        from modp_ti.files.run_folder import require_usable
         from modp_ti.inputs.inspection import report as reports
         from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
+        from modp_ti.inputs.scene_paths import refuse_output_in_input
 
         try:
-            report = inspect_scene(load_scene(scene, set_ or []), progress_console(quiet))
+            config = load_scene(scene, set_ or [])
+            refuse_output_in_input(config, scene.resolve().parent)
+            require_usable(config.output)
+            report = inspect_scene(config, progress_console(quiet))
         except InputError as error:
             report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", one_line(error))])
         result.code = verdict(report.findings)[1]

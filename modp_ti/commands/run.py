@@ -146,19 +146,23 @@ def _run(
     quiet: bool,
     tasks: tuple[Where, str | None] | None,
 ) -> Path:
+    # Imported here, so that `--help` does not wait for Taichi and the readers to load.
+    from modp_ti.files.run_folder import require_usable
+    from modp_ti.inputs.bare_recording import is_recording
+    from modp_ti.inputs.scene_paths import refuse_output_in_input
+
     snapshot = None
     if resume is not None:
-        # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.engine.snapshots import load_resumed
-        from modp_ti.inputs.bare_recording import is_recording
 
         if scene is not None and is_recording(scene):
             raise InputError(f"{scene}: --resume has the recording already; leave it out")
         config, snapshot = load_resumed(resume, scene, overrides, preset)
     else:
         config = _new_scene(scene, stream, overrides, preset)
-    if config.output.exists() and not config.output.is_dir():
-        raise InputError(f"{config.output}: output must be a folder, this is a file")
+        at = Path.cwd() if scene is None or is_recording(scene) else scene.resolve().parent
+        refuse_output_in_input(config, at)
+        require_usable(config.output)  # once more in the run: here, before Taichi is loaded
     if config.parts is not None:
         from modp_ti.parts.mapping import map_in_parts
 

@@ -15,6 +15,7 @@ from modp_ti.engine.realtime import RealtimeRun
 from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
 from modp_ti.engine.second_visit import SecondVisit
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import PRIVATE
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.parts.merged_parts import MergedParts
@@ -40,7 +41,7 @@ def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None =
     """
     settings = config.offline if config.mode == "offline" else config.mapping
     try:
-        return Mapper(camera.width, camera.height, settings, config.seed, pace, config.output / "blocks")
+        return Mapper(camera.width, camera.height, settings, config.seed, pace, config.output / PRIVATE)
     except ValueError as error:
         raise InputError(str(error)) from None
 

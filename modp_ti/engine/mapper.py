@@ -15,10 +15,11 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.backend import program
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.formats.colmap_model import image_names
-from modp_ti.outputs.formats.map_folder import appearing, write_map
+from modp_ti.outputs.formats.map_folder import NOT_ALWAYS, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.blocks.block_files import BlockError
 from pipelines.finished_map import FinishedMap
@@ -299,7 +300,7 @@ class Mapper:
             The path as a `Path`.
 
         Raises:
-            InputError: If the files cannot be written.
+            InputError: If the files cannot be written, or would replace something that is not of a run.
         """
         path = Path(path)
         if path.suffix == ".ply":
@@ -309,7 +310,7 @@ class Mapper:
             except OSError as error:
                 raise InputError(f"{path}: cannot be written: {error.strerror}") from None
             return path
-        with appearing(path.absolute()) as folder:
+        with appearing(path.absolute(), NOT_ALWAYS) as folder:
             names = image_names(self.frames.name, written=False)
             write_map(folder, self.version(), self.frames, names, self.pipeline.keyframes, self.pipeline.near)
         return path

@@ -160,6 +160,7 @@ class RecordedSession(Tracker):
         output: Output folder of the recorded run.
 
     Attributes:
+        path: The file of the session.
         settings: Settings of the recorded run, as JSON.
         plans: Decisions of its pace.
         further: Number of further steps before each frame or correction, and before the end.
@@ -173,14 +174,14 @@ class RecordedSession(Tracker):
     reads_ahead: ClassVar[bool] = True
 
     def __init__(self, output: Path) -> None:
-        self._path = output / FILE
-        if not self._path.is_file():
-            raise InputError(f"{self._path}: there is no recorded session; record one with `export.session: true`")
+        self.path = output / FILE
+        if not self.path.is_file():
+            raise InputError(f"{self.path}: there is no recorded session; record one with `export.session: true`")
         try:
-            self._zip = zipfile.ZipFile(self._path)
+            self._zip = zipfile.ZipFile(self.path)
             about = json.loads(self._zip.read(ABOUT))
             if about["version"] != VERSION:
-                raise InputError(f"{self._path}: a session of version {about['version']}, this program reads {VERSION}")
+                raise InputError(f"{self.path}: a session of version {about['version']}, this program reads {VERSION}")
             self.settings: dict[str, Any] = dict(about["settings"])
             self.plans = [
                 None if plan is None else Plan(float(plan[0]), int(plan[1]), int(plan[2])) for plan in about["plans"]
@@ -203,7 +204,7 @@ class RecordedSession(Tracker):
 
     @property
     def notes(self) -> list[str]:
-        return [f"repeats the session in {self._path}"]
+        return [f"repeats the session in {self.path}"]
 
     @property
     def frame_count(self) -> int:
@@ -238,7 +239,7 @@ class RecordedSession(Tracker):
 
     def _damaged(self, error: Exception) -> InputError:
         reason = " ".join(str(error).split()) or type(error).__name__
-        return InputError(f"{self._path}: not a recorded session, or a damaged one ({reason}); record it again")
+        return InputError(f"{self.path}: not a recorded session, or a damaged one ({reason}); record it again")
 
 
 def _numbers(camera: PinholeCamera) -> NDArray[np.float64]:

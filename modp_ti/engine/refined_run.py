@@ -20,6 +20,7 @@ from modp_ti.engine.results import Results, summary_of
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import require_usable
 from modp_ti.files.sole_use import sole_use
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate
@@ -65,6 +66,7 @@ def refine_run(folder: Path, steps: int | None = None, console: Console | None =
     run = open_run(folder)
     config = _settings_of(run, steps)
     with sole_use(folder):
+        require_usable(folder)
         metrics = read_json(folder / "metrics.json", "of a finished run")
         line = ProgressLine(console or Console(quiet=True))
         try:

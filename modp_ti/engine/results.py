@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,13 @@ from fields.runtime.engine import engine
 from modp_ti.config.scene_file import dump_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text, write_picture
+from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing, is_run_folder
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.undistortion import Undistorter
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
 from modp_ti.outputs.formats.colmap_model import image_names, write_image
-from modp_ti.outputs.formats.map_folder import appearing, write_map
+from modp_ti.outputs.formats.map_folder import NOT_ALWAYS, write_map
 from modp_ti.outputs.formats.scores_csv import write_scores
 from modp_ti.outputs.formats.splats_ply import check_splats
 from modp_ti.outputs.report.page import ReportedRun, write_report
@@ -34,14 +36,14 @@ __all__ = ["Results", "metrics_of", "summary_of"]
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
 MAPS = ("online", "refined", "offline")
-# What not every map has, or is only written after its scores.
-NOT_ALWAYS = ("metrics.json", "scores.csv", "report.html", "renders", "exposure.json", "masks")
+# What not every run has, or is only written after its scores.
+OUTDATED = (*NOT_ALWAYS, "metrics.json", "scores.csv", "report.html", "renders", "session.zip")
 
 
 class Results:
     """Writes the output files of a run.
 
-    Inside `writing_map` and `writing_figures`, files go to the temporary `folder` next to `config.output`.
+    Inside `writing_map` and `writing_figures`, files go to a temporary `folder` in `config.output`.
 
     Args:
         config: The scene's settings.
@@ -63,25 +65,23 @@ class Results:
         Files of an earlier run that this map may not have are deleted from there. It raises InputError if the files
         cannot be written.
         """
-        with appearing(self.config.output) as self.folder:
+        with appearing(self.config.output, OUTDATED) as self.folder:
             yield
             dump_scene(self.config, self.folder / "config.yaml")
-            for name in NOT_ALWAYS:
-                earlier = self.config.output / name
-                if earlier.is_dir():
-                    shutil.rmtree(earlier)
-                else:
-                    earlier.unlink(missing_ok=True)
 
     @contextmanager
     def writing_figures(self) -> Iterator[None]:
         """As `writing_map`, for scores, report and pictures of the map that is in the output folder."""
-        with ExitStack() as parts:
-            self.folder = parts.enter_context(appearing(self.config.output))
+        with appearing(self.config.output, ("renders",)) as self.folder:
             (self.folder / "renders").mkdir()
-            if self.config.export.images:
-                self._images = parts.enter_context(appearing(self.config.output / "colmap"))
             yield
+            if not self.map_is_there:
+                raise InputError(f"{self.config.output}: the finished map is gone")
+
+    @property
+    def map_is_there(self) -> bool:
+        """Whether the map is in the output folder, after `writing_map`."""
+        return is_run_folder(self.config.output) and (self.config.output / "splats.ply").is_file()
 
     def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> None:
         """Write the map. Raises InputError if `splats.ply` is not read back as it was written."""
@@ -108,7 +108,7 @@ class Results:
         side.
         """
         if self.config.export.images:
-            write_image(self._images, self._names[frame.index], frame)
+            write_image(self.folder / "colmap", self._names[frame.index], frame)
         if frame.held_out:
             pair = np.round(np.hstack([frame.image, render]) * 255.0).astype(np.uint8)
             write_picture(self.folder / "renders" / f"{frame.index:06d}.png", pair)

@@ -60,8 +60,6 @@ class SecondVisit(EarlierMap):
 
     def __init__(self, config: SceneConfig, line: ProgressLine) -> None:
         assert config.onto is not None
-        if config.onto.resolve() == config.output.resolve():
-            raise InputError(f"{config.output}: the finished run of onto stays as it is; choose another output")
         self._config = config
         self._line = line
         self._run = open_run(config.onto)

@@ -28,9 +28,12 @@ from modp_ti.engine.remarks import remarks
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
+from modp_ti.engine.snapshots.file import FILE
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import run_folder
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
+from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
@@ -79,12 +82,14 @@ def run_scene(
             output = modp_ti.run_scene(modp_ti.load_scene("scene.yaml"))
             print((output / "metrics.json").read_text())
     """
-    with ExitStack() as held:
-        session = _Session(config, ProgressLine(console or Console(quiet=True), watch), held, replayed)
-        output, further = session.run(resumed), session.tracker.further_maps
-    for place in range(2, 2 + further):
-        session.line.note(f"map {place} of {1 + further}")
-        run_scene(config.of_map(place), console, watch=watch)
+    refuse_output_in_input(config, replayed=None if replayed is None else replayed.path)
+    with run_folder(config.output, adopted=() if resumed is None else (FILE,)):
+        with ExitStack() as held:
+            session = _Session(config, ProgressLine(console or Console(quiet=True), watch), held, replayed)
+            output, further = session.run(resumed), session.tracker.further_maps
+        for place in range(2, 2 + further):
+            session.line.note(f"map {place} of {1 + further}")
+            run_scene(config.of_map(place), console, watch=watch)
     return output
 
 
@@ -122,7 +127,8 @@ class _Session:
         self._say(*remarks(self.mapper.pipeline))
         self.breakdown = breakdown_percent(self.mapper.pipeline.stopwatch.seconds, self.clock.mapping)
         try:
-            versions = self._versions()
+            with self.unfinished.naming_snapshot():
+                versions = self._versions()
         except BlockError as error:
             raise self.unfinished.damaged(error) from None
         self._write(versions)
@@ -162,7 +168,8 @@ class _Session:
             self.clock.begin_mapping()
             self.stop.begin()
             try:
-                self._map(arriving)
+                with self.unfinished.naming_snapshot():
+                    self._map(arriving)
             except RunStopped:
                 raise self.unfinished.interrupted() from None
             except BlockError as error:
@@ -310,14 +317,16 @@ class _Session:
         self.conductor.saved()
         self.observer.on_stage("evaluating the saved map")
         more = f"; modp-ti run --resume {output} scores it" if self.checkpointer.path.is_file() else ""
-        unscored = f"the finished map is in {output}, without its scores{more}"
+        unscored = f"; the finished map is in {output}, without its scores{more}"
         try:
             with results.writing_figures():
                 metrics = self._write_figures(self._score(versions, results), versions, results)
         except RunStopped:
-            raise KeyboardInterrupt(f"interrupted: {unscored}") from None
+            raise KeyboardInterrupt(f"interrupted{unscored}") from None
         except InputError as error:
-            raise InputError(f"{error}; {unscored}") from None
+            if not results.map_is_there:
+                unscored = self.unfinished.way_on(versions[last])
+            raise InputError(f"{error}{unscored}") from None
         self.checkpointer.remove()
         self.line.summary(metrics)
 

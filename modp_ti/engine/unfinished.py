@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.interruption import RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.results import Results
 from modp_ti.engine.snapshots import Checkpointer
@@ -40,9 +44,21 @@ class Unfinished:
         """Save the map without a block whose file was damaged. The last snapshot stays as it was."""
         return InputError(f"{error}{self._save()}{self._checkpointer.way_on()}")
 
+    @contextmanager
+    def naming_snapshot(self) -> Iterator[None]:
+        """Add to errors inside this context how to go on from the snapshot, if there is one."""
+        try:
+            yield
+        except (RunStopped, BlockError):
+            raise
+        except Exception as error:
+            if way_on := self._checkpointer.way_on():
+                error.args = (f"{error}{way_on}",)
+            raise
+
     def way_on(self, version: MapVersion) -> str:
         """Return the part of an error message that says how to go on, or where the map is."""
-        if self._checkpointer.possible:
+        if self._checkpointer.usable:
             return self._checkpointer.way_on()
         pipeline = self._mapper.pipeline
         return self._results().elsewhere(version, pipeline.keyframes, pipeline.near)

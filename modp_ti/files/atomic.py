@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,14 +14,15 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["replace_file", "replace_text", "replacing", "sync_folder", "write_picture"]
+__all__ = ["replace_file", "replace_text", "replacing", "sync_folder", "write_picture", "written_aside"]
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str], mode: str = "wb", sync: bool = True) -> Iterator[IO]:
     """Open a temporary file next to `path` that replaces `path` when the block ends.
 
-    If the block or the write fails, the temporary file is deleted and `path` keeps its old content.
+    If the block or the write fails, the temporary file is deleted and `path` keeps its old content. The temporary file
+    is new, so that no symbolic link is followed and no file of another program is overwritten.
 
     Args:
         path: The file to replace or create.
@@ -34,10 +37,12 @@ def replacing(path: str | os.PathLike[str], mode: str = "wb", sync: bool = True)
         OSError: If the file cannot be written.
     """
     target = Path(path)
-    partial = target.with_name(target.name + ".partial")
+    # A name of at most 255 bytes, whatever that of the target is.
+    partial = target.with_name(f".modp-ti-{secrets.token_hex(8)}.partial")
+    encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
+    opened = partial.open(mode.replace("w", "x"), encoding=encoding, newline=newline)
     try:
-        encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
-        with partial.open(mode, encoding=encoding, newline=newline) as file:
+        with opened as file:
             yield file
             file.flush()
             if sync:
@@ -78,6 +83,21 @@ def write_picture(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> Non
     _, data = cv2.imencode(Path(path).suffix, image[..., ::-1] if image.ndim == 3 else image)
     with replacing(path, sync=False) as file:
         file.write(data.tobytes())
+
+
+@contextmanager
+def written_aside(path: Path) -> Iterator[Path]:
+    """Yield a path of the same name, its suffix in small letters, in a private folder next to `path`.
+
+    The file or folder that is written there replaces `path` on exit, a folder only an empty one.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    with tempfile.TemporaryDirectory(prefix=".modp-ti-", dir=path.parent, ignore_cleanup_errors=True) as folder:
+        partial = Path(folder) / f"{path.stem}{path.suffix.lower()}"
+        yield partial
+        os.replace(partial, path)
 
 
 def sync_folder(folder: Path) -> None:

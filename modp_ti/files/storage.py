@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import PRIVATE
 
 __all__ = ["Storage", "StorageError"]
 
@@ -60,8 +62,9 @@ class Storage:
         target = f"{self._root}/{name}"
         with self._doing("cannot be written"):
             self._files.makedirs(target.rpartition("/")[0], exist_ok=True)
-            self._files.put_file(os.fspath(file), f"{target}.partial")
-            self._files.mv(f"{target}.partial", target)
+            partial = f"{target}.{secrets.token_hex(8)}.partial"  # new, so that no symbolic link is followed
+            self._files.put_file(os.fspath(file), partial)
+            self._files.mv(partial, target)
 
     def get(self, name: str, file: Path) -> bool:
         """Copy the file of this name to `file`, and return whether there is one."""
@@ -80,6 +83,7 @@ class Storage:
     def put_folder(self, folder: Path) -> None:
         """Copy the files of a folder here, `metrics.json` last."""
         names = [file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()]
+        names = [name for name in names if PRIVATE not in name.split("/")]
         for name in sorted(names, key=lambda name: (name == LAST, name)):
             self.put(folder / name, name)
 
@@ -90,7 +94,7 @@ class Storage:
             found = [str(file) for file in self._files.find(self._root)]
         for file in found:
             name = file.removeprefix(f"{self._root}/")
-            if file.endswith(".partial") or Path(name).is_absolute() or ".." in Path(name).parts:
+            if file.endswith(".partial") or Path(name).is_absolute() or {"..", PRIVATE}.intersection(Path(name).parts):
                 continue
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             self.get(name, folder / name)

@@ -12,6 +12,8 @@ from modp_ti.batch.results import State
 from modp_ti.batch.scenes import with_store
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import run_folder
+from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.parts.part_scenes import FOLDER, part_scenes
@@ -42,6 +44,16 @@ def map_in_parts(
         KeyboardInterrupt: After Ctrl-C, when the parts have saved what they had.
     """
     console = console or Console(quiet=True)
+    refuse_output_in_input(config)
+    with run_folder(config.output):
+        _map_parts(config, engine, address, console)
+        from modp_ti.engine.session import run_scene  # here, so that the parts' processes have the memory until then
+
+        return run_scene(config, console)
+
+
+def _map_parts(config: SceneConfig, engine: str, address: str | None, console: Console) -> None:
+    """Map the parts that are not mapped."""
     with closing(open_tracker(config, ProgressLine(console).prepare)) as tracker:
         scenes = part_scenes(tracker, config)
     if config.snapshot_store:
@@ -52,6 +64,3 @@ def map_in_parts(
     failed = [result for result in results if result.state not in (State.finished, State.before)]
     if failed:
         raise InputError(f"{failed[0].name}: {failed[0].error}; the same command goes on with the parts that are left")
-    from modp_ti.engine.session import run_scene  # here, so that the parts' processes have the memory until then
-
-    return run_scene(config, console)

@@ -8,6 +8,7 @@ import shutil
 from fields.map.covisibility import SeenPoints
 from modp_ti.batch.scenes import Scene, for_a_task
 from modp_ti.config.settings import SceneConfig
+from modp_ti.files.run_folder import appearing
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.parts.cutting import Part, cut
@@ -48,7 +49,8 @@ def part_scenes(tracker: Tracker, config: SceneConfig) -> list[Scene]:
     if config.tracker.kind == "sfm":
         for scene in scenes:
             assert scene.config is not None
-            shutil.copytree(config.output / "sfm", scene.config.output / "sfm", dirs_exist_ok=True)
+            with appearing(scene.config.output, ("sfm",)) as staged:
+                shutil.copytree(config.output / "sfm", staged / "sfm")
     return scenes
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -137,7 +138,7 @@ class LocalEngine(Engine):
             output: Any = subprocess.DEVNULL
             if self._logs is not None:
                 self._logs.mkdir(parents=True, exist_ok=True)
-                output = held.enter_context((self._logs / f"{name}.log").open("ab"))
+                output = held.enter_context(open(self._logs / f"{name}.log", "ab", opener=_not_through_links))
             process = _started(theirs.fileno(), max(1, int(resources.cpus)), output)
         call = _Call(resources, process, cast(Connection, ours))
         try:
@@ -160,6 +161,10 @@ class LocalEngine(Engine):
             del self._running[name]
             found.append(Ended(name, message, self._machine))
         return found
+
+
+def _not_through_links(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def _started(descriptor: int, threads: int, output: Any) -> subprocess.Popen[bytes]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import mmap
-import shutil
 import sys
 import tempfile
 import zlib
@@ -68,8 +67,7 @@ class BlockFiles:
     """The files of blocks and of keyframes, in a folder of their own that is removed with this object.
 
     Args:
-        folder: The folder, which appears with the first file. One that is left there from a process that was killed is
-            replaced. None for a temporary folder.
+        folder: Where it is made, with the first file; None for where the system keeps temporary files.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -84,13 +82,11 @@ class BlockFiles:
     def path(self) -> Path:
         """The folder, which is created at the first call. Raises OSError if it cannot be."""
         if self._folder is None:
-            parent, prefix = None, "modp-ti-blocks-"
             if self._wanted is not None:
-                parent, prefix = self._wanted.parent, f"{self._wanted.name}-"
-                parent.mkdir(parents=True, exist_ok=True)
-                for left in parent.glob(f"{prefix}*"):
-                    shutil.rmtree(left, ignore_errors=True)
-            self._folder = tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True)
+                self._wanted.mkdir(parents=True, exist_ok=True)
+            self._folder = tempfile.TemporaryDirectory(
+                prefix="modp-ti-blocks-", dir=self._wanted, ignore_cleanup_errors=True
+            )
         return Path(self._folder.name)
 
     def write(self, blocks: Sequence[NDArray[np.void]]) -> list[StoredBlock]:

@@ -99,7 +99,8 @@ def kill_and_resume(folder: Path, kills: int, seed: int, say: Callable[[str], No
         require_success(ended, output)
         result.runs += 1
         result.identical += contents(output) == expected
-        result.leftovers += len([*folder.glob("**/*.partial")]) + snapshot.exists()
+        temporary = [file for file in folder.glob("**/.modp-ti*/*") if file.name != "files.json"]
+        result.leftovers += len([*folder.glob("**/*.partial"), *temporary]) + snapshot.exists()
         say(f"run {result.runs} has come to its end: {'identical' if contents(output) == expected else 'DIFFERENT'}")
         shutil.rmtree(output, ignore_errors=True)
     return result

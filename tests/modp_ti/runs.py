@@ -10,6 +10,7 @@ from pathlib import Path
 from tests.patience import PATIENCE
 
 FILES = [
+    ".modp-ti",
     "colmap",
     "config.yaml",
     "frames.json",
@@ -34,7 +35,16 @@ refine:  {steps: 20}
 
 def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """A run on a machine whose torch has no weights in its cache."""
-    command = [sys.executable, "-m", "modp_ti.run", str(scene), *arguments]
+    return _called("modp_ti.run", scene, *arguments)
+
+
+def check(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The same of `modp-ti check`."""
+    return _called("modp_ti.commands.check", scene, *arguments)
+
+
+def _called(module: str, scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", module, str(scene), *arguments]
     environment = {**os.environ, "TORCH_HOME": str(scene.parent / "no-torch")}
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, env=environment)
 

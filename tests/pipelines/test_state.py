@@ -122,16 +122,3 @@ def test_a_state_without_its_marks_of_voxels_is_refused(states: dict[str, MapSta
     arrays = {name: array for name, array in states["1"].arrays.items() if not name.startswith("voxels.")}
     with pytest.raises(TypeError, match="restore"):
         restored(MapState(arrays, states["1"].numbers), EXPOSED)
-
-
-def test_marks_that_an_earlier_version_saved_are_those_of_the_gaussians(states: dict[str, MapState]) -> None:
-    state = states["5"]
-    arrays = {name: array for name, array in state.arrays.items() if not name.startswith("voxels.")}
-    assert len(arrays) == len(state.arrays) - 3
-    mapper = restored(MapState(arrays, state.numbers | {"voxels_made_again": True}), EXPOSED)
-    position, spacing = mapper.gaussians.to_numpy()["position"], arrays["anchors.spacing"][mapper.gaussians.anchors()]
-    voxels = mapper.densifier.voxels
-    assert voxels.query(position, spacing).all()
-    elsewhere = position + np.array([0.0, 0.0, 2.0 * voxels.coarsest])
-    assert not voxels.query(elsewhere, spacing).all()
-    assert mapper.state().numbers == state.numbers

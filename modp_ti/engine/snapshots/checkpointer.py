@@ -18,6 +18,8 @@ from modp_ti.engine.snapshots.snapshot import (
     version_state,
 )
 from modp_ti.engine.snapshots.store import SnapshotStore
+from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import RunRecord
 
@@ -88,13 +90,13 @@ class Checkpointer:
         if position == self._last:
             return True
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._snapshot(position).write()
-        except OSError as error:
+            with appearing(self.path.parent) as folder:
+                self._snapshot(position).write(folder / FILE)
+        except InputError as error:
             self.failed += 1
             if self.failed == 1:
-                left = "the previous one is kept" if self.path.exists() else "there is none yet"
-                self._say(f"{self.path}: a snapshot cannot be written: {error.strerror}; {left}, and the run continues")
+                left = "the previous one is kept" if self.usable else "there is none yet"
+                self._say(f"a snapshot cannot be written: {error}; {left}, and the run continues")
             return False
         self.written += 1
         self._last = position
@@ -102,16 +104,24 @@ class Checkpointer:
             self._store.put(self.path)
         return True
 
+    @property
+    def usable(self) -> bool:
+        """Whether there is a snapshot of this run in the output folder."""
+        return self.possible and self.written > 0 and self.path.is_file()
+
     def way_on(self) -> str:
         """Return the part of an error message that says how to resume, or "" if the run cannot be resumed."""
-        if not self.possible or not self.path.is_file():
+        if not self.usable:
             return ""
         return f"; fix the cause, then continue from the snapshot with `modp-ti run --resume {self.path.parent}`"
 
     def remove(self) -> None:
-        """Delete the snapshot of a finished run, its copy, and the partial file that a killed process may have left."""
-        for name in (FILE, FILE + ".partial"):
-            self.path.with_name(name).unlink(missing_ok=True)
+        """Delete the snapshot of a finished run and its copy."""
+        try:
+            with appearing(self.path.parent, (FILE,)):
+                pass
+        except InputError as error:
+            self._say(f"{error}; the snapshot of this finished run is left there")
         if self._store is not None:
             self._store.remove()
 

@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
+from modp_ti.version import __version__
 
-__all__ = ["FILE", "OLDEST", "VERSION", "read_arrays", "write_arrays"]
+__all__ = ["FILE", "VERSION", "of_another_program", "read_arrays", "write_arrays"]
 
 FILE = "snapshot.npz"
-# Version of the arrays and the JSON. Versions before `OLDEST` and newer ones are refused, as they hold the state of
-# different code; `Snapshot.read` converts those in between.
+# Version of the arrays and the JSON. Others are refused, as they hold the state of different code.
 VERSION = 4
-OLDEST = 2
 ABOUT = "about"
 KINDS = "biuf"
 
@@ -37,7 +36,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, 
 
     The previous file is replaced only once the new one is on disk.
     """
-    text = json.dumps({"version": VERSION, **about}).encode("utf-8")
+    text = json.dumps({"version": VERSION, "program": __version__, **about}).encode("utf-8")
     with replacing(path) as file:
         np.savez(file, allow_pickle=False, **arrays, **{ABOUT: np.frombuffer(text, dtype=np.uint8)})
 
@@ -59,12 +58,18 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
     except (zipfile.BadZipFile, ValueError, KeyError, TypeError, NotImplementedError, RuntimeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a snapshot, or a damaged one ({reason}); start the run from its scene") from None
-    if version not in range(OLDEST, VERSION + 1):
-        raise InputError(
-            f"{path}: a snapshot of version {version}, but this program reads version {VERSION}; resume with the "
-            "program that wrote it, or start the run from its scene"
-        )
+    if version != VERSION:
+        raise of_another_program(path, about.get("program"), f"its format is {version}, and this program's {VERSION}")
     return arrays, about
+
+
+def of_another_program(path: Path, program: object, difference: str) -> InputError:
+    """Return the error for a snapshot of another version of the program, None if it is unknown, with its difference."""
+    wrote = f"MODP-Ti {program}" if isinstance(program, str) else "an earlier version of MODP-Ti"
+    return InputError(
+        f"{path}: {wrote} has written this snapshot, and MODP-Ti {__version__} cannot resume it ({difference}); "
+        "resume with that version, or start the run from its scene"
+    )
 
 
 def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:

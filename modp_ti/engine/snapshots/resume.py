@@ -15,10 +15,10 @@ from modp_ti.config.old_settings import without_leftovers
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.snapshots.file import FILE
+from modp_ti.engine.snapshots.file import FILE, of_another_program
 from modp_ti.engine.snapshots.snapshot import Snapshot, StreamDigest
-from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing
 from modp_ti.files.storage import Storage
 
 __all__ = ["continued", "fetch_snapshot", "load_resumed", "replay"]
@@ -66,6 +66,10 @@ def load_resumed(
             raise InputError(f"{output}: this run is finished; there is nothing to resume")
         raise InputError(f"{file}: there is no snapshot; start the run from its scene, and set `snapshot_every`")
     snapshot = Snapshot.read(file)
+    try:
+        scene_from_data(snapshot.settings, str(file))
+    except InputError as error:
+        raise of_another_program(file, snapshot.program, str(error)) from None
     config = config or scene_from_data(snapshot.settings, str(file), overrides)
     return continued(config.model_copy(update={"output": output.resolve()}), snapshot), snapshot
 
@@ -82,10 +86,13 @@ def continued(config: SceneConfig, snapshot: Snapshot) -> SceneConfig:
     if isinstance(scale, float):  # the run's number, which `auto` in the scene file became
         config = config.resolved(scale)
     now = config.model_dump(mode="json")
+    after = leaves(now)
     for key in differing_keys(settings, now, FREE):
+        if key not in before or key not in after:
+            raise of_another_program(snapshot.path, snapshot.program, f"only one of them has the setting {key}")
         raise InputError(
-            f"{snapshot.path}: the snapshot was made with {key}: {as_yaml(before.get(key))}, not "
-            f"{as_yaml(leaves(now).get(key))}; resume with the settings of the interrupted run"
+            f"{snapshot.path}: the snapshot was made with {key}: {as_yaml(before[key])}, not "
+            f"{as_yaml(after[key])}; resume with the settings of the interrupted run"
         )
     return config
 
@@ -106,12 +113,8 @@ def fetch_snapshot(config: SceneConfig) -> None:
             return
         if file.is_file() and _progress(fetched, config) <= _progress(file, config):
             return
-        try:
-            config.output.mkdir(parents=True, exist_ok=True)
-            with replacing(file) as target, fetched.open("rb") as source:
-                shutil.copyfileobj(source, target)
-        except OSError as error:
-            raise InputError(f"{config.output}: cannot be written: {error.strerror}") from None
+        with appearing(config.output) as staged:
+            shutil.copyfile(fetched, staged / FILE)
 
 
 def _progress(file: Path, config: SceneConfig) -> tuple[int, bool, int]:

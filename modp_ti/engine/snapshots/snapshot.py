@@ -17,11 +17,11 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
 from modp_ti.engine.snapshots.file import read_arrays, write_arrays
-from modp_ti.engine.snapshots.old_versions import convert_version_2, convert_version_3
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
+from modp_ti.version import __version__
 from pipelines.state import MapState
 
 __all__ = ["Position", "Snapshot", "StreamDigest", "frames_state", "record_state", "version_state"]
@@ -100,6 +100,7 @@ class Snapshot:
         position: The point in the run at which it was taken.
         arrays: Arrays with names of the form `group.name`.
         numbers: Everything else, as JSON.
+        program: Version of the program that made it, None if the file does not say.
     """
 
     path: Path
@@ -107,29 +108,26 @@ class Snapshot:
     position: Position
     arrays: dict[str, NDArray]
     numbers: dict[str, Any]
+    program: object = __version__
 
     @property
     def map(self) -> MapState:
         return MapState(self.arrays, self.numbers["map"])
 
-    def write(self) -> None:
-        """Write the file, replacing the previous snapshot. Raises OSError if it cannot be written."""
+    def write(self, path: Path) -> None:
+        """Write the file to this path. Raises OSError if it cannot be written."""
         about = {"settings": self.settings, "position": asdict(self.position), "numbers": self.numbers}
-        write_arrays(self.path, self.arrays, about)
+        write_arrays(path, self.arrays, about)
 
     @classmethod
     def read(cls, path: Path) -> Snapshot:
         """Read a snapshot. Raises InputError with one line if the file cannot be used."""
         arrays, about = read_arrays(path)
         try:
-            if about["version"] == 2:
-                convert_version_2(arrays, about["numbers"])
-            if about["version"] <= 3:
-                convert_version_3(arrays, about["numbers"])
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
         except (IndexError, KeyError, TypeError, ValueError) as error:
             raise _unfit(path, error) from None
-        return cls(path, settings, position, arrays, numbers)
+        return cls(path, settings, position, arrays, numbers, about.get("program"))
 
     @contextmanager
     def fitting(self) -> Iterator[None]:

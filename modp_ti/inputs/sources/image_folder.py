@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import PRIVATE
 from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES
 
@@ -29,7 +30,7 @@ def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
 
 
 class ImageFolder(ListedImages):
-    """The images in a folder and its subfolders, without hidden files.
+    """The images in a folder and its subfolders, without hidden files and the output folders of runs.
 
     Names are relative to the folder, with forward slashes. If all names are time stamps, as in EuRoC's and TUM's
     folders, they give the times.
@@ -51,7 +52,9 @@ class ImageFolder(ListedImages):
             raise InputError(f"{path}: {setting} must be a folder of images, this is a file")
         found: list[str] = []
         for folder, subfolders, files in os.walk(path):
-            subfolders[:] = [name for name in subfolders if not name.startswith(".")]
+            subfolders[:] = [
+                name for name in subfolders if name[0] != "." and not os.path.isdir(os.path.join(folder, name, PRIVATE))
+            ]
             inside = Path(folder).relative_to(path)
             found += [
                 (inside / name).as_posix()

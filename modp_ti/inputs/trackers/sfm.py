@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from modp_ti.config.tracker_settings import ColmapSettings, SfmSettings
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.run_folder import appearing
 from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL
 from modp_ti.inputs.multiview.features import detect_features
 from modp_ti.inputs.multiview.image_pairs import image_pairs
@@ -53,8 +53,9 @@ def open_sfm(
     made_of = _fingerprint(images, source, tracker, names, seed)
     kept = _kept(folder) == made_of
     if not kept:
-        _reconstruct(reader, names, tracker, folder, seed, progress or _silent)
-        replace_text(folder / MADE_OF, made_of)
+        with appearing(folder.parent, (folder.name,)) as staged:
+            _reconstruct(reader, names, tracker, staged / folder.name, seed, progress or _silent)
+            replace_text(staged / folder.name / MADE_OF, made_of)
     images.close()
     opened = open_colmap(source, ColmapSettings(path=folder), upright=True)
     if kept:
@@ -75,8 +76,7 @@ def _reconstruct(
             f"{reader.images.path}: structure from motion could not join three of the {len(matched)} images: they need "
             "to show one scene with detail, from places apart (tracker.kind: sfm)"
         )
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    folder.mkdir()
     model.write_binary(str(folder))
 
 

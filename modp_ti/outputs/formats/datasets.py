@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
+from modp_ti.files.atomic import written_aside
 from modp_ti.files.errors import InputError
 
 __all__ = ["new_folder", "rename_images", "write_transforms"]
@@ -31,16 +30,11 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; name a new folder (--output), or remove it")
-    partial = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with written_aside(folder) as partial:
         partial.mkdir()
         yield partial
         if folder.is_dir():
             folder.rmdir()
-        os.replace(partial, folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def rename_images(model: Path, target: Path, names: Sequence[str]) -> None:

@@ -1,16 +1,11 @@
-"""Writes the files of a map to a folder, so that they appear together."""
+"""Writes the files of a map to a folder."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from fields.map.keyframes import KeyframeStore
-from modp_ti.files.atomic import sync_folder
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.undistortion import Undistorter
 from modp_ti.outputs.evaluation import MapVersion
@@ -21,37 +16,10 @@ from modp_ti.outputs.formats.keyframe_masks import write_masks
 from modp_ti.outputs.formats.splats_ply import write_splats
 from modp_ti.outputs.formats.trajectory import write_trajectory
 
-__all__ = ["appearing", "write_map"]
+__all__ = ["NOT_ALWAYS", "write_map"]
 
-LAST = "metrics.json"
-
-
-@contextmanager
-def appearing(output: Path) -> Iterator[Path]:
-    """Yield an empty temporary folder whose content moves to `output` on exit, replacing files of the same name.
-
-    `metrics.json` moves last, so that a folder that contains it is complete.
-
-    Raises:
-        InputError: If the files cannot be written.
-    """
-    folder = output.with_name(output.name + ".partial")
-    shutil.rmtree(folder, ignore_errors=True)
-    try:
-        folder.mkdir(parents=True)
-        yield folder
-        output.mkdir(exist_ok=True)
-        if (folder / LAST).exists():
-            (output / LAST).unlink(missing_ok=True)
-        for item in sorted(folder.iterdir(), key=lambda item: (item.name == LAST, item.name)):
-            if item.is_dir():
-                shutil.rmtree(output / item.name, ignore_errors=True)
-            os.replace(item, output / item.name)
-        sync_folder(output)
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written: {error.strerror}") from None
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+NOT_ALWAYS = ("colmap", "exposure.json", "masks")
+"""What `write_map` writes that another map may lack, or have other files in."""
 
 
 def write_map(

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import SH_C0
-from modp_ti.outputs.formats.open3d_io import open3d, written_aside
+from modp_ti.files.atomic import written_aside
+from modp_ti.outputs.formats.open3d_io import open3d
 from modp_ti.outputs.formats.splat_packing import opacities
 
 __all__ = ["write_points"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import list_files, refuse_foreign
 from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
 from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, TRUNCATION, extracted, fused, supported, write_mesh
@@ -92,9 +93,12 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     for option, of in (("voxel", "mesh"), ("texture", "mesh"), ("spz-version", "spz")):
         if given[option] and format != of:
             raise InputError(f"--{option}: --format {format} has none; use --format {of}, or leave it out")
+    default = output is None and format not in FOLDERS
     if options.texture:
         output = run.folder / TEXTURED_NAME if output is None else output
     target = _target(run, format, output)
+    if default:
+        refuse_foreign(run.folder, [target.name])
     if options.texture:
         if target.suffix.lower() != ".glb":
             raise InputError(f"{target}: a mesh with --texture is written as .glb")
@@ -127,6 +131,8 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
             film(run, plan_flight(run, "recorded"), target, False, options.device, line)
         else:
             _dataset(run, target, format, line)
+        if default:
+            list_files(run.folder, [target.name])
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror or error}") from None
     return target

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.files.atomic import written_aside
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.datasets import new_folder
-from modp_ti.outputs.formats.open3d_io import written_aside
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from pipelines.render.renderer import RenderedView
 

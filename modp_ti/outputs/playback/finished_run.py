@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import require_whole
 from modp_ti.inputs.sources import NO_DISTORTION
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
@@ -91,6 +92,7 @@ def open_run(folder: Path) -> FinishedRun:
     if not folder.is_dir():
         what = "not a folder" if folder.exists() else "no such folder; a run makes it at its end"
         raise InputError(f"{folder}: {what}: name the output folder of a finished run")
+    require_whole(folder)
     missing = [name for name in NEEDED if not (folder / name).exists()]
     if len(missing) == len(NEEDED):
         raise InputError(f"{folder}: no run has left anything here: name the output folder of a finished run")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -14,13 +15,15 @@ import pytest
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine import results, session
 from modp_ti.engine.observer import Observer
+from modp_ti.engine.snapshots import load_resumed
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing
 from modp_ti.outputs.formats.splats_ply import read_splats
 
 if TYPE_CHECKING:
     from tests.room import Room
 
-SAVED = {"splats.ply", "trajectory.txt", "frames.json", "colmap", "config.yaml"}
+SAVED = {".modp-ti", "splats.ply", "trajectory.txt", "frames.json", "colmap", "config.yaml"}
 
 pytestmark = pytest.mark.slow
 
@@ -94,7 +97,12 @@ def elsewhere(_: object) -> None:
 
 
 def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(results.tempfile, "mkdtemp", full)
+    make = results.tempfile.mkdtemp
+    monkeypatch.setattr(
+        results.tempfile,
+        "mkdtemp",
+        lambda *at, **how: full() if how.get("prefix") == "modp-ti-map-" else make(*at, **how),
+    )
 
 
 @pytest.mark.parametrize("room_left", [elsewhere, nowhere])
@@ -109,7 +117,7 @@ def test_a_live_map_that_does_not_fit_on_the_disk_is_saved_elsewhere(
     monkeypatch.setattr(
         results,
         "write_map",
-        lambda folder, *rest: full() if folder.parent == config.output.parent else write_map(folder, *rest),
+        lambda folder, *rest: full() if config.output in folder.parents else write_map(folder, *rest),
     )
     room_left(monkeypatch)
     with pytest.raises(InputError) as error:
@@ -120,7 +128,7 @@ def test_a_live_map_that_does_not_fit_on_the_disk_is_saved_elsewhere(
     if room_left is elsewhere:
         (kept,) = (tmp_path / "tmp").iterdir()
         assert said.endswith(f"; the map is in {kept}")
-        assert set(os.listdir(kept)) == SAVED and len(read_splats(kept / "splats.ply")["position"]) > 20
+        assert set(os.listdir(kept)) == SAVED - {".modp-ti"} and len(read_splats(kept / "splats.ply")["position"]) > 20
     else:
         assert said.endswith(f"; nor can {tmp_path / 'tmp'}: No space left on device, and the map is lost")
 
@@ -140,9 +148,10 @@ def test_the_finished_map_is_there_before_its_scores_and_stays_without_room_for_
     scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = scene.parent / "out"
-    out.mkdir()
-    (out / "metrics.json").write_text("{}")
-    (out / "renders").mkdir()
+    with appearing(out) as earlier:
+        (earlier / "metrics.json").write_text("{}")
+        (earlier / "renders").mkdir()
+        (earlier / "renders" / "000000.png").touch()
     watcher = Watcher(out)
     monkeypatch.setattr(session, "open_observer", lambda *_: watcher)
     monkeypatch.setattr(results, "write_scores", full)
@@ -153,3 +162,92 @@ def test_the_finished_map_is_there_before_its_scores_and_stays_without_room_for_
     )
     assert watcher.held == SAVED == set(os.listdir(out))
     assert len(read_splats(out / "splats.ply")["position"]) > 20
+
+
+@pytest.fixture
+def recorded(tmp_path: Path, room: Room) -> Path:
+    """A short recording with poses, as it can be resumed."""
+    from tests.room import RoomRecording, pinhole, walk
+
+    RoomRecording(room, pinhole(64, 48), walk(8)).write(tmp_path)
+    file = tmp_path / "scene.yaml"
+    file.write_text("""
+source:  {path: images, holdout: 4, fps: 10}
+tracker: {kind: colmap, path: sparse/0}
+output:  out
+device:  cpu
+mapping: {optimise: {steps: 2}}
+refine:  {steps: 3}
+export:  {report: false}
+""")
+    return file
+
+
+class Saboteur(Observer):
+    """Does something to the run at a stage, or to its fourth frame."""
+
+    def __init__(self, stage: str, act: Callable[[], object]) -> None:
+        self._stage, self._act, self._seen = stage, act, 0
+
+    def on_frame(self, *_: object) -> None:
+        self._seen += 1
+        self.on_stage("mapping" if self._seen == 4 else "")
+
+    def on_step(self, stage: str, *_: object) -> None:
+        self.on_stage(stage)
+
+    def on_stage(self, stage: str) -> None:
+        if stage == self._stage:
+            self._stage = "done"
+            self._act()
+
+
+@pytest.mark.parametrize("stage", ["mapping", "refining", "evaluating the saved map"])
+@pytest.mark.parametrize("in_its_place", ["nothing", "a file", "a folder of someone"])
+def test_a_map_whose_folder_is_gone_is_saved_where_the_error_says(
+    stage: str, in_its_place: str, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, temporary = tmp_path / "out", tmp_path / "tmp"
+    temporary.mkdir()
+    monkeypatch.setattr(results.tempfile, "tempdir", str(temporary))
+
+    def sabotage() -> None:
+        shutil.rmtree(out)
+        if in_its_place == "a file":
+            out.touch()
+        elif in_its_place != "nothing":
+            out.mkdir()
+            (out / "splats.ply").write_text("mine")
+
+    monkeypatch.setattr(session, "open_observer", lambda *_: Saboteur(stage, sabotage))
+    said = ""
+    try:
+        session.run_scene(load_scene(recorded))
+    except InputError as error:
+        said = str(error)
+    if in_its_place == "a folder of someone":
+        assert (out / "splats.ply").read_text() == "mine" and os.listdir(out) == ["splats.ply"]
+    maps = [place for place in (out, *temporary.glob("modp-ti-map-*")) if len(files_in(place)) > 1]
+    assert len(maps) == 1 and (maps == [out] if not said else str(maps[0]) in said)
+    assert len(read_splats(maps[0] / "splats.ply")["position"]) > 20
+
+
+def files_in(place: Path) -> list[str]:
+    return os.listdir(place) if place.is_dir() else []
+
+
+@pytest.mark.parametrize("stage", ["mapping", "refining"])
+@pytest.mark.parametrize("fault", [InputError("a fault"), MemoryError(), OSError(5, "a fault"), ValueError("a fault")])
+def test_a_fault_on_the_way_names_the_snapshot(
+    fault: Exception, stage: str, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise fault
+
+    monkeypatch.setattr(session, "open_observer", lambda *_: Saboteur(stage, fail))
+    with pytest.raises(type(fault)) as raised:
+        session.run_scene(load_scene(recorded, ["snapshot_every=2"]))
+    assert f"--resume {recorded.parent / 'out'}" in repr(raised.value)
+    monkeypatch.undo()
+    resumed = load_resumed(recorded.parent / "out", None, [])
+    assert (session.run_scene(resumed[0], resumed=resumed[1]) / "metrics.json").is_file()

@@ -14,6 +14,7 @@ from modp_ti.commands.app import app
 from modp_ti.engine import refined_run
 from modp_ti.engine.refined_run import refine_run
 from modp_ti.engine.snapshots.file import FILE
+from modp_ti.files.run_folder import PRIVATE
 from modp_ti.outputs.formats.scores_csv import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.finished_run import open_run
@@ -60,7 +61,7 @@ def test_an_interrupted_refinement_leaves_the_run_as_it_was(out: Path, monkeypat
     with pytest.raises(KeyboardInterrupt):
         refine_run(out, steps=1)
     assert contents(out) == before
-    assert list(out.parent.iterdir()) == [out]
+    assert [file.name for file in (out / PRIVATE).iterdir()] == ["files.json"]
 
 
 def refused(folder: Path) -> bool:

@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 
 from modp_ti.files import atomic
-from modp_ti.files.atomic import replace_file, replace_text, replacing, write_picture
-from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.map_folder import appearing
+from modp_ti.files.atomic import replace_file, replace_text, replacing, write_picture, written_aside
 from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
@@ -91,28 +89,16 @@ def test_a_picture_is_what_it_was(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], image)
 
 
-def test_a_folder_that_cannot_be_filled_leaves_the_one_before(tmp_path: Path) -> None:
-    output = tmp_path / "out"
-    with appearing(output) as folder:
-        replace_text(folder / "metrics.json", "{}")
-        replace_text(folder / "map", "first")
-    with (
-        pytest.raises(InputError, match="out: cannot be written: No space left on device"),
-        appearing(output) as folder,
-    ):
-        replace_text(folder / "map", "second")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    assert {file.name: file.read_text() for file in output.iterdir()} == {"map": "first", "metrics.json": "{}"}
-    assert os.listdir(tmp_path) == ["out"]
-
-
-def test_the_figures_come_last_so_that_a_folder_that_has_them_is_whole(tmp_path: Path, monkeypatch) -> None:
-    from modp_ti.outputs.formats import map_folder
-
-    moved: list[str] = []
-    move = os.replace
-    monkeypatch.setattr(map_folder.os, "replace", lambda a, b: (moved.append(Path(b).name), move(a, b)))
-    with appearing(tmp_path / "out") as folder:
-        for name in ("splats.ply", "metrics.json", "trajectory.txt"):
-            (folder / name).write_text(name)
-    assert moved == ["splats.ply", "trajectory.txt", "metrics.json"]
+def test_no_write_follows_a_symbolic_link_or_takes_a_file_of_another_name(tmp_path: Path) -> None:
+    """Whatever names another user has laid out beside the file: links to a victim, or files."""
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"precious")
+    for name in ("a.bin", "a.bin.partial", ".a.bin.partial", "a.partial.bin"):
+        (tmp_path / name).symlink_to(victim)
+    before = set(os.listdir(tmp_path))
+    replace_file(tmp_path / "a.bin", b"new")
+    with written_aside(tmp_path / "a.bin") as partial:
+        partial.write_bytes(b"newer")
+    assert victim.read_bytes() == b"precious"
+    assert (tmp_path / "a.bin").read_bytes() == b"newer" and not (tmp_path / "a.bin").is_symlink()
+    assert set(os.listdir(tmp_path)) == before

@@ -13,6 +13,7 @@ import pytest
 from modp_ti.engine.snapshots import file as snapshot_file
 from modp_ti.engine.snapshots.file import FILE, VERSION, read_arrays, write_arrays
 from modp_ti.files.errors import InputError
+from modp_ti.version import __version__
 
 ARRAYS = {
     "gaussians.position": np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32),
@@ -52,11 +53,10 @@ def test_another_version_is_refused_with_its_number(tmp_path: Path, monkeypatch,
     monkeypatch.setattr(snapshot_file, "VERSION", version)
     write_arrays(tmp_path / FILE, ARRAYS, ABOUT)
     monkeypatch.undo()
-    with pytest.raises(
-        InputError, match=f"a snapshot of version {version}, but this program reads version {VERSION}"
-    ) as refused:
+    with pytest.raises(InputError) as refused:
         read_arrays(tmp_path / FILE)
-    assert "\n" not in str(refused.value)
+    said = str(refused.value)
+    assert "\n" not in said and all(text in said for text in (f"{version}", f"{VERSION}", f"MODP-Ti {__version__}"))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])

@@ -1,0 +1,198 @@
+"""The output folder of a run: all or nothing appears in it, and what no run has written stays as it is."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from modp_ti.config.scene_file import dump_scene
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.atomic import replace_text
+from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import (
+    PRIVATE,
+    appearing,
+    is_run_folder,
+    refuse_foreign,
+    require_usable,
+    require_whole,
+    run_folder,
+)
+from modp_ti.files.sole_use import sole_use
+from tests.patience import PATIENCE
+
+PROJECT = Path(__file__).resolve().parents[3]
+FIRST = {"splats.ply": "1", "colmap/cameras.bin": "1", "colmap/old.bin": "1", "masks/000001.png": "1"}
+SECOND = {"splats.ply": "2", "colmap/cameras.bin": "2", "trajectory.txt": "2", "metrics.json": "2"}
+
+# Writes files over those of a folder, and dies at the n-th rename or removal.
+DIES = """
+import json, os, sys; from pathlib import Path; from modp_ti.files.run_folder import appearing
+left = int(sys.argv[2])
+def counted(call):
+    def step(*arguments, **options):
+        global left
+        left -= 1
+        if left < 0: os.kill(os.getpid(), 9)
+        return call(*arguments, **options)
+    return step
+os.replace, Path.unlink, os.unlink = counted(os.replace), counted(Path.unlink), counted(os.unlink)
+with appearing(Path(sys.argv[1]), ("colmap", "masks")) as folder:
+    for name, text in json.loads(sys.argv[3]).items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+"""
+
+
+def fill(output: Path, files: dict[str, str], outdated: tuple[str, ...] = ()) -> None:
+    with appearing(output, outdated) as folder:
+        for name, text in files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text)
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    return {
+        file.relative_to(folder).as_posix(): file.read_text()
+        for file in folder.rglob("*")
+        if file.is_file() and PRIVATE not in file.parts
+    }
+
+
+def test_a_folder_has_the_old_files_or_the_new_ones_wherever_the_process_dies(tmp_path: Path) -> None:
+    seen = []
+    for steps in range(100):
+        output = tmp_path / str(steps)
+        fill(output, FIRST)
+        (output / "notes.txt").write_text("mine")
+        command = [sys.executable, "-c", DIES, str(output), str(steps), json.dumps(SECOND)]
+        died = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        require_whole(output)  # as every reader asks
+        found = files_of(output)
+        assert found.pop("notes.txt") == "mine"
+        assert found in (FIRST, SECOND)
+        seen.append(found == SECOND)
+        with run_folder(output):
+            assert [file.name for file in (output / PRIVATE).iterdir()] == ["files.json"]
+        if died.returncode == 0:
+            break
+        assert died.returncode == -9, died.stderr
+    assert died.returncode == 0 and seen == sorted(seen) and sum(seen) > 5 < len(seen)
+
+
+def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path) -> None:
+    fill(tmp_path / "out", FIRST)
+    with pytest.raises(InputError) as refused, appearing(tmp_path / "out", ("colmap",)) as folder:
+        (folder / "splats.ply").write_text("2")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert "\n" not in str(refused.value) and os.strerror(errno.ENOSPC) in str(refused.value)
+    assert files_of(tmp_path / "out") == FIRST
+    assert os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("name", ["splats.ply", "colmap", "colmap/cameras.bin", "masks/000009.png", PRIVATE])
+@pytest.mark.parametrize("kind", ["file", "link", "folder"])
+def test_what_no_run_has_written_stays(tmp_path: Path, name: str, kind: str) -> None:
+    elsewhere, output = tmp_path / "elsewhere", tmp_path / "out"
+    shutil.copytree(_tree(elsewhere, {"cameras.bin": "mine", "files.json": "mine"}), output / "other")
+    (output / name).parent.mkdir(exist_ok=True)
+    if kind == "file":
+        (output / name).write_text("mine")
+    elif kind == "link":
+        (output / name).symlink_to(elsewhere)
+    else:
+        shutil.copytree(elsewhere, output / name)
+    before = files_of(tmp_path), sorted(os.listdir(output))
+    for act in (lambda: require_usable(output), lambda: fill(output, SECOND | FIRST | {"masks/000009.png": ""})):
+        with pytest.raises(InputError) as refused:
+            act()
+        assert "\n" not in str(refused.value) and str(output / name) in str(refused.value)
+        assert (files_of(tmp_path), sorted(os.listdir(output))) == before
+
+
+def _tree(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_files_next_to_those_of_a_run_stay(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    fill(output, FIRST)
+    mine = {"notes.txt": "mine", "masks/.DS_Store": "", "images/a.png": "mine", "out.partial/a": "mine"}
+    _tree(output, mine)
+    _tree(tmp_path / "out.partial", {"a": "mine"})
+    with run_folder(output):
+        fill(output, SECOND, ("colmap", "masks"))
+    assert files_of(output) == SECOND | mine
+    assert files_of(tmp_path / "out.partial") == {"a": "mine"}
+
+
+def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
+    output, pictures = tmp_path / "out", _tree(tmp_path / "pictures", {"cameras.bin": "mine", "old.bin": "mine"})
+    fill(output, FIRST)
+    shutil.rmtree(output / "colmap")
+    (output / "colmap").symlink_to(pictures)
+    with pytest.raises(InputError):
+        fill(output, SECOND, ("colmap",))
+    assert files_of(pictures) == {"cameras.bin": "mine", "old.bin": "mine"}
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        *({"files": [name], "staged": "", "gone": [name]} for name in ("../victim", "/etc/x", "a/../../victim", "", 3)),
+        {"files": ["a"], "staged": "../../elsewhere", "gone": []},
+        {"files": ["a"], "staged": 5, "gone": []},
+        {"files": 5, "staged": "", "gone": []},
+        [],
+    ],
+)
+def test_a_list_from_a_stranger_reaches_nothing_outside(tmp_path: Path, record: object) -> None:
+    _tree(tmp_path, {"victim": "mine", "elsewhere/b": "mine", "out/a": "1"})
+    (tmp_path / "out" / PRIVATE).mkdir()
+    replace_text(tmp_path / "out" / PRIVATE / "files.json", json.dumps(record))
+    for act in (lambda: require_whole(tmp_path / "out"), lambda: fill(tmp_path / "out", SECOND, ("..", "victim"))):
+        with pytest.raises(InputError):
+            act()
+    assert (tmp_path / "victim").exists() and (tmp_path / "elsewhere" / "b").exists()
+
+
+def test_a_folder_of_an_earlier_version_is_known_by_its_settings(tmp_path: Path) -> None:
+    output = _tree(tmp_path / "out", FIRST | {"colmap/mine.db": "mine"})
+    assert not is_run_folder(output)
+    scene = {"source": {"path": "images"}, "tracker": {"kind": "klt"}, "output": "out"}
+    dump_scene(SceneConfig.model_validate(scene), output / "config.yaml")
+    assert is_run_folder(output)
+    refuse_foreign(output, ["splats.ply", "masks"])
+    with pytest.raises(InputError, match=r"mine\.db"):
+        refuse_foreign(output, ["colmap"])
+
+
+def test_a_run_that_leaves_nothing_leaves_no_folder(tmp_path: Path) -> None:
+    with run_folder(tmp_path / "new" / "out"):
+        assert (tmp_path / "new" / "out").is_dir()
+    require_usable(tmp_path / "new" / "out")
+    assert os.listdir(tmp_path) == []
+    (tmp_path / "old").mkdir()
+    with sole_use(tmp_path / "old"), run_folder(tmp_path / "old"):  # as a task of a batch does
+        pass
+    assert os.listdir(tmp_path) == ["old"]
+
+
+@pytest.mark.parametrize("place", ["file", "file/out", "/proc/out", "/proc/self/out"])
+def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    for act in (require_usable, lambda output: run_folder(output).__enter__()):
+        with pytest.raises(InputError) as refused:
+            act(tmp_path / place)
+        assert "\n" not in str(refused.value)
+    assert os.listdir(tmp_path) == ["file"]
