@@ -80,7 +80,9 @@ def run_scene(
             print((output / "metrics.json").read_text())
     """
     with ExitStack() as held:
-        session = _Session(config, ProgressLine(console or Console(quiet=True), watch), held, replayed)
+        line = ProgressLine(console or Console(quiet=True), watch)
+        held.callback(line.stop)
+        session = _Session(config, line, held, replayed)
         output, further = session.run(resumed), session.tracker.further_maps
     for place in range(2, 2 + further):
         session.line.note(f"map {place} of {1 + further}")
@@ -333,13 +335,22 @@ class _Session:
             if stage == last:
                 results.write_frame(frame, render)
 
-        self.line.start("evaluating the saved map", len(self.mapper.frames) * len(versions))
-        pipeline = self.mapper.pipeline
+        pipeline, frames = self.mapper.pipeline, self.mapper.frames
+        self.line.start("evaluating the saved map", len(frames) * len(versions))
         try:
             with pipeline.stopwatch.measure("evaluate"), FramesAhead(self.tracker, self.ahead) as again:
-                return evaluate(pipeline, again, versions, self.lpips, keep)
+                mapped = self.checkpointer.digest.known(again, frames)
+                scores = evaluate(pipeline, mapped, versions, self.lpips, keep)
         finally:
             self.line.stop()
+        scored = {score.index for score in scores}
+        missing = [name for index, name in zip(frames.index, frames.name, strict=True) if index not in scored]
+        if not scored:
+            raise InputError(f"{missing[0]} and all other images of the run are gone or have changed")
+        if missing:
+            many = f"{len(missing)} of {len(frames)} images are"
+            self._say(f"{many} gone or have changed since they were mapped: no scores (the first: {missing[0]})")
+        return scores
 
     def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
         """Write the scores, the metrics and the report, and return the metrics."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from functools import partial
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 
@@ -16,7 +17,7 @@ from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import PosedImage, points_inside, tracked_frame
+from modp_ti.inputs.replay import PosedImage, points_inside, read_again, tracked_frame
 from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, SenderGoneError
 from modp_ti.inputs.tracker_server.history import History
 from modp_ti.inputs.tracker_server.listening import Lobby, listen, open_to_others
@@ -160,7 +161,7 @@ class TrackerServer(Tracker):
         """Iterate over the delivered frames with their corrected poses and points, then over frames that arrive."""
         for index, frame in enumerate(self._history.frames[:]):
             points = self._history.placed(self._received.points(frame.name))
-            yield tracked_frame(self._received.reader, index, frame.with_points(points))
+            yield from read_again(partial(tracked_frame, self._received.reader, index, frame.with_points(points)))
         for event in self.events():
             if isinstance(event, TrackedFrame):
                 yield event
