@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import queue
 import shutil
-import signal
 import sys
 import threading
 from contextlib import suppress
@@ -17,6 +16,7 @@ import cv2
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.tracker_settings import KltSettings
+from modp_ti.files.ending_signals import left_to_parent
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
@@ -44,7 +44,7 @@ REMOVALS = 100
 
 def main() -> None:
     """Serve the parent process, whose descriptors of pipe, ring and board are the arguments."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent decides what it means
+    left_to_parent()
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the end of a stream is told in a note
     pipe, ring, board = (int(argument) for argument in sys.argv[1:4])
