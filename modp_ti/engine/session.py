@@ -27,7 +27,7 @@ from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.remarks import remarks
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
-from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
+from modp_ti.engine.snapshots import Checkpointer, Recovery, Snapshot, replay
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
@@ -139,6 +139,9 @@ class _Session:
         self.earlier = open_earlier_map(self.config, self.line)
         tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(tracker.close)
+        recovery = Recovery(self.config, tracker)
+        self.held.callback(recovery.remove)
+        recovery.write()
         self.tracker = self.earlier.join(tracker)
         self.conductor = open_conductor(self.config, self.tracker, self.held)
         if self.config.is_realtime:  # the kernels are loaded while the tracker opens
@@ -151,6 +154,7 @@ class _Session:
             if undistorter is not None:  # larger images than expected: while the first frames are tracked
                 self._make_mapper(undistorter.camera)
             first = first_frame(arriving)
+            recovery.write()  # a server has nothing to keep before
             prepared = time.perf_counter() - tick - self.compiling
             side = min(first.camera.width, first.camera.height)
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)

@@ -150,6 +150,10 @@ class KltTracker(Tracker):
         return LiveCounts(arrivals.arrived, tracked, arrivals.thinned, self._skipped, 0, arrivals.newest)
 
     @property
+    def kept(self) -> Mapping[str, Mapping[str, str | None]]:
+        return self._reader.images.kept
+
+    @property
     def scale(self) -> float:
         return self._reader.images.scale
 

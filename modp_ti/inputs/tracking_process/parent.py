@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from multiprocessing import Pipe
 from pathlib import Path
@@ -26,7 +27,7 @@ from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import read_again
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
-from modp_ti.inputs.sources.frame_store import StoredFrames
+from modp_ti.inputs.sources.frame_store import StoredFrames, kept_frames
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
 from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
@@ -116,6 +117,10 @@ class TrackingProcess(Tracker):
         return self._notes
 
     @property
+    def kept(self) -> Mapping[str, Mapping[str, str | None]]:
+        return {} if self._kept is None else kept_frames(Path(self._kept.name))
+
+    @property
     def scale(self) -> float:
         self._wait_until_open()
         return self._scale
@@ -182,7 +187,9 @@ class TrackingProcess(Tracker):
     def close(self) -> None:
         """End the recording and the process, and remove what was stored."""
         self._ended = True
-        self._connection.close()  # the process exits when it notices
+        with suppress(OSError):
+            self._connection.send(None)  # the process exits when it notices
+        self._connection.close()
         try:
             self._process.wait(PATIENCE)
         except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""Images that disappear, change or heal between mapping and scoring: the other frames are scored as they were mapped."""
+"""Images that disappear, change or heal after they were mapped: the other frames are scored as they were mapped."""
 
 from __future__ import annotations
 
