@@ -7,7 +7,8 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from modp_ti.commands.shared import BAD_INPUT, FAULT, INTERRUPTED
+from modp_ti.commands.shared import BAD_INPUT, FAULT
+from modp_ti.files.ending_signals import EndingSignals, exit_code
 from modp_ti.files.errors import InputError
 
 __all__ = ["documented_ending"]
@@ -20,6 +21,7 @@ def documented_ending(*refusals: type[Exception]) -> Iterator[None]:
     Args:
         *refusals: Exceptions that report bad input in one line, in addition to InputError.
     """
+    signals = EndingSignals()
     try:
         yield
     except (InputError, *refusals) as error:
@@ -27,11 +29,13 @@ def documented_ending(*refusals: type[Exception]) -> Iterator[None]:
         code = BAD_INPUT
     except KeyboardInterrupt:
         print("error: interrupted", file=sys.stderr)
-        code = INTERRUPTED
+        code = exit_code()
     except Exception as error:
         traceback.print_exc()
         print(f"error: a fault of the program, not of your input; please report it ({error!r})", file=sys.stderr)
         code = FAULT
     else:
         return
+    finally:
+        signals.give_back()
     raise SystemExit(code)

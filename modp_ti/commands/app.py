@@ -26,7 +26,7 @@ OVERVIEW = examples(
 )
 ENDS = (
     "Exit codes: 0 done; 1 (check) usable, with warnings; 1 (batch) a scene is not finished; 1 (locate) a picture was "
-    "not located; 2 wrong input or options; 3 a fault of the program; 130 interrupted."
+    "not located; 2 wrong input or options; 3 a fault of the program; 130 interrupted (129 by SIGHUP, 143 by SIGTERM)."
 )
 
 app = typer.Typer(

@@ -170,8 +170,12 @@ def _run(
     if tasks is not None:
         raise InputError("--engine and --address are for --parts, whose tasks they carry out")
     from modp_ti.engine.session import run_scene
+    from modp_ti.engine.snapshots import discard
 
-    return run_scene(config, progress_console(quiet), snapshot)
+    folder = run_scene(config, progress_console(quiet), snapshot)
+    if resume is not None:
+        discard(folder)
+    return folder
 
 
 def _new_scene(scene: Path | None, stream: str | None, overrides: list[str], preset: str | None) -> SceneConfig:

@@ -19,10 +19,13 @@ from typer.core import TyperCommand, TyperGroup
 
 from fields.runtime.engine import EngineError
 from modp_ti.config.presets import PRESETS
+from modp_ti.files.ending_signals import EndingSignals, exit_code
 from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from modp_ti.outputs.tidy_console import TidyConsole
 
 __all__ = [
     "BAD_INPUT",
@@ -48,7 +51,7 @@ __all__ = [
 ]
 
 # Exit codes; docs/commands.md lists all of them. 1 has its own meaning in `check` and `locate`.
-BAD_INPUT, FAULT, INTERRUPTED = 2, 3, 130
+BAD_INPUT, FAULT = 2, 3
 
 # Boxes on a narrow terminal cut the names of options.
 MARKUP: Any = "rich" if shutil.get_terminal_size().columns >= 60 else None
@@ -58,6 +61,8 @@ USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
 # Longest error message in characters, since messages may quote the content of a damaged file.
 MAX_MESSAGE = 1000
+
+_consoles: list[TidyConsole] = []  # those of the command that runs
 
 
 class Device(str, Enum):
@@ -146,23 +151,36 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
     An InputError or EngineError is printed in one line, any other exception with its traceback. With `as_json`, the
     outcome is printed as one JSON object, and everything else goes to standard error.
     """
-    result = Outcome()
+    result, signals = Outcome(), EndingSignals()
     try:
-        with _to_standard_error() if as_json else nullcontext():
+        with _to_standard_error() if as_json else nullcontext(), _tidy_terminal():
             yield result
     except (InputError, EngineError) as error:
         _end(BAD_INPUT, one_line(error), as_json)
     except KeyboardInterrupt as stop:
-        _end(INTERRUPTED, str(stop) or "interrupted", as_json)
+        _end(exit_code(), str(stop) or "interrupted", as_json)
     except Exception as error:
         traceback.print_exc()
         _end(FAULT, f"a fault of the program, not of your input; please report what stands above ({error!r})", as_json)
+    finally:
+        signals.give_back()
     if as_json:
         typer.echo(json.dumps({"exit_code": result.code, **result.data}, indent=2))
     elif result.text:
         typer.echo(result.text)
     if result.code:
         raise typer.Exit(result.code)
+
+
+@contextmanager
+def _tidy_terminal() -> Iterator[None]:
+    """End the progress lines that an exception has left on the terminal, and show its cursor again."""
+    try:
+        yield
+    finally:
+        for console in _consoles:
+            console.tidy()
+        _consoles.clear()
 
 
 @contextmanager
@@ -198,9 +216,11 @@ def _end(code: int, message: str, as_json: bool) -> None:
 
 def progress_console(quiet: bool) -> Console:
     """A console for progress and notes, on standard error; it prints nothing if `quiet`."""
-    from rich.console import Console
+    from modp_ti.outputs.tidy_console import TidyConsole
 
-    return Console(stderr=True, quiet=quiet)
+    console = TidyConsole(stderr=True, quiet=quiet)
+    _consoles.append(console)
+    return console
 
 
 def examples(*lines: str) -> str:

@@ -264,7 +264,8 @@ class SocketSettings(TrackerSettings):
         default=None, description="host:port of the server; empty: 127.0.0.1:7007, which only this machine can reach"
     )
     path: Path | None = Field(
-        default=None, description="path of a Unix socket that is created, instead of `address`; empty: none"
+        default=None,
+        description="path of a Unix socket that is created, or of the stream of a killed run; not with `address`",
     )
     patience: float = Field(
         default=120.0, gt=0, description="time [s] without a complete message after which the stream ends"

@@ -1,11 +1,11 @@
-"""Ctrl-C handling: the first one stops the mapping after its current step, the second stops it immediately."""
+"""Ctrl-C, SIGTERM and SIGHUP: the first stops the mapping after its current step, the second immediately."""
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from modp_ti.files.ending_signals import EndingSignals
 
 __all__ = ["Interruption", "RunStopped"]
 
@@ -15,12 +15,13 @@ class RunStopped(Exception):  # noqa: N818 - it is no error
 
 
 class Interruption:
-    """Context manager that records the first Ctrl-C after `begin` and restores the default handler for the second.
+    """Context manager that records the first Ctrl-C after `begin`; the second one raises `KeyboardInterrupt`.
 
-    Before `begin` there is no map to save, and Ctrl-C raises `KeyboardInterrupt` as usual. A live source that is opened
-    inside the context ends its recording at the first Ctrl-C, and passes a later one on to this handler.
+    SIGTERM and SIGHUP count as Ctrl-C. Before `begin` there is no map to save, and Ctrl-C raises `KeyboardInterrupt`
+    as usual. A live source that is opened inside the context ends its recording at the first Ctrl-C, and passes a later
+    one on to this handler.
 
-    It does nothing outside the main thread, or if SIGINT already has another handler or is ignored.
+    It does nothing outside the main thread, and with signals that already have another handler or are ignored.
 
     Args:
         say: Called when Ctrl-C is pressed while the run is not waiting for a frame.
@@ -34,17 +35,13 @@ class Interruption:
         self._say = say
         self._begun = False
         self._waits = False
-        self._installed = False
 
     def __enter__(self) -> Interruption:
-        ours = threading.current_thread() is threading.main_thread()
-        if ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, self._note)
-            self._installed = True
+        self._signals = EndingSignals(self._note)
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._give_back()
+        self._signals.give_back()
 
     def begin(self) -> None:
         """There is a map from now on, which Ctrl-C leaves consistent."""
@@ -69,15 +66,10 @@ class Interruption:
             self._waits = False
 
     def _note(self, *_: object) -> None:
-        self._give_back()
+        self._signals.stop_at_once()
         if not self._begun:
             raise KeyboardInterrupt
         self.asked = True
         if self._waits:
             raise RunStopped
         self._say()
-
-    def _give_back(self) -> None:
-        if self._installed:
-            self._installed = False
-            signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -27,7 +27,7 @@ from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.remarks import remarks
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
-from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
+from modp_ti.engine.snapshots import Checkpointer, Recovery, Snapshot, replay
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
@@ -85,7 +85,9 @@ def run_scene(
     refuse_output_in_input(config, replayed=None if replayed is None else replayed.path)
     with run_folder(config.output, adopted=() if resumed is None else (FILE,)):
         with ExitStack() as held:
-            session = _Session(config, ProgressLine(console or Console(quiet=True), watch), held, replayed)
+            line = ProgressLine(console or Console(quiet=True), watch)
+            held.callback(line.stop)
+            session = _Session(config, line, held, replayed)
             output, further = session.run(resumed), session.tracker.further_maps
         for place in range(2, 2 + further):
             session.line.note(f"map {place} of {1 + further}")
@@ -143,6 +145,9 @@ class _Session:
         self.earlier = open_earlier_map(self.config, self.line)
         tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(tracker.close)
+        recovery = Recovery(self.config, tracker)
+        self.held.callback(recovery.remove)
+        recovery.write()
         self.tracker = self.earlier.join(tracker)
         self.conductor = open_conductor(self.config, self.tracker, self.held)
         if self.config.is_realtime:  # the kernels are loaded while the tracker opens
@@ -155,6 +160,7 @@ class _Session:
             if undistorter is not None:  # larger images than expected: while the first frames are tracked
                 self._make_mapper(undistorter.camera)
             first = first_frame(arriving)
+            recovery.write()  # a server has nothing to keep before
             prepared = time.perf_counter() - tick - self.compiling
             side = min(first.camera.width, first.camera.height)
             self.lpips, self.no_lpips = open_lpips(self.config.evaluation.lpips_weights, side)
@@ -342,13 +348,22 @@ class _Session:
             if stage == last:
                 results.write_frame(frame, render)
 
-        self.line.start("evaluating the saved map", len(self.mapper.frames) * len(versions))
-        pipeline = self.mapper.pipeline
+        pipeline, frames = self.mapper.pipeline, self.mapper.frames
+        self.line.start("evaluating the saved map", len(frames) * len(versions))
         try:
             with pipeline.stopwatch.measure("evaluate"), FramesAhead(self.tracker, self.ahead) as again:
-                return evaluate(pipeline, again, versions, self.lpips, keep)
+                mapped = self.checkpointer.digest.known(again, frames)
+                scores = evaluate(pipeline, mapped, versions, self.lpips, keep)
         finally:
             self.line.stop()
+        scored = {score.index for score in scores}
+        missing = [name for index, name in zip(frames.index, frames.name, strict=True) if index not in scored]
+        if not scored:
+            raise InputError(f"{missing[0]} and all other images of the run are gone or have changed")
+        if missing:
+            many = f"{len(missing)} of {len(frames)} images are"
+            self._say(f"{many} gone or have changed since they were mapped: no scores (the first: {missing[0]})")
+        return scores
 
     def _write_figures(self, scores: list[FrameScore], versions: dict[str, MapVersion], results: Results) -> dict:
         """Write the scores, the metrics and the report, and return the metrics."""

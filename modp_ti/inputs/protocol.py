@@ -115,5 +115,10 @@ class Tracker(ABC):
         """What a tracker that follows a clock has done so far; None for other trackers."""
         return None
 
+    @property
+    def kept(self) -> Mapping[str, Mapping[str, str | None]]:
+        """Settings, by section, that read again what a live tracker keeps until `close`; empty for other trackers."""
+        return {}
+
     def close(self) -> None:  # noqa: B027 - most trackers hold nothing open
         """Release open resources, such as a camera, a file or a socket."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = [
     "Unreadable",
     "is_held_out",
     "points_inside",
+    "read_again",
     "readable_sizes",
     "tracked_frame",
 ]
@@ -50,7 +52,8 @@ class ReplayedTracker(Tracker):
     """A `Tracker` that replays posed images in the given order.
 
     Points on masked pixels are dropped. Damaged images are skipped, up to a share `FEW` of all images. Whether a frame
-    is held out depends on its position among all given images, including damaged ones.
+    is held out depends on its position among all given images, including damaged ones. A later iteration delivers the
+    frames of the first one that can still be read, with the same indices, and no others.
 
     Args:
         reader: Reads and undistorts the images.
@@ -65,6 +68,7 @@ class ReplayedTracker(Tracker):
         self._notes = [*notes, *reader.images.notes]
         self._unreadable = Unreadable()
         self._noted = False
+        self._indices: dict[int, int] = {}  # of the delivered frames, by place
         self._reader = reader
         self._part = range(len(self.frames))
 
@@ -114,16 +118,19 @@ class ReplayedTracker(Tracker):
         self._reader.images.close()
 
     def __iter__(self) -> Iterator[TrackedFrame]:
-        index = -1
         for place in self._part:
-            frame = self.frames[place]
-            try:
-                tracked = tracked_frame(self._reader, index + 1, frame, place)
-            except UnreadableImageError as error:
-                self._unreadable.add(frame.name, error, len(self.frames))
-                continue
-            index += 1
-            yield tracked
+            frame, index = self.frames[place], self._indices.get(place, len(self._indices))
+            read = partial(tracked_frame, self._reader, index, frame, place)
+            if place in self._indices:
+                yield from read_again(read)
+            elif frame.name not in self._unreadable:
+                try:
+                    tracked = read()
+                except UnreadableImageError as error:
+                    self._unreadable.add(frame.name, error, len(self.frames))
+                    continue
+                self._indices[place] = index
+                yield tracked
         if self._unreadable and not self._noted:
             self._noted = True
             self._notes.append(self._unreadable.note(len(self.frames)))
@@ -142,6 +149,15 @@ class Unreadable(dict[str, UnreadableImageError]):
         """Return a remark on the images that were skipped, of `count` images."""
         first = str(next(iter(self.values()))).partition(";")[0]
         return f"{len(self)} of {count} images are damaged: left out (the first: {first})"
+
+
+def read_again(read: Callable[[], TrackedFrame]) -> Iterator[TrackedFrame]:
+    """Yield a frame that was delivered before, or nothing if its image can no longer be read."""
+    try:
+        frame = read()
+    except InputError:
+        return
+    yield frame
 
 
 def readable_sizes(images: ImageSource, names: Sequence[str]) -> Iterator[tuple[str, tuple[int, int]]]:

@@ -47,7 +47,9 @@ def retention(frames: Sequence[FrameNote], scores: Sequence[FrameScore]) -> dict
     result: dict[str, Mapping[str, float]] = {}
     for stage in dict.fromkeys(score.stage for score in scores):
         final = {score.index: score.psnr for score in scores if score.stage == stage}
-        change = np.array([final[index] - psnr for index, psnr in mapped.items()])
+        change = np.array([final[index] - psnr for index, psnr in mapped.items() if index in final])
+        if not len(change):  # no keyframe could be read again
+            return None
         width = min(WINDOW, len(change))
         window = np.convolve(change, np.full(width, 1.0 / width), mode="valid")
         result[stage] = {"mean": round(float(change.mean()), 4), "worst": round(float(window.min()), 4)}

@@ -16,6 +16,9 @@ __all__ = ["RECENT", "TimeAfterMapping", "TimeLeft", "duration"]
 EARLIEST = 10.0
 # Share of the elapsed time whose items set the pace. Keyframes become slower as the map grows.
 RECENT = 1 / 3
+# An item that takes longer than this [s], and longer than all other recent ones together, is a gap: the run was paused,
+# or its process stopped. A second one within so many items is none.
+GAP, GAP_APART = 5.0, 100
 
 # Optimisation time before the time of a view is known [s].
 EARLIEST_VIEW = 1.0
@@ -31,6 +34,7 @@ class TimeLeft:
 
     The pace is by default that of the items finished in the last third of the elapsed time, since a keyframe takes
     longer the larger the map is. No estimate is made in the first ten seconds, or if the number of items is unknown.
+    Gaps are left out, but for items that come in bursts.
 
     Args:
         total: Number of items; None if unknown.
@@ -63,10 +67,19 @@ class TimeLeft:
         self._done = done
         # Times and counts, oldest first. The first one is the latest that lies before the recent share.
         self._history: deque[tuple[float, int]] = deque([(self._began, done)])
+        self._gaps = 0.0  # [s]
+        self._gap_at = -GAP_APART  # number of items that were done at the last gap
 
     def update(self, done: int) -> None:
         """Set the number of items that are done."""
-        now = self._clock()
+        now = self._clock() - self._gaps
+        first, last = self._history[0][0], self._history[-1][0]
+        items = done > self._done and not self._prepares and self._recent < 1
+        if items and now - last > max(GAP, last - first):
+            if self._done - self._gap_at >= GAP_APART:
+                self._gaps += now - last
+                now = last
+            self._gap_at = self._done
         if self._prepares and done > self._done:
             self._prepares, self._began = False, now
             self._history = deque([(now, done)])
@@ -78,7 +91,7 @@ class TimeLeft:
 
     def pace(self) -> float | None:
         """Return the recent time of an item [s], None if it is not known yet."""
-        now = self._clock()
+        now = self._clock() - self._gaps
         then, before = self._history[0]
         if now - self._began < self._earliest or self._done <= before:
             return None

@@ -10,6 +10,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
+from modp_ti.files.ending_signals import left_to_parent
 from modp_ti.tasks.task import perform
 
 __all__ = ["main"]
@@ -22,7 +23,8 @@ PATIENCE = 30.0
 
 def main() -> None:
     """Serve the parent process; the argument is the descriptor of the pipe to it."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where a shell started the parent
+    left_to_parent()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # by which `_listen` passes on that the parent stops
     connection = Connection(int(sys.argv[1]))
     try:
         work = connection.recv()

@@ -16,6 +16,7 @@ from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.snapshots.file import FILE, of_another_program
+from modp_ti.engine.snapshots.recovery import recovered
 from modp_ti.engine.snapshots.snapshot import Snapshot, StreamDigest
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
@@ -39,7 +40,7 @@ FREE = (
 
 def load_resumed(
     output: Path, scene: Path | None, overrides: Iterable[str], preset: str | None = None
-) -> tuple[SceneConfig, Snapshot]:
+) -> tuple[SceneConfig, Snapshot | None]:
     """Read the snapshot in an output folder and the settings to continue with.
 
     Args:
@@ -49,7 +50,7 @@ def load_resumed(
         preset: Preset for the scene file. A snapshot holds every setting, which leaves a preset nothing to set.
 
     Returns:
-        The settings and the snapshot.
+        The settings and the snapshot. A killed live run has no snapshot: its frames are mapped from the start.
 
     Raises:
         InputError: If there is no usable snapshot, or a setting that the map depends on has changed.
@@ -61,6 +62,9 @@ def load_resumed(
         fetch_snapshot(config)
     if not output.is_dir():
         raise InputError(f"{output}: no such folder (--resume); give the output folder of an interrupted run")
+    recording = recovered(output, overrides)
+    if recording is not None:
+        return recording.model_copy(update={"output": output.resolve()}), None
     if not file.is_file():
         if (output / "metrics.json").is_file():
             raise InputError(f"{output}: this run is finished; there is nothing to resume")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ class StreamDigest:
     def __init__(self) -> None:
         self.value = 0
         self.events = 0
+        self._images: dict[str, int] = {}  # checksums by name
 
     def add(self, event: TrackedFrame | PoseCorrection) -> None:
         """Add a frame or correction. The image of a held-out frame is left out, as it does not affect the map."""
@@ -58,15 +59,29 @@ class StreamDigest:
         if isinstance(event, PoseCorrection):
             self._take(event.index, event.T_camera_world, event.ids, event.xyz)
             if event.camera is not None:
+                self._images.clear()  # all images look different from now on
                 self._take(event.camera.camera.matrix())
                 self._take(*(array for array in (event.camera.lookup, event.camera.covered) if array is not None))
             return
         camera, points = event.camera, event.points
+        self._images[event.name] = zlib.adler32(event.rgba)
         self.value = zlib.crc32(event.name.encode("utf-8"), self.value)
         numbers = [event.index, event.timestamp, camera.fx, camera.fy, camera.cx, camera.cy]
         self._take(np.array(numbers, dtype=np.float64), event.T_camera_world, points.xyz, points.pixels, points.ids)
         if not event.held_out:
             self._take(event.rgba)
+
+    def known(self, again: Iterable[TrackedFrame], frames: DeliveredFrames) -> Iterator[TrackedFrame]:
+        """Yield those of the frames that were delivered before, with the index that they had and the same image.
+
+        Args:
+            again: The frames as they are read now.
+            frames: The frames as they were delivered.
+        """
+        index = dict(zip(frames.name, frames.index, strict=True))
+        for frame in again:
+            if frame.name in index and self._images.get(frame.name) in (None, zlib.adler32(frame.rgba)):
+                yield frame if frame.index == index[frame.name] else replace(frame, index=index[frame.name])
 
     def _take(self, *arrays: np.ndarray) -> None:
         for array in arrays:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import ClassVar
 
@@ -22,7 +23,7 @@ from modp_ti.inputs.klt.selected_images import arriving, available, followed_sca
 from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import PosedImage, Unreadable, tracked_frame
+from modp_ti.inputs.replay import PosedImage, Unreadable, read_again, tracked_frame
 from modp_ti.inputs.sources import FrameReader, Intrinsics, Undistorter
 
 __all__ = ["KltTracker"]
@@ -120,7 +121,7 @@ class KltTracker(Tracker):
                 pass
         if self._trajectory is not None:
             for index, delivered in enumerate(self._trajectory.frames):
-                yield self._frame(index, delivered, self._trajectory.points(delivered))
+                yield from read_again(partial(self._frame, index, delivered, self._trajectory.points(delivered)))
 
     @property
     def notes(self) -> list[str]:
@@ -147,6 +148,10 @@ class KltTracker(Tracker):
             return None
         tracked = 0 if self._trajectory is None else len(self._trajectory.frames)
         return LiveCounts(arrivals.arrived, tracked, arrivals.thinned, self._skipped, 0, arrivals.newest)
+
+    @property
+    def kept(self) -> Mapping[str, Mapping[str, str | None]]:
+        return self._reader.images.kept
 
     @property
     def scale(self) -> float:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections.abc import Callable
-from types import FrameType
+
+from modp_ti.files.ending_signals import EndingSignals
 
 __all__ = ["RecordingInterrupt"]
 
 
 class RecordingInterrupt:
-    """Handler of Ctrl-C while a live source records. It must be made in the main thread to have an effect.
+    """Handler of Ctrl-C, SIGTERM and SIGHUP while a live source records. It must be made in the main thread.
 
-    Ctrl-C gives the signal back to the handler that was there before. If the recording had ended already, that handler
-    is called at once.
+    The first of them gives the signals back to the handlers that were there before. If the recording had ended already,
+    that handler is called at once.
 
     Args:
         finish: Ends the recording; returns whether it was going on. It is called in the signal handler.
@@ -22,22 +21,13 @@ class RecordingInterrupt:
 
     def __init__(self, finish: Callable[[], bool]) -> None:
         self._finish = finish
-        self._before = None
-        ours = threading.current_thread() is threading.main_thread()
-        if ours and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-            self._before = signal.signal(signal.SIGINT, self._pressed)
+        self._signals = EndingSignals(self._pressed, others=True)
 
     def give_back(self) -> None:
-        """Restore the handler that was there before."""
-        if self._before is not None and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self._before)
-            self._before = None
+        """Restore the handlers that were there before."""
+        self._signals.give_back()
 
-    def _pressed(self, number: int, frame: FrameType | None) -> None:
-        before = self._before
-        self.give_back()
-        if self._finish():
-            return
-        if not callable(before):
-            raise KeyboardInterrupt
-        before(number, frame)
+    def _pressed(self, number: int) -> None:
+        pass_on = self._signals.give_back()
+        if not self._finish():
+            pass_on(number)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files.errors import InputError
+from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources.masks import LEAST_LIGHT, MaskFolder, differs_from_colour, read_vignette
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import Undistorter, both_valid
@@ -98,6 +98,12 @@ class FrameReader:
             InputError: If the image or its mask is unreadable.
         """
         raw = self.images.read(name) if raw is None else raw
+        size, expected = raw.shape[1::-1], (undistorter.raw.width, undistorter.raw.height)
+        if size != expected:
+            raise UnreadableImageError(
+                f"{self.images.path}: image {name} is now {size[0]}x{size[1]} instead of {expected[0]}x{expected[1]}; "
+                "leave the images alone during a run"
+            )
         image, mask = undistorter.image(raw, self.valid(name, raw))
         if self._vignette is None:
             return Picture(image, mask, None)

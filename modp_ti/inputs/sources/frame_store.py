@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,27 @@ from numpy.typing import NDArray
 
 from fields.runtime.disk_room import has_room
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.listed_images import decoded
 from modp_ti.inputs.sources.protocol import ImageSource
 
-__all__ = ["FrameStore", "StoredFrames"]
+__all__ = ["FrameStore", "StoredFrames", "kept_frames", "list_frames"]
+
+
+def kept_frames(folder: Path) -> dict[str, dict[str, str | None]]:
+    """Return the settings that read the delivered frames again, see `Tracker.kept`."""
+    return {"source": {"stream": None, "path": str(folder), "kind": "tum_rgbd"}}
+
+
+def list_frames(folder: Path) -> None:
+    """Write the list that makes the folder of a killed process a recording. Raises OSError if it cannot be written."""
+    lines = []
+    for file in sorted(folder.glob("[0-9]*.png")):
+        with file.open("rb") as image:
+            header = read_image_header(image)
+        if header is not None and header.complete:  # the last one may be cut off
+            lines.append(f"{file.stat().st_mtime_ns / 1e9!r} {file.name}\n")
+    (folder / "rgb.txt").write_text("".join(lines), encoding="utf-8")
 
 
 class FrameStore:
@@ -69,6 +87,11 @@ class FrameStore:
             os.replace(waiting, self.file(number))
         except OSError as error:
             raise self._unwritable(error) from None
+
+    def date(self, number: int, time: float) -> None:
+        """Give the file of a delivered frame its time [s], for `list_frames`."""
+        with suppress(OSError):  # on file systems that keep no such times
+            os.utime(self.file(number), (time, time))
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Read a delivered frame (H, W, 3) uint8 RGB.

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
 from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
-from modp_ti.inputs.sources.frame_store import FrameStore
+from modp_ti.inputs.sources.frame_store import FrameStore, kept_frames
 from modp_ti.inputs.sources.listed_images import quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
 
@@ -47,8 +47,8 @@ class LiveSource(ImageSource):
     """A source that is still recording. The n-th delivered frame is called `live_<n, six digits>`.
 
     A thread captures frames continuously. They wait for `arriving` in a `Backlog`, which leaves frames out evenly if
-    they arrive faster than they are taken. Each delivered frame is stored without loss in a folder, from which `read`
-    decodes it again. Times are those of arrival [s], on the Unix clock.
+    they arrive faster than they are taken; most of these are not decoded. Each delivered frame is stored without loss
+    in a folder, from which `read` decodes it again. Times are those of arrival [s], on the Unix clock.
 
     The recording ends when the stream ends or sends nothing for `PATIENCE`, when `arriving` reaches its `stop`, when
     `finish` is called, if the disk is full, or on the first Ctrl-C if the source was opened in the main thread of a
@@ -78,7 +78,7 @@ class LiveSource(ImageSource):
         # The system clock may be adjusted during the recording, so times advance with the monotonic clock.
         self._clock = time.time() - time.monotonic()
         first = self._grab()
-        if first is None:
+        if first is None or first[1] is None:
             self._capture.release()
             raise InputError(f"{self.path}: sends no frame (source.stream); is it in use by another program?")
         self._size = (first[1].shape[1], first[1].shape[0])
@@ -137,6 +137,10 @@ class LiveSource(ImageSource):
         return not self._ended
 
     @property
+    def kept(self) -> dict[str, dict[str, str | None]]:
+        return kept_frames(self._store.folder)
+
+    @property
     def arrivals(self) -> Arrivals:
         return self._backlog.arrivals
 
@@ -182,13 +186,17 @@ class LiveSource(ImageSource):
 
     # ---- the capturing thread --------------------------------------------------------------------------------
 
-    def _grab(self) -> tuple[float, NDArray[np.uint8]] | None:
-        """Capture the next frame (BGR) with its time of arrival [s]; None at the end of the stream."""
+    def _grab(self) -> tuple[float, NDArray[np.uint8] | None] | None:
+        """Capture the next frame (BGR, None if nobody wants it) with its time of arrival [s]; None at the end."""
         import cv2
 
         try:
             more = self._capture.grab()
             arrived = time.monotonic()
+            with self._changed:
+                wanted = self._backlog.wants()
+            if more and not wanted:
+                return arrived, None
             more, image = self._capture.retrieve() if more else (False, None)
         except cv2.error:
             return None
@@ -214,18 +222,18 @@ class LiveSource(ImageSource):
                 self.finish()
         self._capture.release()
 
-    def _add(self, arrived: float, image: NDArray[np.uint8]) -> None:
+    def _add(self, arrived: float, image: NDArray[np.uint8] | None) -> None:
         """Let a frame wait, on disk if there is no room in memory. Raises InputError if the disk is full."""
         captured = _Captured(image, self._store.waiting_file(self._backlog.arrivals.arrived))
-        if self._held + image.nbytes > MEMORY:
+        if image is not None and self._held + image.nbytes > MEMORY:
             self._store.write(captured.file, image)
             captured.image = None
         with self._changed:
             if self._ended:
                 captured.file.unlink(missing_ok=True)
                 return
-            self._held += 0 if captured.image is None else image.nbytes
-            self._backlog.add(arrived, captured)
+            self._held += 0 if captured.image is None else captured.image.nbytes
+            self._backlog.add(arrived, None if image is None else captured)
             self._changed.notify_all()
 
     def _drop(self, captured: _Captured) -> None:
@@ -267,6 +275,7 @@ class LiveSource(ImageSource):
         else:
             self._store.write(self._store.file(number), captured.image)
             self._last = name, captured.image  # the tracker reads it next, so it need not be decoded
+        self._store.date(number, self._clock + arrived)
         self._received.append(arrived)
         self._append(name, self._clock + arrived)
 

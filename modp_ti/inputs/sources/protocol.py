@@ -147,6 +147,11 @@ class ImageSource(ABC):
         return False
 
     @property
+    def kept(self) -> dict[str, dict[str, str | None]]:
+        """As `Tracker.kept`."""
+        return {}
+
+    @property
     def arrivals(self) -> Arrivals | None:
         """Number of images received so far; None for a source that follows no clock."""
         return None

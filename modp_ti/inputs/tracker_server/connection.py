@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import socket
 import time
+from collections.abc import Callable
 from threading import Event
 
 from modp_ti.inputs.tracker_server.messages import HEADER, Hello, Kind, ProtocolError, encoded, parse_header
 
-__all__ = ["GLANCE", "Connection", "SenderGoneError"]
+__all__ = ["GLANCE", "Connection", "OthersSpeakError", "SenderGoneError"]
 
 # Timeout [s] for the first message after its first byte, so that a stalled client does not block a tracker.
 FIRST_PATIENCE = 5.0
@@ -24,6 +25,10 @@ class SenderGoneError(Exception):
     """The connection has ended or timed out. The text says how, in one line."""
 
 
+class OthersSpeakError(Exception):
+    """The sender is silent between two messages, and another one is not."""
+
+
 class Connection:
     """Reads messages from a connected socket.
 
@@ -31,19 +36,25 @@ class Connection:
         sock: The socket.
         patience: Timeout [s] for each whole message.
         closed: Set by another thread to stop reading.
+
+    Attributes:
+        socket: As the argument.
+        hello: Payload of the HELLO, kept by the caller.
     """
 
     def __init__(self, sock: socket.socket, patience: float, closed: Event) -> None:
-        self._socket = sock
+        self.socket = sock
+        self.hello: bytes | None = None
         self._patience = patience
         self._closed = closed
         self._reset = False
 
-    def receive(self, hello: Hello | None) -> tuple[Kind, bytes]:
+    def receive(self, hello: Hello | None, others: Callable[[], bool] = lambda: False) -> tuple[Kind, bytes]:
         """Read the next message. Its header is checked before the payload is read.
 
         Args:
             hello: The connection's HELLO; None before it.
+            others: Returns whether another sender waits with something to say.
 
         Returns:
             The message's kind and payload.
@@ -51,26 +62,32 @@ class Connection:
         Raises:
             ProtocolError: If the header is invalid.
             SenderGoneError: If the connection ends or times out.
+            OthersSpeakError: If `others` does, and this sender is silent.
         """
         patience = self._patience if hello else min(self._patience, FIRST_PATIENCE)
         deadline = time.monotonic() + patience
-        kind, length = parse_header(self._read(HEADER.size, deadline, patience, begun=False), hello)
-        return kind, self._read(length, deadline, patience, begun=True)
+        kind, length = parse_header(self._read(HEADER.size, deadline, patience, False, others), hello)
+        return kind, self._read(length, deadline, patience, True, others)
 
-    def _read(self, size: int, deadline: float, patience: float, begun: bool) -> bytes:
-        data = bytearray()
+    def _read(self, size: int, deadline: float, patience: float, begun: bool, others: Callable[[], bool]) -> bytes:
+        data, heard = bytearray(), time.monotonic()
         while len(data) < size:
             if self._closed.is_set():
                 raise SenderGoneError("the sender is let go: the run is over")
             left = deadline - time.monotonic()
             try:
-                self._socket.settimeout(min(max(left, 0.001), GLANCE))
-                part = self._socket.recv(min(size - len(data), CHUNK))
+                self.socket.settimeout(min(max(left, 0.001), GLANCE))
+                part = self.socket.recv(min(size - len(data), CHUNK))
             except TimeoutError:
+                silent = time.monotonic() - heard
+                if left > 0 and others():
+                    if not begun and not data:
+                        raise OthersSpeakError from None
+                    left = min(left, FIRST_PATIENCE - silent)
                 if left > 0:
                     continue
                 where = "in mid-message" if begun or data else "without a message"
-                raise SenderGoneError(f"the sender was silent for {patience:g} s {where}") from None
+                raise SenderGoneError(f"the sender was silent for {min(patience, silent):.3g} s {where}") from None
             except ConnectionResetError:
                 # A sender that exits without reading WELCOME causes one reset. What it sent may still be readable.
                 if self._reset:
@@ -84,13 +101,14 @@ class Connection:
                     "the sender ended in mid-message" if begun or data else "the sender ended without END"
                 )
             data += part
+            heard = time.monotonic()
         return bytes(data)
 
     def say(self, kind: Kind, payload: bytes = b"") -> None:
         """Send a message. Errors are ignored, because the sender need not read replies."""
         try:
-            self._socket.settimeout(DRAIN_SECONDS)
-            self._socket.sendall(encoded(kind, payload))
+            self.socket.settimeout(DRAIN_SECONDS)
+            self.socket.sendall(encoded(kind, payload))
         except OSError:
             pass
 
@@ -99,8 +117,8 @@ class Connection:
         self.say(Kind.ERROR, " ".join(str(reason).split()).encode())
         deadline = time.monotonic() + DRAIN_SECONDS
         try:
-            self._socket.shutdown(socket.SHUT_WR)
-            while time.monotonic() < deadline and self._socket.recv(CHUNK):
+            self.socket.shutdown(socket.SHUT_WR)
+            while time.monotonic() < deadline and self.socket.recv(CHUNK):
                 pass
         except OSError:
             pass
@@ -108,4 +126,4 @@ class Connection:
 
     def close(self) -> None:
         """Close the connection."""
-        self._socket.close()
+        self.socket.close()

@@ -122,22 +122,37 @@ class Lobby:
         self.dropped = 0
         self._listener = listener
         self._patience = min(patience, HELLO_PATIENCE)
-        self._silent: dict[socket.socket, float] = {}  # idle connections and their accept times, oldest first
+        self._silent: dict[socket.socket, float] = {}  # idle connections and the ends of their patience, oldest first
         self._selector = selectors.DefaultSelector()
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
 
     def next(self, timeout: float) -> socket.socket | None:
         """Return a connection with data to read or at its end, or None after `timeout` seconds without one."""
-        self._drop(sock for sock, since in self._silent.items() if time.monotonic() - since > self._patience)
+        spoken = self._spoken(timeout)
+        if spoken is None:
+            self._drop(sock for sock, until in self._silent.items() if time.monotonic() > until)
+        else:
+            self._forget(spoken)
+        return spoken
+
+    def waits(self) -> bool:
+        """Whether a connection has data to read or is at its end."""
+        return self._spoken(0.0) is not None
+
+    def take_back(self, sock: socket.socket, patience: float) -> None:
+        """Keep a connection until it says more, for so many seconds."""
+        self._silent[sock] = time.monotonic() + patience
+        self._selector.register(sock, selectors.EVENT_READ, data=sock)
+
+    def _spoken(self, timeout: float) -> socket.socket | None:
+        """Accept connections for up to `timeout` seconds; return the first one with data to read or at its end."""
         spoken: socket.socket | None = None
         for key, _ in self._selector.select(timeout):
             if key.fileobj is self._listener:
                 self._accept()
             elif spoken is None:
                 spoken = key.data
-        if spoken is not None:
-            self._forget(spoken)
         return spoken
 
     def close(self) -> None:
@@ -151,8 +166,7 @@ class Lobby:
             sock, _ = self._listener.accept()
         except OSError:  # the client has disconnected, or there are too many open files
             return
-        self._silent[sock] = time.monotonic()
-        self._selector.register(sock, selectors.EVENT_READ, data=sock)
+        self.take_back(sock, self._patience)
         self._drop(list(self._silent)[:-MAX_SILENT])
 
     def _drop(self, sockets: Iterable[socket.socket]) -> None:

@@ -107,10 +107,10 @@ class Encoding(IntEnum):
         """Bytes per pixel of a raw encoding; None for a file format."""
         return {Encoding.GREY8: 1, Encoding.RGB8: 3, Encoding.RGBA8: 4}.get(self)
 
-    @property
-    def suffix(self) -> str:
-        """Suffix of stored images."""
-        return {Encoding.JPEG: ".jpg", Encoding.PNG: ".png"}.get(self, f".{self.name.lower()}")
+    def file(self, number: int) -> str:
+        """Name of the file in which the image of the frame with this number is stored."""
+        suffix = {Encoding.JPEG: ".jpg", Encoding.PNG: ".png"}.get(self, f".{self.name.lower()}")
+        return f"{number:06d}{suffix}"
 
 
 class State(IntEnum):

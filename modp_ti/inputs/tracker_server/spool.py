@@ -19,7 +19,18 @@ from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.listed_images import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.tracker_server.messages import POINT, Encoding, Frame, Hello, UnfitError, parse_points
+from modp_ti.inputs.tracker_server.messages import (
+    FRAME,
+    POINT,
+    Encoding,
+    Frame,
+    Hello,
+    Kind,
+    UnfitError,
+    encoded,
+    parse_points,
+)
+from modp_ti.inputs.tracker_server.recorded_stream import FRAMES, STREAM
 
 __all__ = ["Spool", "SpoolFullError"]
 
@@ -39,6 +50,7 @@ class Spool(ImageSource):
 
     Attributes:
         hello: As the argument.
+        stream: File of the messages, see `recorded_stream`.
         undistorter: Undistorter of the images.
         reader: Reads and undistorts the images.
 
@@ -48,7 +60,9 @@ class Spool(ImageSource):
 
     def __init__(self, hello: Hello, source: SourceSettings) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-server-")
-        super().__init__(Path(self._folder.name))
+        frames = Path(self._folder.name, FRAMES)
+        frames.mkdir()
+        super().__init__(frames)
         self.hello = hello
         self.intrinsics = hello.intrinsics
         self._size = (hello.intrinsics.camera.width, hello.intrinsics.camera.height)
@@ -57,8 +71,20 @@ class Spool(ImageSource):
         self.undistorter = hello.intrinsics.undistorter(self.scale)
         self.reader = FrameReader(self, source)
         self._encoding = hello.encoding
+        self.stream = self.path.with_name(STREAM)
+        self._stream = self.stream.open("wb", buffering=0)
         self._last: tuple[str, NDArray[np.uint8]] | None = None
         self._received: dict[str, float] = {}
+
+    def keep(self, kind: Kind, payload: bytes) -> None:
+        """Add a message to the file of the stream. Raises SpoolFullError if the disk has no space."""
+        message = encoded(kind, payload)
+        if kind is Kind.FRAME:
+            message = message[: -FRAME.unpack_from(payload)[-1] or None]
+        try:
+            self._stream.write(message)
+        except OSError as error:
+            raise self._full(error) from None
 
     def add(self, frame: Frame) -> str:
         """Store a frame's image.
@@ -91,7 +117,7 @@ class Spool(ImageSource):
 
     def name(self, number: int) -> str:
         """The name of the frame with this number."""
-        return f"{number:06d}{self._encoding.suffix}"
+        return self._encoding.file(number)
 
     def _require_image(self, frame: Frame) -> None:
         """Check encoding and size from the image's header, so that no image of another size is ever decoded."""
@@ -169,12 +195,16 @@ class Spool(ImageSource):
         try:
             if not has_room(self.path, len(data)):
                 raise SpoolFullError(
-                    f"{self.path.parent}: less than 1 GiB is free for the frames that arrive; set TMPDIR"
+                    f"{self.path.parent.parent}: less than 1 GiB is free for the frames that arrive; set TMPDIR"
                 )
             (self.path / name).write_bytes(data)
         except OSError as error:
-            raise SpoolFullError(f"{self.path.parent}: a frame cannot be kept: {error.strerror}; set TMPDIR") from None
+            raise self._full(error) from None
+
+    def _full(self, error: OSError) -> SpoolFullError:
+        return SpoolFullError(f"{self.path.parent.parent}: a frame cannot be kept: {error.strerror}; set TMPDIR")
 
     def close(self) -> None:
         """Delete the temporary folder."""
+        self._stream.close()
         self._folder.cleanup()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from queue import Empty, Full, Queue
+from socket import socket
 from threading import Event, Thread
 
 import numpy as np
@@ -16,8 +18,8 @@ from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import PosedImage, points_inside, tracked_frame
-from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, SenderGoneError
+from modp_ti.inputs.replay import PosedImage, points_inside, read_again, tracked_frame
+from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, OthersSpeakError, SenderGoneError
 from modp_ti.inputs.tracker_server.history import History
 from modp_ti.inputs.tracker_server.listening import Lobby, listen, open_to_others
 from modp_ti.inputs.tracker_server.messages import (
@@ -32,6 +34,7 @@ from modp_ti.inputs.tracker_server.messages import (
     parse_hello,
 )
 from modp_ti.inputs.tracker_server.ordering import Ordering
+from modp_ti.inputs.tracker_server.recorded_stream import is_stream, send_again
 from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError
 
 __all__ = ["TrackerServer", "open_tracker_server"]
@@ -94,9 +97,10 @@ class TrackerServer(Tracker):
     def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
         self._source = source
         self._patience = tracker.patience
-        self._path = tracker.path
-        self._listener, self.address = listen(tracker.address, tracker.path)
-        self._notes = [f"frames come from {self.address}"]
+        self._again = tracker.path if is_stream(tracker.path) else None
+        self._path = None if self._again else tracker.path
+        self._listener, self.address = listen("127.0.0.1:0" if self._again else tracker.address, self._path)
+        self._notes = [f"frames come from {self._again or self.address}"]
         if open_to_others(self._listener):
             self._notes.append(f"{self.address} is open to the network: whoever reaches it can send frames")
         self._progress = progress
@@ -117,6 +121,8 @@ class TrackerServer(Tracker):
         self._decoder = Thread(target=self._decode, name="received frames", daemon=True)
         self._thread.start()
         self._decoder.start()
+        if self._again is not None:
+            Thread(target=send_again, args=(self._again, self._listener.getsockname()), daemon=True).start()
 
     # ---- called by the mapper, in its thread -----------------------------------------------------------------
 
@@ -128,6 +134,11 @@ class TrackerServer(Tracker):
     def scale(self) -> float:
         """Factor on the sent images' sides. `source.scale: auto` keeps them, since their sender chooses their size."""
         return 1.0 if self._source.scale == "auto" else self._source.scale
+
+    @property
+    def kept(self) -> Mapping[str, Mapping[str, str | None]]:
+        again = self._spool is None or self._again is not None
+        return {} if again else {"tracker": {"address": None, "path": str(self._received.stream)}}
 
     @property
     def live(self) -> LiveCounts:
@@ -160,7 +171,7 @@ class TrackerServer(Tracker):
         """Iterate over the delivered frames with their corrected poses and points, then over frames that arrive."""
         for index, frame in enumerate(self._history.frames[:]):
             points = self._history.placed(self._received.points(frame.name))
-            yield tracked_frame(self._received.reader, index, frame.with_points(points))
+            yield from read_again(partial(tracked_frame, self._received.reader, index, frame.with_points(points)))
         for event in self.events():
             if isinstance(event, TrackedFrame):
                 yield event
@@ -189,14 +200,22 @@ class TrackerServer(Tracker):
     def _serve(self) -> None:
         end: InputError | None = None
         lobby = Lobby(self._listener, self._patience)
+        waiting: dict[socket, Connection] = {}  # connections that have said HELLO and are in the lobby again
         try:
             while not self._closed.is_set():
                 sock = lobby.next(GLANCE)
                 if lobby.dropped:
                     self._count_dropped("it said nothing", lobby.dropped)
                     lobby.dropped = 0
-                if sock is not None and self._talk(Connection(sock, self._patience, self._closed)):
-                    break
+                if sock is None:
+                    continue
+                connection = waiting.pop(sock, None) or Connection(sock, self._patience, self._closed)
+                try:
+                    if self._talk(connection, lobby) or self._again:
+                        break
+                except OthersSpeakError:
+                    lobby.take_back(sock, self._patience)
+                    waiting[sock] = connection
         except InputError as error:
             end = error
         except Exception as error:  # a bug in this thread must end the run instead of leaving it waiting
@@ -208,14 +227,21 @@ class TrackerServer(Tracker):
                 self._path.unlink(missing_ok=True)
             self._put(self._waiting, end)
 
-    def _talk(self, connection: Connection) -> bool:
-        """Serve one connection until it ends. Returns whether the stream has ended with it."""
+    def _talk(self, connection: Connection, lobby: Lobby) -> bool:
+        """Serve one connection until it ends. Returns whether the stream has ended with it.
+
+        Raises OthersSpeakError if it has only said HELLO, and another one in the lobby speaks.
+        """
         ordering = Ordering()
         hello: Hello | None = None
         problem = None
         try:
             while True:
-                kind, payload = connection.receive(hello)
+                if connection.hello is None or hello is not None:
+                    others = (lambda: False) if ordering.begun else lobby.waits
+                    kind, payload = connection.receive(hello, others)
+                else:  # it was in the lobby meanwhile
+                    kind, payload = Kind.HELLO, connection.hello
                 if kind is Kind.END:
                     break
                 if kind is Kind.HELLO:
@@ -223,8 +249,11 @@ class TrackerServer(Tracker):
                     if self._spool is not None:
                         self._spool.close()  # left by a connection that sent no frame
                     self._spool = Spool(hello, self._source)
-                    connection.say(Kind.WELCOME)
-                else:
+                    if connection.hello is None:
+                        connection.say(Kind.WELCOME)
+                    connection.hello = payload
+                self._received.keep(kind, payload)
+                if kind is not Kind.HELLO:
                     try:
                         self._take(kind, payload, ordering)
                     except UnfitError as error:

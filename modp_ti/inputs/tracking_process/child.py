@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import os
 import queue
-import shutil
-import signal
 import sys
 import threading
 from contextlib import suppress
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 import cv2
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.tracker_settings import KltSettings
+from modp_ti.files.ending_signals import left_to_parent
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
@@ -34,17 +32,15 @@ from modp_ti.inputs.tracking_process.messages import (
 )
 from modp_ti.inputs.tracking_process.outbox import Outbox
 
-__all__ = ["main", "remove_folder"]
+__all__ = ["main"]
 
 # Interval [s] at which the counts are published and the wish to finish is noticed.
 GLANCE = 0.05
-# A folder to which the capture adds a file between two looks cannot be removed, and is tried again.
-REMOVALS = 100
 
 
 def main() -> None:
     """Serve the parent process, whose descriptors of pipe, ring and board are the arguments."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent decides what it means
+    left_to_parent()
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the end of a stream is told in a note
     pipe, ring, board = (int(argument) for argument in sys.argv[1:4])
@@ -155,25 +151,24 @@ class _Child:
     # ---- the listening thread --------------------------------------------------------------------------------
 
     def _listen(self) -> None:
-        """Take back slots, publish the counts and end the recording when asked. If the parent is gone, exit."""
+        """Take back slots, publish the counts and end the recording when asked. Exit when the parent has no more use.
+
+        If the parent was killed, the frames that were recorded stay.
+        """
         finished = False
         try:
             while True:
                 if self._connection.poll(GLANCE):
-                    self._free.put(self._connection.recv())
+                    slot = self._connection.recv()
+                    if slot is None:
+                        os._exit(0)
+                    self._free.put(slot)
                 self._publish()
                 if self._board.finish and not finished and self._images is not None:
                     finished = True
                     self._images.finish()
         except (EOFError, OSError):
             if self._job.folder is not None:
-                remove_folder(self._job.folder)
+                how = f"modp-ti run --resume {self._job.config.output}"
+                sys.stderr.write(f"error: the mapper has ended; {how} maps the frames that were recorded\n")
             os._exit(1)
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove the folder in which the capture may be storing a frame at the same time."""
-    for _ in range(REMOVALS):
-        shutil.rmtree(folder, ignore_errors=True)
-        if not folder.exists():
-            return

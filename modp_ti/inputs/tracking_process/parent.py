@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import partial
 from multiprocessing import Pipe
 from pathlib import Path
 
@@ -19,14 +19,17 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.child_environment import child_environment
+from modp_ti.files.ending_signals import withheld
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress, Tracker
+from modp_ti.inputs.replay import read_again
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
-from modp_ti.inputs.sources.frame_store import StoredFrames
+from modp_ti.inputs.sources.frame_store import StoredFrames, kept_frames
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
+from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
 from modp_ti.inputs.tracking_process.messages import (
     CameraRevised,
@@ -114,6 +117,10 @@ class TrackingProcess(Tracker):
         return self._notes
 
     @property
+    def kept(self) -> Mapping[str, Mapping[str, str | None]]:
+        return {} if self._kept is None else kept_frames(Path(self._kept.name))
+
+    @property
     def scale(self) -> float:
         self._wait_until_open()
         return self._scale
@@ -172,12 +179,17 @@ class TrackingProcess(Tracker):
         if self._again is None:
             self._again = FrameReader(self._images_again(), self._config.source)
         for record in self._log:
-            yield record.with_picture(self._again.read(record.name, self.undistorter))
+            yield from read_again(partial(self._read_again, self._again, record))
+
+    def _read_again(self, reader: FrameReader, record: FrameRecord) -> TrackedFrame:
+        return record.with_picture(reader.read(record.name, self.undistorter))
 
     def close(self) -> None:
         """End the recording and the process, and remove what was stored."""
         self._ended = True
-        self._connection.close()  # the process exits when it notices
+        with suppress(OSError):
+            self._connection.send(None)  # the process exits when it notices
+        self._connection.close()
         try:
             self._process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
@@ -248,11 +260,9 @@ class TrackingProcess(Tracker):
 
 
 def _started(descriptors: list[int]) -> subprocess.Popen[bytes]:
-    """Start the child with these descriptors. It ignores Ctrl-C from its beginning, where possible."""
+    """Start the child with these descriptors. Ctrl-C and the like do not reach it."""
     code = "from modp_ti.inputs.tracking_process.child import main; main()"
-    in_main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main else None
-    try:
+    with withheld():
         return subprocess.Popen(
             [sys.executable, "-c", code, *map(str, descriptors)],
             pass_fds=descriptors,
@@ -260,9 +270,6 @@ def _started(descriptors: list[int]) -> subprocess.Popen[bytes]:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
         )
-    finally:
-        if in_main:
-            signal.signal(signal.SIGINT, before)
 
 
 def _shared_cores(config: SceneConfig) -> str:

@@ -110,8 +110,10 @@ def _read_again(
         yield from _through_source(config, [frames.names[place] for place in wanted], undistorter)
         return
     with closing(open_tracker(config.without_clock(), preparing)) as tracker:
-        count, chosen = 0, set(wanted)
-        for frame, name, camera in zip(tracker, frames.names, frames.cameras, strict=False):
+        count, chosen, known = 0, set(wanted), set(frames.names)
+        # An image that could not be read then, and can be now, was not mapped.
+        again = (frame for frame in tracker if frame.name in known)
+        for frame, name, camera in zip(again, frames.names, frames.cameras, strict=False):
             if (frame.name, frame.camera) != (name, camera):
                 raise _changed(config)
             if count in chosen:

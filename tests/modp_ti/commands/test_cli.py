@@ -352,7 +352,7 @@ def test_the_page_of_commands_names_every_command_option_and_exit_code():
         assert f"modp-ti {name} " in page
         for option in (word for parameter in sub.params for word in parameter.opts if word.startswith("-")):
             assert f"`{option}" in page or option == "--help", f"{name} {option}"
-    for code in (0, 1, command_line.BAD_INPUT, command_line.FAULT, command_line.INTERRUPTED):
+    for code in (0, 1, command_line.BAD_INPUT, command_line.FAULT, 129, 130, 143):
         assert f"| {code} | " in page
 
 

@@ -63,6 +63,26 @@ def test_items_in_bursts_are_estimated_from_all_of_them() -> None:
     assert recent.seconds() == pytest.approx(89 * 20.0)
 
 
+@pytest.mark.parametrize("before", [0, 3, 100])
+@pytest.mark.parametrize("pause", [60.0, 3600.0])
+def test_a_pause_is_left_out(pause: float, before: int) -> None:
+    """The run is paused, or its process is stopped, after so many items."""
+    clock = Clock()
+    left = TimeLeft(1000, clock=clock)
+    after(left, clock, [0.2] * before)
+    after(left, clock, [pause + 0.2], done=before)
+    assert left.seconds() is None or left.seconds() == pytest.approx(0.2 * (999 - before), rel=0.05)
+    after(left, clock, [0.2] * 60, done=before + 1)
+    assert left.seconds() == pytest.approx(0.2 * (939 - before), rel=0.05)
+
+
+def test_items_that_become_slow_are_no_pause() -> None:
+    clock = Clock()
+    left = TimeLeft(100, clock=clock)
+    after(left, clock, [0.1] * 50 + [20.0] * 10)
+    assert left.seconds() == pytest.approx(40 * 20.0, rel=0.3)
+
+
 def test_a_resumed_run_counts_only_its_own_items() -> None:
     clock = Clock()
     left = TimeLeft(100, done=80, clock=clock)

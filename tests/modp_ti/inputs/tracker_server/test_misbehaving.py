@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from modp_ti.inputs.tracker_server import ordering
+from modp_ti.inputs.tracker_server import connection, ordering
 from tests.modp_ti.inputs.tracker_server.clients import (
     DONE,
     END,
@@ -68,6 +68,29 @@ def test_who_says_nothing_keeps_nobody_out(tmp_path: Path) -> None:
         assert silent.stdout.readline() == "waiting\n"
         assert served(tracker, tmp_path / "s") == [1, 2]
         silent.communicate("", timeout=PATIENCE)
+
+
+@pytest.mark.parametrize("rest", [b"", message(FRAME, frame(1))[:40], message(FRAME, frame(1))[:-10]])
+def test_trackers_that_hang_after_hello_keep_nobody_out(rest: bytes, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(connection, "FIRST_PATIENCE", 0.5)
+    with opened(tmp_path / "s", patience=10 * PATIENCE, prefetch=8) as tracker:
+        hung = [connect(tmp_path / "s") for _ in range(3)]
+        for each in hung:
+            each.sendall(message(HELLO, hello()) + rest)
+        assert answer(hung[0])[0] == WELCOME
+        assert served(tracker, tmp_path / "s") == [1, 2]
+        for each in hung:
+            each.close()
+
+
+def test_a_tracker_that_needs_long_for_its_first_frame_is_served_after_others_spoke(tmp_path: Path) -> None:
+    with opened(tmp_path / "s", prefetch=8) as tracker, connect(tmp_path / "s") as slow:
+        slow.sendall(message(HELLO, hello()))
+        assert answer(slow)[0] == WELCOME
+        assert peer(tmp_path / "s", "bad starts").wait(timeout=PATIENCE) == 0
+        slow.sendall(message(FRAME, frame(1)) + message(FRAME, frame(2)) + message(END))
+        assert [int(f.rgba[0, 0, 0]) for f in tracker] == [1, 2]
+        assert answer(slow)[0] == DONE
 
 
 def test_whoever_is_silent_for_too_long_is_sent_away(tmp_path: Path) -> None:

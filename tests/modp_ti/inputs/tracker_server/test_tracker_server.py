@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import stat
 import struct
@@ -31,6 +32,7 @@ from tests.modp_ti.inputs.tracker_server.clients import (
     HELLO,
     POSE,
     SIZE,
+    WELCOME,
     answer,
     colours,
     connect,
@@ -208,6 +210,43 @@ def test_nothing_more_is_read_while_too_much_waits_for_the_mapper(tmp_path: Path
         assert len(os.listdir(tracker._spool.path)) <= 2 * (3 + 1 + 2)
         assert sum(1 for _ in tracker) == 1500
         thread.join()
+
+
+# ---- what a killed run leaves ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", [2, 4])
+@pytest.mark.parametrize("lost", [0, 30])
+def test_a_stream_that_was_kept_comes_again(encoding: int, lost: int, tmp_path: Path) -> None:
+    """The last `lost` bytes had not been written when the run was killed."""
+    pictures = [np.random.default_rng(i).integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8) for i in range(4)]
+    sent = [cv2.imencode(".png", each)[1].tobytes() if encoding == 2 else each.tobytes() for each in pictures]
+    with opened(tmp_path / "s", prefetch=8) as tracker:
+        with connect(tmp_path / "s") as connection:
+            connection.sendall(message(HELLO, hello(encoding=encoding)))
+            connection.sendall(message(FRAME, frame(1, points=point(5, 0, 0, 5, 4, 3), image=sent[0])))
+            connection.sendall(message(FRAME, frame(2, state=0, image=sent[1])))
+            connection.sendall(message(FRAME, frame(3, image=b"none" if encoding == 2 else sent[2][:-1])))  # refused
+            connection.sendall(message(POSE, late(2)) + message(CORRECTION, correction({1: pose(0.3)}, {5: (0, 0, 6)})))
+            connection.sendall(message(FRAME, frame(4, image=sent[3])) + message(END))
+            assert answer(connection)[0] == WELCOME
+            assert answer(connection)[0] == DONE
+        expected = list(tracker.events())
+        shutil.copytree(Path(tracker.kept["tracker"]["path"]).parent, tmp_path / "kept")
+    file = tmp_path / "kept" / "stream.modp"
+    file.write_bytes(file.read_bytes()[: -lost or None])
+    with opened(file, prefetch=8) as again:
+        assert not again.kept
+        found = list(again.events())
+    assert len(expected) == 4 and len(found) == len(expected) - (lost > 0)
+    for one, other in zip(found, expected, strict=False):
+        if isinstance(one, PoseCorrection):
+            np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
+            continue
+        assert (one.index, one.name, one.timestamp) == (other.index, other.name, other.timestamp)
+        np.testing.assert_array_equal(one.rgba, other.rgba)
+        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
+        np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
 
 
 # ---- where it listens ----------------------------------------------------------------------------------------
