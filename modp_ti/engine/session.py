@@ -98,7 +98,7 @@ class _Session:
         self.clock, self.record = RunClock(), RunRecord()
         self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
         # Opened first, as what follows may take minutes.
-        self.observer = open_observer(config.view, self._say, self.line.note, self.held)
+        self.observer = open_observer(config.view, self._say, self.line.insist, self.held)
         self.stop = Interruption(lambda: self.line.note("stopping after this step; Ctrl-C again stops at once"))
         try:
             self.backend = initialise(config.device, config.mapper_threads, config.seed)

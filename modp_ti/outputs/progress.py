@@ -79,6 +79,12 @@ class ProgressLine:
         """Print a note for the user."""
         self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
+    def insist(self, text: str) -> None:
+        """Print what the user needs even if the console is quiet."""
+        before, self.console.quiet = self.console.quiet, False
+        self.note(text)
+        self.console.quiet = before
+
     def prepare(self, what: str, done: int, total: int) -> None:
         """Show the progress of a tracker's preparation. Trackers take this method as their `Progress` callback."""
         if self._progress is None:
