@@ -30,6 +30,7 @@ from modp_ti.engine.run_clock import RunClock, peak_memory_mb
 from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import without_secrets
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
@@ -383,6 +384,6 @@ class _Session:
 
     def _say(self, *notes: str) -> None:
         """Print notes, and keep them for the report."""
-        for note in notes:
+        for note in map(without_secrets, notes):
             self.line.note(f"note: {note}")
             self.record.notes.append(note)

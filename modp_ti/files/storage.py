@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import actual_url
 
 __all__ = ["Storage", "StorageError"]
 
@@ -30,7 +31,7 @@ class Storage:
     """
 
     def __init__(self, url: str) -> None:
-        self.url = url.rstrip("/")
+        self.url = actual_url(url).rstrip("/")
         try:
             import fsspec
         except ImportError:

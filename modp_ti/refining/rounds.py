@@ -14,7 +14,7 @@ from rich.console import Console
 
 from modp_ti.batch.batch import Shares
 from modp_ti.batch.scenes import with_resources
-from modp_ti.config.settings import SceneConfig
+from modp_ti.config.settings import WITH_SECRETS, SceneConfig
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
@@ -146,7 +146,7 @@ class _Refinement:
         chosen = [place for place, span in enumerate(spans) if span.end > span.first]
         machines = self._engine.machines
         resources = self._plan.shares.of(self._config, machines, max(len(chosen), 1))
-        settings = with_resources(self._config, resources).model_dump(mode="json")
+        settings = with_resources(self._config, resources).model_dump(mode="json", context=WITH_SECRETS)
         tasks = []
         for place in chosen:
             job = self._job(parts[place], spans[place], settings, number * count + place)

@@ -25,7 +25,6 @@ __all__ = [
     "remarks",
     "shown",
     "stages",
-    "without_credentials",
 ]
 
 PACKAGES = {"PyTorch": "torch", "NumPy": "numpy", "OpenCV": "opencv-python-headless"}
@@ -54,11 +53,6 @@ OTHERS = {
 }
 
 
-def without_credentials(text: str) -> str:
-    """Remove user names and passwords from URLs in the text, since reports are shared."""
-    return re.sub(r"(?<=://)[^/@\s\"']+@", "", text)
-
-
 def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
     """Return the settings that differ from their defaults, in the order of the settings reference.
 
@@ -69,7 +63,7 @@ def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
     for entry, value in documented_values(config):
         text = "" if value is None else as_yaml(value)
         if text != entry.default:
-            changes.append((entry.key, without_credentials(text), entry.default))
+            changes.append((entry.key, text, entry.default))
     return changes
 
 
@@ -176,7 +170,7 @@ def duration(seconds: float) -> str:
 
 def remarks(metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
     """Return the run's notes, with a warning if no frame was held out."""
-    said = [without_credentials(note) for note in notes]
+    said = list(notes)
     scores = metrics[last_stage(metrics)]
     if not scores["held_out"]["count"]:
         said.append("no frame was held out: the scores are of frames that the map was made of, and flatter it")
