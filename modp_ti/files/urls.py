@@ -30,7 +30,7 @@ def shown_url(url: str) -> str:
         return url
     scheme, rest = found.groups()
     authority, place = re.split("[/?#]", rest, maxsplit=1)[0], rest.rpartition("@")[2]
-    if not authority:  # of this machine
+    if scheme.lower().startswith("file:"):  # a path of this machine, in which an `@` is a letter
         place = rest
     elif not HOST.match(place) or ("@" in rest[len(authority) :] and HOST.fullmatch(authority)):
         return f"{scheme}..."
