@@ -15,7 +15,7 @@ from modp_ti.batch.results import SceneResult, State, figures, write_csv, write_
 from modp_ti.batch.scene_task import fetch_finished, map_scene
 from modp_ti.batch.scenes import Scene, with_resources
 from modp_ti.batch.summary_page import write_summary_page
-from modp_ti.config.settings import SceneConfig
+from modp_ti.config.settings import WITH_SECRETS, SceneConfig
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
@@ -117,7 +117,7 @@ class _Batch:
         machines, tasks = self._engine.machines, []
         for name, config in wanted.items():
             resources = self._shares.of(config, machines, len(wanted))
-            settings = with_resources(config, resources).model_dump(mode="json")
+            settings = with_resources(config, resources).model_dump(mode="json", context=WITH_SECRETS)
             tasks.append(Task(name, partial(map_scene, settings), resources, self._shares.attempts))
         return tasks
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import actual_url
 from modp_ti.inputs.bare_recording import is_recording, recorded_scene
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.tasks import Resources
@@ -108,7 +109,7 @@ def with_store(scenes: Iterable[Scene], url: str) -> list[Scene]:
 
     The folder's name ends with a checksum of the output folder, so that it does not depend on the other scenes.
     """
-    stored = []
+    url, stored = actual_url(url), []
     for scene in scenes:
         if scene.config is not None:
             output = scene.config.output

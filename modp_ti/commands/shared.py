@@ -21,6 +21,7 @@ from fields.runtime.engine import EngineError
 from modp_ti.config.presets import PRESETS
 from modp_ti.files.ending_signals import EndingSignals, exit_code
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import without_secrets
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -160,8 +161,9 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
     except KeyboardInterrupt as stop:
         _end(exit_code(), str(stop) or "interrupted", as_json)
     except Exception as error:
-        traceback.print_exc()
-        _end(FAULT, f"a fault of the program, not of your input; please report what stands above ({error!r})", as_json)
+        sys.stderr.write(without_secrets(traceback.format_exc()))
+        what = f"a fault of the program, not of your input; please report what stands above ({error!r})"
+        _end(FAULT, without_secrets(what), as_json)
     finally:
         signals.give_back()
     if as_json:
@@ -203,7 +205,7 @@ def _to_standard_error() -> Iterator[None]:
 
 def one_line(error: object) -> str:
     """Format an error as one line of limited length without control characters."""
-    text = "".join(c if c.isprintable() else "?" for c in " ".join(str(error).split()))
+    text = "".join(c if c.isprintable() else "?" for c in " ".join(without_secrets(str(error)).split()))
     return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE // 2]} ... {text[-MAX_MESSAGE // 2 :]}"
 
 

@@ -19,7 +19,7 @@ EXAMPLES = examples(
 def view(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run, or a file of splats")],
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="address to serve at; 0.0.0.0 is for all that reach this machine")
+        str, typer.Option(metavar="ADDRESS", help="address to listen at; 0.0.0.0 is for all that reach this machine")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="port, or the next one that is free; 0 for any")] = 8080,
     max_splats: Annotated[int, typer.Option(min=100, help="splats that a browser draws, of larger maps")] = 300_000,
@@ -39,7 +39,7 @@ def view(
         settings = ViewSettings(enabled=True, host=host, port=port, max_splats=max_splats)
         with ProgressLine(progress_console(quiet)).working("reading the map"):
             viewer = FinishedViewer(run, settings, device.value)
-        typer.echo(f"viewer: {viewer.url} (Ctrl-C ends it)")
+        typer.echo(f"viewer: {viewer.page.address}\nCtrl-C ends it")
         try:
             viewer.serve()
         except KeyboardInterrupt:

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from modp_ti.files.urls import shown_url
+
 __all__ = [
     "KeyDoc",
     "as_yaml",
@@ -42,8 +44,8 @@ The tables are generated: `python -m modp_ti.config > docs/configuration.md`."""
 
 
 def as_yaml(value: Any) -> str:
-    """Format a value as one line of YAML."""
-    return json.dumps(value, ensure_ascii=False, default=str)
+    """Format a value as one line of YAML, a URL without its secrets."""
+    return json.dumps(shown_url(value) if isinstance(value, str) else value, ensure_ascii=False, default=str)
 
 
 @dataclass(frozen=True)

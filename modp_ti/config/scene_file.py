@@ -17,14 +17,16 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from modp_ti.config.comparison import differing_keys
 from modp_ti.config.keys import as_yaml, documented_keys, sections_of, variants_of
 from modp_ti.config.old_settings import refuse_removed_kind, without_leftovers
 from modp_ti.config.presets import with_preset
-from modp_ti.config.settings import SceneConfig
+from modp_ti.config.settings import WITH_SECRETS, SceneConfig
 from modp_ti.config.unknown_keys import refuse_unknown_keys
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import FROM_FILE, shown_url
 
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
@@ -93,7 +95,12 @@ def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
     """Write every setting with absolute paths, so that the file gives the same run from any folder."""
     resolved = _with_absolute_paths(config, Path.cwd())
     text = "# Every setting of this run: `modp-ti run` on this file gives the same map.\n"
-    text += yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    written = resolved.model_dump(mode="json")
+    for key in differing_keys(resolved.model_dump(mode="json", context=WITH_SECRETS), written, ()):
+        text += (
+            f"# {key} had a user, password or query: give it again, or take it with from-env:NAME (docs/sources.md).\n"
+        )
+    text += yaml.safe_dump(written, sort_keys=False, allow_unicode=True)
     replace_text(path, text)
 
 
@@ -104,6 +111,8 @@ def _with_absolute_paths(model: M, base: Path, typed: Collection[str] = (), sect
         here = Path.cwd() if section + name in typed else base
         if isinstance(value, Path):
             update[name] = _absolute_path(value, here, name)
+        elif isinstance(value, str) and value.startswith(FROM_FILE):
+            update[name] = f"{FROM_FILE}{_absolute_path(Path(value.removeprefix(FROM_FILE)), here, name)}"
         elif isinstance(value, BaseModel):
             update[name] = _with_absolute_paths(value, here, typed, f"{section}{name}.")
     return model.model_copy(update=update)
@@ -275,9 +284,8 @@ def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any
 
 def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
     """Write one "section.key=value" into the raw data."""
-    origin = f"{OVERRIDE}{override}"
     key, equals, text = override.partition("=")
-    key = key.strip()
+    key, origin = key.strip(), f"{OVERRIDE}{key}{equals}{shown_url(text.strip())}"
     if not equals or not key:
         raise InputError(f"{origin}: write it as section.key=value, for example source.scale=0.5")
     value = _parse_yaml(text, origin, {})

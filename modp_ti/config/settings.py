@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, SerializationInfo, field_serializer, field_validator, model_validator
 
 from fields.runtime.parallel import available_cores
 from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
@@ -18,11 +18,13 @@ from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, V
 from modp_ti.config.tracker_base_settings import GivenPosesSettings
 from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import shown_url
 from pipelines.offline_settings import OfflineSettings
 from pipelines.settings import MappingSettings, RefineSettings, StrictModel
 
 __all__ = [
     "LONGER_SIDE",
+    "WITH_SECRETS",
     "EvaluationSettings",
     "ExportSettings",
     "IntrinsicsSettings",
@@ -36,7 +38,15 @@ __all__ = [
 LONGER_SIDE = 480
 """Longest side [px] of a mapped image where `source.scale` is `auto`."""
 
+WITH_SECRETS = {"secrets": True}
+"""Context of `model_dump` that keeps users, passwords and queries of URLs."""
+
 NO_PATH = "source.path is missing: set it to the folder of the images"
+
+
+def _written(url: int | str | None, info: SerializationInfo) -> int | str | None:
+    """What is written of a URL: its secrets only for the processes of a run, which ask for them in the context."""
+    return shown_url(url) if isinstance(url, str) and info.context != WITH_SECRETS else url
 
 
 class SourceSettings(StrictModel):
@@ -74,7 +84,9 @@ class SourceSettings(StrictModel):
         "tracker `socket`",
     )
     stream: int | str | None = Field(
-        default=None, description="instead of `path`: number of a camera or URL of a stream, for live frames"
+        default=None,
+        description="instead of `path`: number of a camera or URL of a stream, for live frames. `from-env:NAME` and "
+        "`from-file:PATH` take the URL from an environment variable or a text file, which keeps its password secret",
     )
     realtime: bool = Field(
         default=False, description="deliver the images of a file or folder at the times of their time stamps"
@@ -137,6 +149,8 @@ class SourceSettings(StrictModel):
         description="true trajectory of the camera in TUM's format, matched with the frames by time: used only for the "
         "trajectory errors (`ate_rmse`) in `metrics.json` and the report; empty for none",
     )
+
+    _without_secrets = field_serializer("stream")(_written)
 
     @property
     def follows_clock(self) -> bool:
@@ -248,8 +262,11 @@ class SceneConfig(StrictModel):
     snapshot_store: str | None = Field(
         default=None,
         description="URL of a folder for copies of the snapshots, such as `s3://bucket/room`, through fsspec: another "
-        "machine continues from there (`modp-ti run SCENE --resume OUT`, `modp-ti batch --store`). Empty: none",
+        "machine continues from there (`modp-ti run SCENE --resume OUT`, `modp-ti batch --store`). `from-env:` and "
+        "`from-file:` as for `source.stream`. Empty: none",
     )
+    _without_secrets = field_serializer("snapshot_store")(_written)
+
     threads: int | None = Field(
         default=None,
         ge=1,

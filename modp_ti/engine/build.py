@@ -86,14 +86,14 @@ def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Co
 
 
 def open_observer(
-    view: ViewSettings, say: Callable[..., None], note: Callable[[str], None], held: ExitStack
+    view: ViewSettings, say: Callable[..., None], insist: Callable[[str], None], held: ExitStack
 ) -> Observer:
     """Start the live viewer if the settings ask for it, and return what observes the run.
 
     Args:
         view: Settings of the viewer.
         say: Called with remarks for the user, which the report repeats.
-        note: Called with the address of the viewer.
+        insist: Called with the address of the viewer, which nobody can guess.
         held: Closes the viewer when the run ends.
     """
     if not view.enabled:
@@ -102,5 +102,5 @@ def open_observer(
 
     viewer = LiveViewer(view, say)
     held.callback(viewer.close)
-    note(f"viewer: {viewer.url}")
+    insist(f"viewer: {viewer.page.address}")
     return viewer

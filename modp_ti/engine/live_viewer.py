@@ -36,8 +36,8 @@ FOR_NUMBERS = 0.25
 NUMBERS_EVERY = 0.1
 # Maximum width of the current frame's picture [px]; the finest pyramid level within it is shown.
 THUMBNAIL = 320
-# Time after which a paused run resumes if all browsers have disconnected [s].
-PATIENCE = 10.0
+# Time after which a paused run resumes if the browser that paused it, or the last one, has disconnected [s].
+PATIENCE = 5.0
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class LiveViewer(Observer):
         """Set the page's units, once the first keyframe provides the scene depth."""
         store = self._mapper.pipeline.keyframes
         if len(store):
-            self.page.settle(store.scene_depth, store[0].T_camera_world)
+            self.page.settle(store.scene_depth, store[0].T_camera_world, store[0].camera)
 
     def _hold(self) -> None:
         """Block while paused. Browsers are served without a cost limit, as there is no mapping to slow down."""
@@ -200,7 +200,9 @@ class LiveViewer(Observer):
             nonlocal alone_since
             now = self._clock()
             self._visited |= len(self.page.requests) > 0
-            alone_since = None if len(self.page.requests) or not self._visited else alone_since or now
+            holder, browsers = self._gate.holder, self.page.requests
+            watched = len(browsers) > 0 if holder is None else holder in browsers
+            alone_since = None if watched or not self._visited else alone_since or now
             if alone_since is not None and now - alone_since > PATIENCE:
                 self._gate.pause(False)
                 self.page.show_paused()
@@ -237,16 +239,15 @@ class LiveViewer(Observer):
         pipeline, waiting = self._mapper.pipeline, self._updates.waiting
         if not len(self.page.requests) or len(pipeline.keyframes) == 0 or len(pipeline.gaussians) == 0:
             return
-        if self.page.requests.mode == SPLATS:
-            if self._behind and (waiting is None or waiting.splats is None):
-                self._behind = False
-                self._updates.put(Update(splats=pipeline.gaussians.to_numpy()))
-        elif waiting is None or waiting.picture is None:
-            camera = self.page.requests.next()
+        if self.page.requests.shows(SPLATS) and self._behind and (waiting is None or waiting.splats is None):
+            self._behind = False
+            self._updates.put(Update(splats=pipeline.gaussians.to_numpy()))
+        if waiting is None or waiting.picture is None:
+            camera = self.page.requests.next(but=SPLATS)
             if camera is not None:
-                self._render(camera, self.page.requests.mode)
+                self.page.attempt(camera.client, lambda: self._render(camera))
 
-    def _render(self, browser: BrowserCamera, mode: str) -> None:
+    def _render(self, browser: BrowserCamera) -> None:
         """Render the map for one browser. The publishing thread converts the result to a picture."""
         pipeline = self._mapper.pipeline
         images, store = pipeline.renderer.images, pipeline.keyframes
@@ -261,7 +262,7 @@ class LiveViewer(Observer):
 
         largest = images.max_width, images.max_height
         try:
-            paint = painter(mode, browser, self.page.units, render, largest, store.scene_depth, poses, photograph)
+            paint = painter(browser, self.page.units, render, largest, store.scene_depth, poses, photograph)
         finally:
             images.resize(*size)  # also clears the buffers, so that the mapper's next step does not pay for it
         if paint is not None:
@@ -290,4 +291,4 @@ class LiveViewer(Observer):
             page.show_splats(splats_of(update.splats, page.units, self.settings.max_splats))
         if update.picture is not None:
             client, paint = update.picture
-            page.show_picture(client, paint())
+            page.attempt(client, lambda: page.show_picture(client, paint()))

@@ -32,6 +32,7 @@ from modp_ti.engine.snapshots.file import FILE
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import run_folder
+from modp_ti.files.urls import without_secrets
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.trackers import Tracker, open_tracker
@@ -105,7 +106,7 @@ class _Session:
         self.clock, self.record = RunClock(), RunRecord()
         self.truth = open_ground_truth(config.source.ground_truth)  # a missing file is reported before anything else
         # Opened first, as what follows may take minutes.
-        self.observer = open_observer(config.view, self._say, self.line.note, self.held)
+        self.observer = open_observer(config.view, self._say, self.line.insist, self.held)
         self.stop = Interruption(lambda: self.line.note("stopping after this step; Ctrl-C again stops at once"))
         try:
             self.backend = initialise(config.device, config.mapper_threads, config.seed)
@@ -407,6 +408,6 @@ class _Session:
 
     def _say(self, *notes: str) -> None:
         """Print notes, and keep them for the report."""
-        for note in notes:
+        for note in map(without_secrets, notes):
             self.line.note(f"note: {note}")
             self.record.notes.append(note)

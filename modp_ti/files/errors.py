@@ -1,5 +1,9 @@
 """The exception for unusable input, which the command line reports as one line with exit code 2."""
 
+from __future__ import annotations
+
+from modp_ti.files.urls import without_secrets
+
 __all__ = ["FEW", "InputError", "UnreadableImageError"]
 
 # Largest share of a recording's frames, or of a file's lines, that may be faulty. Up to it they are skipped and
@@ -8,7 +12,7 @@ FEW = 0.1
 
 
 class InputError(Exception):
-    """The user's input cannot be used. The message is one line that says what to change.
+    """The user's input cannot be used. The message is one line that says what to change, without secrets of URLs.
 
     Examples:
         Report the problem without a traceback:
@@ -18,6 +22,9 @@ class InputError(Exception):
             except modp_ti.InputError as error:
                 raise SystemExit(f"error: {error}")
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(without_secrets(str(message)))
 
 
 class UnreadableImageError(InputError):

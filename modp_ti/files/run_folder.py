@@ -40,7 +40,7 @@ LAST = "metrics.json"
 # What a run may write to its folder.
 OF_A_RUN = (
     "config.yaml splats.ply trajectory.txt frames.json exposure.json metrics.json scores.csv report.html session.zip "
-    "snapshot.npz colmap masks renders sfm"
+    "snapshot.npz recording.yaml colmap masks renders sfm"
 ).split()
 # A folder without a list whose config.yaml begins like this is a copy or of an earlier version: these files are listed.
 SETTINGS = b"# Every setting of this run: "

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import PRIVATE
+from modp_ti.files.urls import actual_url
 
 __all__ = ["Storage", "StorageError"]
 
@@ -32,7 +33,7 @@ class Storage:
     """
 
     def __init__(self, url: str) -> None:
-        self.url = url.rstrip("/")
+        self.url = actual_url(url).rstrip("/")
         try:
             import fsspec
         except ImportError:

@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.bags import SUFFIXES, has_poses
 from modp_ti.inputs.captures import ARCHIVES, KINDS
 from modp_ti.inputs.opening import recognised_kind
@@ -88,7 +89,7 @@ def _stream_name(stream: str) -> str:
     if stream.isdecimal():
         return f"camera-{int(stream)}"
     try:
-        url = urlsplit(stream)
+        url = urlsplit(shown_url(actual_url(stream)))
         parts = (url.hostname or "", url.path) if url.scheme and url.netloc else (Path(stream).name,)
     except ValueError:  # no URL; what is wrong is said when it is opened
         parts = ()

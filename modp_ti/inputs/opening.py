@@ -7,6 +7,7 @@ from pathlib import Path
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.urls import actual_url
 from modp_ti.inputs.bags import is_bag
 from modp_ti.inputs.captures import ARCHIVES, recognised_capture
 from modp_ti.inputs.captures.images import open_capture_images
@@ -44,7 +45,8 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
     if source.stream is not None:
         from modp_ti.inputs.sources.live import LiveSource
 
-        live = LiveSource(source.stream, folder)
+        stream = source.stream
+        live = LiveSource(actual_url(stream) if isinstance(stream, str) else stream, folder)
         try:
             return _scaled(_with_camera(live, source), source)
         except InputError:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from modp_ti.files.urls import without_secrets
 from modp_ti.outputs.time_left import RECENT, TimeLeft, duration
 
 if TYPE_CHECKING:
@@ -77,7 +78,13 @@ class ProgressLine:
 
     def note(self, text: str) -> None:
         """Print a note for the user."""
-        self.console.print(text, highlight=False, soft_wrap=True, markup=False)
+        self.console.print(without_secrets(text), highlight=False, soft_wrap=True, markup=False)
+
+    def insist(self, text: str) -> None:
+        """Print what the user needs even if the console is quiet."""
+        before, self.console.quiet = self.console.quiet, False
+        self.note(text)
+        self.console.quiet = before
 
     def prepare(self, what: str, done: int, total: int) -> None:
         """Show the progress of a tracker's preparation. Trackers take this method as their `Progress` callback."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
 import platform
 import re
+import secrets
 import socket
 import time
 from collections.abc import Sequence
@@ -70,14 +72,19 @@ class RayEngine(Engine):
     """Runs calls on a Ray cluster, on whose machines the same MODP-Ti must be installed.
 
     Args:
-        address: Address of the cluster; None for the one that `RAY_ADDRESS` names or that runs on this machine, or for
-            a new one on this machine.
+        address: Address of the cluster; None for the one that `RAY_ADDRESS` names, or for a new one of this process
+            alone, which answers only to those who have its random token. No other cluster is ever joined.
 
     Raises:
         InputError: If Ray is not installed or the cluster cannot be reached.
     """
 
     def __init__(self, address: str | None = None) -> None:
+        address = address or os.environ.get("RAY_ADDRESS") or "local"
+        if address == "local":
+            # Ray listens at all addresses of the machine, and asks for this token unless it is told not to.
+            os.environ.pop("RAY_AUTH_MODE", None)
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         try:
             import ray  # pyright: ignore[reportMissingImports] - an extra
         except ImportError:
@@ -86,8 +93,7 @@ class RayEngine(Engine):
             NodeAffinitySchedulingStrategy,
         )
 
-        if address is not None:
-            _require_reachable(address)
+        _require_reachable(address)
         self._ray = ray
         # Ray prints a paragraph for every lost worker. Standard output is for results, and the events tell it shortly.
         self._held = ExitStack()
@@ -95,10 +101,12 @@ class RayEngine(Engine):
         self._held.callback(ray.shutdown)
         try:
             ray.init(address, log_to_driver=False, logging_level="error", include_dashboard=False)
+            if address == "local" and os.environ.get("RAY_AUTH_MODE") != "token":
+                raise RuntimeError("this version of it would let anybody in")
             here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
         except Exception as error:  # ConnectionError, RuntimeError, ValueError, and those of gRPC
             self._held.close()
-            reason, where = " ".join(str(error).split())[:200], address or "this machine"
+            reason, where = " ".join(str(error).split())[:200], address.replace("local", "this machine")
             raise InputError(f"Ray at {where} cannot be used: {reason}; start it, or correct --address") from None
         board = ray.remote(_Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
         self._board: Any = board.remote()

@@ -10,6 +10,7 @@ from typing import Any
 
 from fields.runtime.engine import EngineError
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import without_secrets
 
 __all__ = ["Answer", "End", "Report", "Resources", "Task", "Work", "perform"]
 
@@ -92,4 +93,5 @@ def perform(work: Work, report: Report) -> Answer:
     except KeyboardInterrupt as stop:
         return Answer(End.interrupted, error=str(stop) or "interrupted")
     except Exception as error:
-        return Answer(End.fault, error=f"a fault of the program ({error!r})", traceback=traceback.format_exc())
+        what, where = f"a fault of the program ({error!r})", traceback.format_exc()
+        return Answer(End.fault, error=without_secrets(what), traceback=without_secrets(where))

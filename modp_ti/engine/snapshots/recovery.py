@@ -11,6 +11,7 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.engine.snapshots.file import FILE as SNAPSHOT
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import list_files
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources.frame_store import list_frames
 
@@ -44,6 +45,7 @@ class Recovery:
             settings[section] |= changes
         try:
             self._config.output.mkdir(parents=True, exist_ok=True)
+            list_files(self._config.output, [FILE])
             dump_scene(SceneConfig.model_validate(settings, strict=False), self._config.output / FILE)
         except OSError as error:
             raise InputError(f"{self._config.output}: cannot be written: {error.strerror}") from None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import atexit
 import os
-import re
 import tempfile
 import threading
 import time
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
+from modp_ti.files.urls import shown_url
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
 from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import FrameStore, kept_frames
@@ -295,7 +295,7 @@ def _shown(stream: int | str) -> str:
     """
     if isinstance(stream, int):
         return f"camera {stream}"
-    return re.sub(r"^[a-z0-9+.-]+://(?:[^/@]*@)?", "", stream, flags=re.IGNORECASE).partition("?")[0]
+    return shown_url(stream).rpartition("://")[2]
 
 
 def _open(stream: int | str):

@@ -27,7 +27,6 @@ __all__ = [
     "shareable",
     "shown",
     "stages",
-    "without_credentials",
     "yardsticks",
 ]
 
@@ -69,18 +68,11 @@ YARDSTICKS = {
 PATH = re.compile(r"""(?<![\w.:~/\\-])(~|/[^\s/"':,;()]+|[A-Za-z]:)(?:[/\\]+[^\s/\\"':,;()]+)+""")
 
 
-def without_credentials(text: str) -> str:
-    """Remove user names and passwords from URLs in the text, since reports are shared."""
-    return re.sub(r"(?<=://)[^/@\s\"']+@", "", text)
-
-
 def shareable(text: str, *folders: Path) -> str:
     """Remove from text what a page must not give away, since pages are shared.
 
-    User names and passwords of URLs are left out. Paths in one of the folders become relative to it; of other absolute
-    paths, the last name is left.
+    Paths in one of the folders become relative to it; of other absolute paths, the last name is left.
     """
-    text = without_credentials(text)
     for folder in sorted({*folders} - {Path(folder.anchor) for folder in folders}, key=lambda f: -len(str(f))):
         text = re.sub(rf"(?<![\w./-]){re.escape(str(folder))}[/\\]+", "", text)
     home = os.path.expanduser("~")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,19 +55,20 @@ class FinishedViewer:
     def __init__(self, run: FinishedRun, settings: ViewSettings, device: str) -> None:
         self.run = run
         self._max_splats = settings.max_splats
-        self._chosen: Latest[int] = Latest()
+        self._chosen: Latest[dict[int, int]] = Latest(lambda newer, waiting: waiting | newer)
         gaussians, points = run.gaussians, _tracked_points(run)
         self._kept = (run.folder / "colmap" / "images").is_dir()
         self._exposures = read_exposures(run.folder / "exposure.json") if self._kept else {}
         modes = MODES if self._kept else tuple(mode for mode in MODES if mode != "error")
-        self.page = Page(settings.host, settings.port, None, modes, self._chosen.put, len(run))
+        choose = lambda client, index: self._chosen.put({client: index})  # noqa: E731
+        self.page = Page(settings.host, settings.port, None, modes, choose, len(run))
         self.url = self.page.url
         start_device(device)
         largest = (max(*(getattr(c, side) for c in run.cameras), 0) for side in ("width", "height"))
         width, height = (max(own, least) for own, least in zip(largest, PICTURE, strict=True))
         self._renderer = MapRenderer(gaussians, width, height, run.record.near)
         keyframes = run.record.keyframes
-        self.page.settle(run.record.scene_depth, run.poses[keyframes[0]])
+        self.page.settle(run.record.scene_depth, run.poses[keyframes[0]], run.cameras[keyframes[0]])
         self.page.show_keyframes(run.poses[keyframes], run.cameras[keyframes[0]])
         self.page.show_points(points)
         # Of a map with more splats than a browser draws, each browser gets those for its camera.
@@ -77,7 +79,6 @@ class FinishedViewer:
             self.page.show_splats(splats_of(gaussians, self.page.units, settings.max_splats))
         frames = f"**{len(run)}** frames, {len(keyframes)} keyframes  \n" if run.folder.is_dir() else ""
         self.page.show_numbers(f"{frames}{len(gaussians['position']):,} Gaussians")
-        self._show_frame(0)
         self._renderer.view(PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16), run.poses[0])  # compiles the kernels
 
     def close(self) -> None:
@@ -87,24 +88,25 @@ class FinishedViewer:
     def serve(self, done: Callable[[], bool] = lambda: False) -> None:
         """Render what browsers request, until `done` returns true."""
         while not done():
-            index = self._chosen.take(timeout=0.0)
-            if index is not None:
-                self._show_frame(index)
+            for client, index in (self._chosen.take(timeout=0.0) or {}).items():
+                self.page.attempt(client, partial(self._show_frame, index, client))
             camera = self.page.requests.next(timeout=0.1)
-            mode = self.page.requests.mode
-            if camera is not None and mode != SPLATS:
-                self._render(camera, mode)
-            elif camera is not None and self._detail is not None:
-                self._show_splats(camera, self._detail)
+            if camera is not None:
+                self.page.attempt(camera.client, partial(self._show, camera))
 
-    def _show_frame(self, index: int) -> None:
+    def _show_frame(self, index: int, client: int) -> None:
         picture = self._photograph(index).rgba[..., :3] if self._kept else None
-        self.page.show_frame(ShownFrame(self.run.poses[index], self.run.cameras[index], picture))
+        self.page.show_frame(ShownFrame(self.run.poses[index], self.run.cameras[index], picture), client)
 
-    def _render(self, browser: BrowserCamera, mode: str) -> None:
+    def _show(self, browser: BrowserCamera) -> None:
+        if browser.mode != SPLATS:
+            self._render(browser)
+        elif self._detail is not None:
+            self._show_splats(browser, self._detail)
+
+    def _render(self, browser: BrowserCamera) -> None:
         record, mapped, images = self.run.record, self.run.mapped, self._renderer.renderer.images
         paint = painter(
-            mode,
             browser,
             self.page.units,
             self._renderer.view,
@@ -129,6 +131,7 @@ class FinishedViewer:
         before = self._shown.get(browser.client)
         if before is not None and np.linalg.norm(eye - before) < MOVED * self.run.record.scene_depth:
             return
+        self._shown = {client: at for client, at in self._shown.items() if client in self.page.requests}
         self._shown[browser.client] = eye
         blocks = np.arange(len(detail.blocks))
         levels = detail.levels_for(blocks, eye, camera.fy, self._max_splats)

@@ -69,23 +69,26 @@ class Gate:
 
     Attributes:
         paused: Whether the gate is closed, except for one frame or step.
+        holder: Id of the browser that closed it; None if no browser did.
     """
 
     def __init__(self) -> None:
         self.paused = False
+        self.holder: int | None = None
         self._step = False
         self._changed = threading.Condition()
 
-    def pause(self, paused: bool) -> None:
+    def pause(self, paused: bool, holder: int | None = None) -> None:
         with self._changed:
-            self.paused = paused
+            self.paused, self.holder = paused, holder
             self._step = False
             self._changed.notify_all()
 
-    def step(self) -> None:
+    def step(self, holder: int | None = None) -> None:
         """Let one frame or step through, then pause."""
         with self._changed:
             self.paused = self._step = True
+            self.holder = holder
             self._changed.notify_all()
 
     def wake(self) -> None:
@@ -118,6 +121,7 @@ class BrowserCamera:
         fov: Vertical field of view [rad].
         width: Width of the canvas [px].
         height: Height of the canvas [px].
+        mode: What the browser shows, one of `MODES`.
     """
 
     client: int
@@ -126,23 +130,17 @@ class BrowserCamera:
     fov: float
     width: int
     height: int
+    mode: str
 
 
 class Requests:
     """The pictures that browsers need, with at most one pending request per browser.
 
-    A browser needs a new picture when its camera has moved, the mode has changed, or the map has changed since its last
+    A browser needs a new picture when its camera has moved, its mode has changed, or the map has changed since its last
     one.
-
-    Args:
-        mode: The first mode.
-
-    Attributes:
-        mode: The current mode.
     """
 
-    def __init__(self, mode: str) -> None:
-        self.mode = mode
+    def __init__(self) -> None:
         self._cameras: dict[int, BrowserCamera] = {}
         self._due: list[int] = []  # ids of browsers with an outdated picture, longest waiting first
         self._changed = threading.Condition()
@@ -150,6 +148,15 @@ class Requests:
     def __len__(self) -> int:
         """Number of connected browsers."""
         return len(self._cameras)
+
+    def __contains__(self, client: int) -> bool:
+        """Whether this browser is connected."""
+        return client in self._cameras
+
+    def shows(self, mode: str) -> bool:
+        """Return whether any browser shows this mode."""
+        with self._changed:
+            return any(camera.mode == mode for camera in self._cameras.values())
 
     def look(self, camera: BrowserCamera) -> None:
         """Register a browser or its new camera. Browsers beyond MAX_BROWSERS see the page but get no pictures."""
@@ -168,20 +175,24 @@ class Requests:
             self._due = [other for other in self._due if other != client]
             self._changed.notify_all()
 
-    def show(self, mode: str) -> None:
-        """Change the mode for all browsers."""
-        with self._changed:
-            self.mode = mode
-        self.outdate()
-
     def outdate(self) -> None:
         """Mark all pictures as outdated, after a change of the map."""
         with self._changed:
             self._due += [client for client in self._cameras if client not in self._due]
             self._changed.notify_all()
 
-    def next(self, timeout: float = 0.0) -> BrowserCamera | None:
-        """Return the camera of the browser that has waited longest; None if none waits in `timeout` seconds."""
+    def next(self, timeout: float = 0.0, but: str | None = None) -> BrowserCamera | None:
+        """Return the camera of the browser that has waited longest; None if none waits in `timeout` seconds.
+
+        Browsers in the mode `but` are left out.
+        """
+
+        def due() -> list[int]:
+            return [client for client in self._due if self._cameras[client].mode != but]
+
         with self._changed:
-            self._changed.wait_for(lambda: self._due, timeout)
-            return self._cameras[self._due.pop(0)] if self._due else None
+            self._changed.wait_for(due, timeout)
+            for client in due()[:1]:
+                self._due.remove(client)
+                return self._cameras[client]
+        return None

@@ -10,12 +10,22 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, inverse_se3, matrix_from_quaternion
-from modp_ti.outputs.playback.film import depth_colours
+from modp_ti.outputs.playback.film import DEPTH_RANGE, depth_colours
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from pipelines.render.renderer import RenderedView
 
-__all__ = ["MODES", "SPLATS", "Photograph", "image_error", "nearest_photograph", "painter", "picture_of", "pinhole_of"]
+__all__ = [
+    "MODES",
+    "SPLATS",
+    "Photograph",
+    "image_error",
+    "nearest_photograph",
+    "painter",
+    "picture_of",
+    "pinhole_of",
+    "scale_of",
+]
 
 # The browser draws splats itself. The other modes are background pictures from this program's renderer.
 SPLATS = "splats"
@@ -80,7 +90,6 @@ def pinhole_of(
 
 
 def painter(
-    mode: str,
     browser: BrowserCamera,
     units: float,
     render: Callable[[PinholeCamera, NDArray[np.float64]], RenderedView],
@@ -89,11 +98,10 @@ def painter(
     poses: NDArray[np.float64],
     photograph: Callable[[int], Photograph],
 ) -> Callable[[], NDArray[np.uint8]] | None:
-    """Render what a display mode needs.
+    """Render what a browser's mode needs.
 
     Args:
-        mode: One of MODES, except for SPLATS.
-        browser: The camera to show the map from.
+        browser: The camera to show the map from, and the mode, one of MODES except for SPLATS.
         units: Page units per world unit.
         render: Renders the map from a camera and T_camera_world (4, 4).
         largest: Largest width and height of a picture [px].
@@ -111,8 +119,8 @@ def painter(
     camera, T_camera_world = seen_from
     try:
         view = render(camera, T_camera_world)
-        if mode != "error":
-            return lambda: picture_of(view, mode, scene_depth)
+        if browser.mode != "error":
+            return lambda: picture_of(view, browser.mode, scene_depth)
         taken = photograph(nearest_photograph(poses, T_camera_world, scene_depth))
         seen = render(taken.camera, taken.T_camera_world)
     except ValueError:
@@ -127,6 +135,29 @@ def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.
     if mode == "opacity":
         return np.repeat(eight_bits(view.opacity)[..., None], 3, axis=2)
     return eight_bits(view.colour)
+
+
+def scale_of(mode: str, scene_depth: float) -> str:
+    """Return what the colours of a mode mean, as HTML: a bar with numbers. Empty for modes that need none."""
+    import cv2
+
+    steps = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
+    turbo = cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[0, :, ::-1]
+    if mode == "depth":  # `depth_colours`: red is near
+        ends = [scene_depth / DEPTH_RANGE, scene_depth, scene_depth * DEPTH_RANGE]
+        colours, what = turbo[::-1], "depth [scene units], logarithmic"
+    elif mode == "error":
+        ends, colours, what = [0.0, LARGEST_ERROR / 2, LARGEST_ERROR], turbo, "mean colour difference, of 1"
+    elif mode == "opacity":
+        ends, colours, what = [0.0, 0.5, 1.0], np.repeat(steps[0, :, None], 3, axis=1), "opacity"
+    else:
+        return ""
+    stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in colours.tolist())
+    numbers = "".join(f"<span>{number:.3g}</span>" for number in ends)
+    return (
+        f'<div style="margin:0 0.75em;font-size:0.8em">{what}<div style="height:0.8em;background:linear-gradient(90deg,'
+        f'{stops})"></div><div style="display:flex;justify-content:space-between">{numbers}</div></div>'
+    )
 
 
 def nearest_photograph(poses: NDArray[np.float64], T_camera_world: NDArray[np.float64], scene_depth: float) -> int:

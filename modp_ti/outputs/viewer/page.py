@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +13,8 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, inverse_se3, quaternion_from_matrix
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Requests
+from modp_ti.outputs.viewer.browser import FRAME, KEYFRAMES, POINTS, SPLATS_NODE, Browser
+from modp_ti.outputs.viewer.handover import Gate, Requests
 from modp_ti.outputs.viewer.modes import MODES, SPLATS
 from modp_ti.outputs.viewer.splats import Splats
 
@@ -28,13 +26,10 @@ __all__ = ["Page", "ShownFrame"]
 TITLE = "MODP-Ti"
 # Depth of the scene in page units. The world's units are arbitrary, and browsers store covariances as 16-bit floats.
 DEPTH_ON_PAGE = 4.0
-# Position of the initial camera behind and above the first frame [page units].
-BEHIND, ABOVE = 2.0, 1.0
 # Depth of the frustums of keyframes and of the current frame, and size of points [page units].
-KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.015
+KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.006
 KEYFRAME_COLOUR, FRAME_COLOUR, POINT_COLOUR = (90, 140, 255), (255, 120, 30), (255, 60, 60)
 JPEG_QUALITY = 85
-KEYFRAMES, FRAME, POINTS = "Keyframes", "Current frame", "Tracked points"
 # Corners of a frustum's image as (x, y) in {0, 1}.
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
@@ -62,15 +57,16 @@ class Page:
         port: Port to listen on. If it is taken, the next free one is used; 0 picks any free port.
         gate: The gate that the pause and step buttons control, None for a page without them.
         modes: Display modes to choose from. The first one is shown first.
-        choose: Called with a frame's position when the frame slider moves, None for a page without slider.
+        choose: Called with a browser's id and the frame's position that it chooses, None for a page without slider.
         frames: Number of frames of the slider.
 
     Attributes:
         requests: The pictures that browsers need.
         threads: The server's threads.
+        url: Address of the page. Who has it can see the map.
 
     Raises:
-        InputError: If viser is not installed, or `host` is not an address of this machine.
+        InputError: If viser is not installed, or no port can be opened at `host`.
     """
 
     def __init__(
@@ -79,40 +75,61 @@ class Page:
         port: int,
         gate: Gate | None = None,
         modes: Sequence[str] = MODES,
-        choose: Callable[[int], None] | None = None,
+        choose: Callable[[int, int], None] | None = None,
         frames: int = 0,
     ) -> None:
         try:
-            import viser
+            import viser  # noqa: F401
+
+            from modp_ti.outputs.viewer.door import Door
         except ImportError:
             raise InputError(
                 'the viewer needs viser: pip install "modp-ti[viewer]", in a checkout '
                 '.venv/bin/pip install -c constraints.txt -e ".[viewer]"'
             ) from None
-        _require_address(host)
-        self.requests = Requests(modes[0])
+        self.requests = Requests()
         self._gate = gate
+        self._modes, self._choose, self._frames = modes, choose, frames
         self._units: float | None = None
         self._frame: ShownFrame | None = None
-        self._nodes: dict[str, Any] = {}
-        self._splats: dict[int | None, Any] = {}  # by browser, None for all
-        self._lock = threading.Lock()  # nodes are changed by the publishing thread and by viser's threads
+        self._chosen: dict[int, ShownFrame] = {}  # by browser, where each chooses its own
+        self._nodes: dict[str, Any] = {}  # those of all browsers
+        self._browsers: dict[int, Browser] = {}
+        self._eyes = np.zeros((0, 3))  # of the keyframes [page units]
+        self._drawn = ""  # how many of the Gaussians all browsers draw
+        self._lock = threading.RLock()  # nodes are changed by the publishing thread and by viser's threads
         before = set(threading.enumerate())
-        with _silent():
-            self._server = viser.ViserServer(host=host, port=port, label=TITLE, verbose=False)
+        self._door = Door(host, port, TITLE)
+        self._server = self._door.server
         self.threads = [thread for thread in threading.enumerate() if thread not in before]
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        # The share button is hidden because it would route the page through a third party's server.
+        self.url = self._door.url
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.scene.world_axes.visible = False
-        self._add_controls(modes, choose, frames)
+        self._numbers = self._server.gui.add_markdown("waiting for the first frame")
+        if gate is not None:
+            self._add_gate_controls(gate)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
 
     def close(self) -> None:
         """Stop serving the page."""
-        with _silent():
-            self._server.stop()
+        self._door.close()
+
+    @property
+    def address(self) -> str:
+        """The address for the user, who is warned if it is open to more than this machine."""
+        open_to_all = "\nnote: other machines can reach this page, unencrypted; whoever has its address sees the map"
+        return self.url + (open_to_all if self._door.beyond_this_machine else "")
+
+    def attempt(self, client: int, act: Callable[[], None]) -> None:
+        """Do something for one browser. What fails is noted on its page, or ends its connection, and nothing else."""
+        try:
+            act()
+        except InputError as error:
+            if client in self._browsers:
+                self._browsers[client].note(str(error))
+        except Exception:
+            self._door.dismiss(client)
 
     # ---- what is shown ---------------------------------------------------------------------------------------
 
@@ -121,22 +138,21 @@ class Page:
         """Page units per world unit; 1 before `settle`."""
         return self._units or 1.0
 
-    def settle(self, scene_depth: float, T_camera_world: NDArray[np.float64]) -> None:
-        """Set the page's scale by the scene's depth [scene units], and the initial view by its pose (4, 4).
+    def settle(self, scene_depth: float, T_camera_world: NDArray[np.float64], camera: PinholeCamera) -> None:
+        """Set the page's scale by the scene's depth [scene units], and the initial view by a camera.
 
-        The pose also defines the up direction. Later calls have no effect.
+        The pose (4, 4) also defines the up direction. Later calls have no effect.
         """
         if self._units is not None:
             return
         self._units = DEPTH_ON_PAGE / scene_depth
-        forward, up = T_camera_world[2, :3], -T_camera_world[1, :3]
-        centre = inverse_se3(T_camera_world)[:3, 3] * self.units
+        first, up = self._server.initial_camera, -T_camera_world[1, :3]
         self._server.scene.set_up_direction(up)
-        eye, target = centre - BEHIND * forward + ABOVE * up, centre + DEPTH_ON_PAGE * forward
-        first = self._server.initial_camera
-        first.position, first.look_at, first.up = eye, target, up
-        for client in self._server.get_clients().values():
-            _look(client, eye, target, up)
+        first.position, first.look_at = self._eye_and_target(T_camera_world)
+        first.up, first.fov = up, _vertical(camera)
+        for browser in list(self._browsers.values()):
+            self._look(browser.client, T_camera_world, camera)
+            browser.scale(scene_depth)
 
     def show_numbers(self, text: str) -> None:
         """Show Markdown text in the numbers panel."""
@@ -144,147 +160,175 @@ class Page:
 
     def show_splats(self, splats: Splats, client: int | None = None) -> None:
         """Replace the splats of one browser, or of all, which are visible in the splats mode."""
-        note = "" if len(splats.centres) == splats.of else f"{len(splats.centres):,} of {splats.of:,} Gaussians drawn"
-        if note != self._note.content:
-            self._note.content = note
         values = splats.centres, splats.covariances, splats.colours, splats.opacities
+        drawn = "" if len(splats.centres) == splats.of else f"{len(splats.centres):,} of {splats.of:,} Gaussians drawn"
         with self._lock:
-            shown_by = self._server if client is None else self._server.get_clients().get(client)
-            if client in self._splats:
-                self._splats[client].set_gaussians(*values)
-            elif shown_by is not None:
-                node = shown_by.scene.add_gaussian_splats("/splats", *values)
-                node.visible = self.requests.mode == SPLATS
-                self._splats[client] = node
+            self._drawn = drawn if client is None else self._drawn
+            browsers = [browser for key, browser in self._browsers.items() if client in (None, key)]
+            for browser in browsers:
+                browser.note(drawn)
+            nodes, scene = self._scene_of(client)
+            if scene is not None and SPLATS_NODE in nodes:
+                nodes[SPLATS_NODE].set_gaussians(*values)
+            elif scene is not None:
+                nodes[SPLATS_NODE] = scene.add_gaussian_splats(SPLATS_NODE, *values)
+                self._arrange(browsers)
 
     def show_picture(self, client: int, picture: NDArray[np.uint8]) -> None:
         """Set a picture (H, W, 3) as the background of one browser."""
         with self._lock:
-            handle = self._server.get_clients().get(client)
-            if handle is not None and self.requests.mode != SPLATS:
-                handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
+            browser = self._browsers.get(client)
+            if browser is not None and browser.mode.value != SPLATS:
+                browser.client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
 
-    def show_frame(self, frame: ShownFrame) -> None:
-        """Show the current frame as a frustum with its image."""
+    def show_frame(self, frame: ShownFrame, client: int | None = None) -> None:
+        """Show the current frame of one browser, or of all, as a frustum with its image."""
         T_world_camera = inverse_se3(frame.T_camera_world)
-        pose: dict[str, NDArray] = {
-            "wxyz": quaternion_from_matrix(T_world_camera[:3, :3]),
-            "position": T_world_camera[:3, 3] * self.units,
+        if client is None:
+            self._frame = frame
+        else:
+            self._chosen[client] = frame
+        style = {
+            "fov": _vertical(frame.camera),
+            "aspect": frame.camera.width / frame.camera.height,
+            "scale": FRAME_SIZE,
+            "thickness": 2.0,
+            "thickness_units": "screen",
+            "color": FRAME_COLOUR,
+            "format": "jpeg",
+            "jpeg_quality": JPEG_QUALITY,
         }
-        self._frame = frame
-        add = partial(
-            self._server.scene.add_camera_frustum,
-            "/frame",
-            fov=_vertical(frame.camera),
-            aspect=frame.camera.width / frame.camera.height,
-            scale=FRAME_SIZE,
-            thickness=2.0,
-            thickness_units="screen",
-            color=FRAME_COLOUR,
-            format="jpeg",
-            jpeg_quality=JPEG_QUALITY,
+        self._show(
+            lambda scene, **values: scene.add_camera_frustum(FRAME, **style, **values),
+            FRAME,
+            client,
+            image=frame.picture,
+            wxyz=quaternion_from_matrix(T_world_camera[:3, :3]),
+            position=T_world_camera[:3, 3] * self.units,
         )
-        self._show(FRAME, add, image=frame.picture, **pose)
 
     def show_keyframes(self, poses: NDArray[np.float64], camera: PinholeCamera) -> None:
         """Show keyframes, given their T_camera_world (N, 4, 4), as frustums that all have the shape of `camera`."""
         style = {"colors": KEYFRAME_COLOUR, "thickness": 1.5, "thickness_units": "screen"}
-        add = partial(self._server.scene.add_line_segments, "/keyframes", **style)
-        self._show(KEYFRAMES, add, points=frustum_lines(poses, camera, self.units))
+        self._eyes = camera_centres(poses) * self.units
+        lines = frustum_lines(poses, camera, self.units)
+        self._show(lambda scene, points: scene.add_line_segments(KEYFRAMES, points, **style), KEYFRAMES, points=lines)
 
     def show_points(self, xyz: NDArray[np.float64]) -> None:
-        """Show tracked points (N, 3), in world coordinates."""
+        """Show tracked points (N, 3), in world coordinates, but for those that cover the view of a keyframe."""
         style = {"colors": POINT_COLOUR, "point_size": POINT_SIZE, "point_shape": "circle", "precision": "float32"}
-        add = partial(self._server.scene.add_point_cloud, "/points", **style)
-        self._show(POINTS, add, points=(xyz * self.units).astype(np.float32))
+        points = (xyz * self.units).astype(np.float32)
+        for eye in self._eyes:
+            points = points[np.linalg.norm(points - eye, axis=1) > FRAME_SIZE]
+        self._show(lambda scene, points: scene.add_point_cloud(POINTS, points, **style), POINTS, points=points)
 
-    def _show(self, name: str, add: Callable[..., Any], **values: Any) -> None:
-        """Set the values of a node, which `add` creates first where there is none."""
+    def _show(self, add: Callable[..., Any], name: str, client: int | None = None, **values: Any) -> None:
+        """Set the values of a node of one browser, or of all, which `add` creates first where there is none."""
         with self._lock:
-            if name not in self._nodes:
-                self._nodes[name] = add(**values, visible=self._boxes[name].value)
-                return
-            for attribute, value in values.items():
-                setattr(self._nodes[name], attribute, value)
+            nodes, scene = self._scene_of(client)
+            if scene is not None and name not in nodes:
+                nodes[name] = add(scene, **values)
+            elif scene is not None:
+                for attribute, value in values.items():
+                    setattr(nodes[name], attribute, value)
+            self._arrange([browser for key, browser in self._browsers.items() if client in (None, key)])
+
+    def _scene_of(self, client: int | None) -> tuple[dict[str, Any], Any]:
+        """Return the nodes and the scene of one browser, or of all; the scene is None if the browser has left."""
+        if client is None:
+            return self._nodes, self._server.scene
+        browser = self._browsers.get(client)
+        return ({}, None) if browser is None else (browser.nodes, browser.client.scene)
+
+    def _arrange(self, browsers: Iterable[Browser]) -> None:
+        for browser in browsers:
+            frame = self._chosen.get(browser.client.client_id, self._frame)
+            centre = None if frame is None else inverse_se3(frame.T_camera_world)[:3, 3] * self.units
+            browser.arrange(centre, FRAME_SIZE)
 
     # ---- controls --------------------------------------------------------------------------------------------
-
-    def _add_controls(self, modes: Sequence[str], choose: Callable[[int], None] | None, frames: int) -> None:
-        gui = self._server.gui
-        self._numbers = gui.add_markdown("waiting for the first frame")
-        if self._gate is not None:
-            self._add_gate_controls(self._gate)
-        if choose is not None:
-            slider = gui.add_slider("Frame", min=0, max=max(frames - 1, 1), step=1, initial_value=0)
-            slider.on_update(lambda _: choose(min(int(slider.value), frames - 1)))
-        mode = gui.add_dropdown("Show", tuple(modes), hint="splats: drawn by the browser; others: by our renderer")
-        mode.on_update(lambda _: self._set_mode(mode.value))
-        self._note = gui.add_markdown("")
-        self._boxes = {name: gui.add_checkbox(name, initial_value=True) for name in (KEYFRAMES, FRAME, POINTS)}
-        for box in self._boxes.values():
-            box.on_update(lambda _: self._set_visible())
-        look = gui.add_button("Look from the current frame")
-        look.on_click(lambda event: self._look_from_frame(event.client))
 
     def _add_gate_controls(self, gate: Gate) -> None:
         gui = self._server.gui
         self._pause = gui.add_button("Pause", hint="pause the mapping after the current frame or step")
         step = gui.add_button("Step", hint="map one frame or take one step, then pause")
+        self._door.admit(self._pause, step)
         self.show_paused()
 
         def press(act: Callable[[], None]) -> None:
             act()
             self.show_paused()
 
-        self._pause.on_click(lambda _: press(lambda: gate.pause(not gate.paused)))
-        step.on_click(lambda _: press(gate.step))
+        self._pause.on_click(lambda event: press(lambda: gate.pause(not gate.paused, event.client_id)))
+        step.on_click(lambda event: press(lambda: gate.step(event.client_id)))
 
     def show_paused(self) -> None:
         """Set the label of the pause button, if there is one."""
         if self._gate is not None:
             self._pause.label = "Resume" if self._gate.paused else "Pause"
 
-    def _set_mode(self, mode: str) -> None:
-        with self._lock:
-            self.requests.show(mode)
-            for node in self._splats.values():
-                node.visible = mode == SPLATS
-            if mode == SPLATS:
-                for client in self._server.get_clients().values():
-                    client.scene.set_background_image(None)
-        if self._gate is not None:
-            self._gate.wake()
-
-    def _set_visible(self) -> None:
-        with self._lock:
-            for name, box in self._boxes.items():
-                if name in self._nodes:
-                    self._nodes[name].visible = box.value
-
     def _connected(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: self._moved(client))
-        self._moved(client)
+        number = client.client_id
+        choose, browser = self._choose, Browser(client, self._modes, self._frames if self._choose else 0)
+
+        def on(register: Callable[[Callable[[Any], None]], Any], act: Callable[[], None]) -> None:
+            register(lambda _: self.attempt(number, act))
+
+        with self._lock:
+            self._browsers[number] = browser
+            browser.note(self._drawn)
+        if choose is not None and browser.frame is not None:
+            slider = browser.frame
+            on(slider.on_update, lambda: choose(number, min(int(slider.value), self._frames - 1)))
+            choose(number, 0)
+        on(browser.mode.on_update, lambda: self._set_mode(browser))
+        for box in browser.boxes.values():
+            on(box.on_update, lambda: self._moved(browser))
+        on(browser.look.on_click, lambda: self._look_from_frame(client))
+        on(browser.link.on_click, lambda: browser.note(f"[This view]({self.url}{browser.link_to_view})"))
+        on(client.camera.on_update, lambda: self._moved(browser))
+        self._door.admit(*browser.controls)
+        self.attempt(number, lambda: self._moved(browser))
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
         self.requests.leave(client.client_id)
         with self._lock:
-            self._splats.pop(client.client_id, None)
+            self._browsers.pop(client.client_id, None)
+            self._chosen.pop(client.client_id, None)
 
-    def _moved(self, client: viser.ClientHandle) -> None:
-        if client.client_id not in self._server.get_clients():
-            return  # late message of a disconnected browser
-        c = client.camera
-        self.requests.look(BrowserCamera(client.client_id, c.wxyz, c.position, c.fov, c.image_width, c.image_height))
+    def _set_mode(self, browser: Browser) -> None:
+        with self._lock:
+            browser.scale(None if self._units is None else DEPTH_ON_PAGE / self._units)
+            if browser.mode.value == SPLATS:
+                browser.client.scene.set_background_image(None)
+        self._moved(browser)
+
+    def _moved(self, browser: Browser) -> None:
+        """Take in what a browser wants to see, and from where."""
+        with self._lock:
+            if browser.client.client_id not in self._server.get_clients():
+                return  # late message of a disconnected browser
+            self._arrange([browser])
+            self.requests.look(browser.camera)
         if self._gate is not None:
             self._gate.wake()
 
-    def _look_from_frame(self, client: viser.ClientHandle | None) -> None:
-        frame = self._frame
-        if client is None or frame is None:
-            return
-        centre = inverse_se3(frame.T_camera_world)[:3, 3] * self.units
-        client.camera.fov = _vertical(frame.camera)
-        _look(client, centre, centre + DEPTH_ON_PAGE * frame.T_camera_world[2, :3], -frame.T_camera_world[1, :3])
+    def _look_from_frame(self, client: viser.ClientHandle) -> None:
+        frame = self._chosen.get(client.client_id, self._frame)
+        if frame is not None:
+            self._look(client, frame.T_camera_world, frame.camera)
+
+    def _look(self, client: viser.ClientHandle, T_camera_world: NDArray[np.float64], camera: PinholeCamera) -> None:
+        """Move a browser's camera to a camera's place."""
+        with client.atomic():
+            client.camera.fov = _vertical(camera)
+            client.camera.position, client.camera.look_at = self._eye_and_target(T_camera_world)
+            client.camera.up_direction = -T_camera_world[1, :3]
+
+    def _eye_and_target(self, T_camera_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return centre and target of a camera with this pose (4, 4) [page units]."""
+        eye = inverse_se3(T_camera_world)[:3, 3] * self.units
+        return eye, eye + DEPTH_ON_PAGE * T_camera_world[2, :3]
 
 
 def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: float) -> NDArray[np.float32]:
@@ -302,36 +346,3 @@ def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: floa
 def _vertical(camera: PinholeCamera) -> float:
     """Return the vertical field of view [rad]."""
     return float(2 * np.arctan(0.5 * camera.height / camera.fy))
-
-
-def _look(client: viser.ClientHandle, eye: NDArray, target: NDArray, up: NDArray) -> None:
-    with client.atomic():
-        client.camera.position = eye
-        client.camera.look_at = target
-        client.camera.up_direction = up
-
-
-def _require_address(host: str) -> None:
-    """Raise InputError if no port of `host` can be opened, in which case viser would wait forever."""
-    try:
-        family = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0][0]
-        with socket.create_server((host, 0), family=family):
-            pass
-    except OSError as error:
-        raise InputError(
-            f"view.host {host}: no address of this machine ({error.strerror}); 127.0.0.1 is for this machine alone, "
-            "0.0.0.0 for all that reach it"
-        ) from None
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Suppress viser's own messages on the terminal."""
-    import rich
-
-    console = rich.get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before

@@ -34,15 +34,15 @@ WINDOWS = [(640, 480), (300, 500), (1600, 200)]
 class Visited(LiveViewer):
     """With a browser that looks from elsewhere, in another mode, with another window at every frame and step.
 
-    shown: mode and shape of each picture.
+    shown: shape of each picture.
     """
 
     def __init__(self) -> None:
         super().__init__(ViewSettings(port=0), pytest.fail)
         self.numbers_limit.allows = self.pictures_limit.allows = lambda: True
         self.visits = 0
-        self.shown: list[tuple[str, tuple[int, ...]]] = []
-        self.page.show_picture = lambda client, picture: self.shown.append((self.page.requests.mode, picture.shape))
+        self.shown: list[tuple[int, ...]] = []
+        self.page.show_picture = lambda client, picture: self.shown.append(picture.shape)
 
     def _look_around(self) -> None:
         self.visits += 1
@@ -52,8 +52,8 @@ class Visited(LiveViewer):
             T[:3, 3] += 0.02 * self.visits * T[:3, 0]
             q = quaternion_from_matrix(T[:3, :3])
             window = WINDOWS[self.visits % len(WINDOWS)]
-            self.page.requests.look(BrowserCamera(1, q, T[:3, 3] * self.page.units, 0.9, *window))
-        self.page.requests.show(MODES[self.visits % len(MODES)])
+            mode = MODES[self.visits % len(MODES)]
+            self.page.requests.look(BrowserCamera(1, q, T[:3, 3] * self.page.units, 0.9, *window, mode))
         super()._look_around()
         while self._updates.waiting is not None:  # else pictures would be left out
             time.sleep(0.001)
@@ -88,7 +88,7 @@ def test_a_map_that_is_looked_at_is_the_same_bit_for_bit(room_recording: RoomRec
     np.testing.assert_array_equal(seen_trajectory, trajectory)
     assert viewer.visits == 8
     assert len(viewer.shown) >= 4  # none before the first keyframe, and none of splats
-    assert {shape for _, shape in viewer.shown} == {(60, 80, 3), (60, 36, 3), (LEAST_SIDE, 80, 3)}
+    assert set(viewer.shown) == {(60, 80, 3), (60, 36, 3), (LEAST_SIDE, 80, 3)}
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def viewer():
 
 
 def visit(viewer: LiveViewer) -> None:
-    viewer.page.requests.look(BrowserCamera(1, np.array([1.0, 0, 0, 0]), np.zeros(3), 1.0, 640, 480))
+    viewer.page.requests.look(BrowserCamera(1, np.array([1.0, 0, 0, 0]), np.zeros(3), 1.0, 640, 480, "splats"))
 
 
 def test_a_paused_run_whose_browser_has_gone_goes_on(viewer: LiveViewer):
@@ -117,6 +117,14 @@ def test_a_paused_run_whose_browser_has_gone_goes_on(viewer: LiveViewer):
     assert not viewer._gate.paused
     assert viewer._clock() > PATIENCE
     assert viewer.waited > 0
+    assert viewer.said == []
+
+
+def test_a_paused_run_goes_on_where_the_browser_that_paused_it_has_gone(viewer: LiveViewer):
+    visit(viewer)  # this one stays
+    viewer._gate.pause(True, 2)
+    viewer.on_step("refining", 1, 9, 30.0)  # would hold for ever
+    assert not viewer._gate.paused
     assert viewer.said == []
 
 

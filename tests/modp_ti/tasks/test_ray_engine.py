@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -64,6 +67,31 @@ def test_tasks_of_a_machine_that_is_lost_go_on_on_another(cluster: Any) -> None:
         answers = run_tasks(engine, tasks, watch)
     assert [answer.end for answer in answers.values()] == [End.done, End.done]
     assert [event.attempt for event in seen if isinstance(event, Retried)] == [2]
+
+
+STRANGER = """
+import sys, ray
+ray.init(sys.argv[1], log_to_driver=False, logging_level="error")
+print("came in", ray.get(ray.remote(num_cpus=0)(lambda: 42).remote()))
+"""
+
+
+def test_a_cluster_of_its_own_lets_nobody_in_and_joins_no_other(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("RAY_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
+        monkeypatch.delenv(name, raising=False)
+    outside = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    with open_engine("ray", None):
+        import ray
+
+        address = ray.get_runtime_context().gcs_address
+        assert address != cluster.address  # which Ray's temporary folder names
+        call = [sys.executable, "-c", STRANGER, address]
+        came = subprocess.run(call, env=outside | {"HOME": str(tmp_path)}, capture_output=True, text=True)
+        assert came.returncode != 0 and "came in" not in came.stdout
+        ours = subprocess.run(call, env=dict(os.environ), capture_output=True, text=True)
+        assert "came in 42" in ours.stdout
 
 
 def test_a_cluster_that_cannot_be_reached_is_said_in_one_line() -> None:

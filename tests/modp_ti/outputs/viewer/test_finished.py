@@ -63,22 +63,24 @@ def run(tmp_path: Path) -> FinishedRun:
     return FinishedRun(tmp_path, NAMES, np.arange(3.0), poses, [CAMERA] * 3, FramesRecord(0.01, 2.0, [0, 2], []))
 
 
-def looks(viewer: FinishedViewer, T: np.ndarray, width: int, height: int) -> None:
+def looks(viewer: FinishedViewer, T: np.ndarray, width: int, height: int, mode: str = "splats") -> None:
     """A browser looks from T_camera_world, with the camera's field of view."""
     T_world_camera = inverse_se3(T)
     q = quaternion_from_matrix(T_world_camera[:3, :3])
     fov = 2 * np.arctan(CAMERA.height / 2 / CAMERA.fy)
-    viewer.page.requests.look(BrowserCamera(5, q, T_world_camera[:3, 3] * viewer.page.units, fov, width, height))
+    position = T_world_camera[:3, 3] * viewer.page.units
+    viewer.page.requests.look(BrowserCamera(5, q, position, fov, width, height, mode))
 
 
 def test_a_browser_at_a_frames_place_gets_the_frames_picture_in_every_mode(run: FinishedRun):
     viewer = FinishedViewer(run, ViewSettings(port=0), "cpu")
     got: dict[str, np.ndarray] = {}
-    viewer.page.show_picture = lambda client, picture: got.setdefault(viewer.page.requests.mode, picture)
+    asked: list[str] = []
+    viewer.page.show_picture = lambda client, picture: got.setdefault(asked[-1], picture)
     try:
         for mode in MODES[1:]:
-            viewer.page.requests.show(mode)
-            looks(viewer, run.poses[2], 96, 64)
+            asked.append(mode)
+            looks(viewer, run.poses[2], 96, 64, mode)
             viewer.serve(lambda mode=mode: mode in got)
         image = cv2.imread(str(run.folder / "colmap" / "images" / "c.png"))[..., ::-1].astype(float)
         unclipped = (image < 255) & (got["colour"] > 0)
@@ -102,8 +104,7 @@ def test_a_file_of_splats_is_shown_without_a_run(tmp_path: Path):
     got: list[np.ndarray] = []
     viewer.page.show_picture = lambda client, picture: got.append(picture)
     try:
-        viewer.page.requests.show("opacity")
-        looks(viewer, run.poses[0], 96, 64)
+        looks(viewer, run.poses[0], 96, 64, "opacity")
         viewer.serve(lambda: bool(got))
     finally:
         viewer.close()
@@ -135,15 +136,33 @@ def test_a_browser_gets_the_splats_of_a_large_map_for_its_camera(tmp_path: Path)
 def test_the_chosen_frame_is_shown_with_its_picture(run: FinishedRun):
     viewer = FinishedViewer(run, ViewSettings(port=0), "cpu")
     shown = []
-    viewer.page.show_frame = shown.append
+    viewer.page.show_frame = lambda frame, client: shown.append((frame, client))
     try:
-        viewer._chosen.put(0)
-        viewer._chosen.put(1)
+        for client, index in ((5, 0), (6, 2), (5, 1)):
+            viewer._chosen.put({client: index})
         viewer.serve(lambda: len(shown) > 0)
-        assert len(shown) == 1
-        np.testing.assert_array_equal(shown[0].T_camera_world, run.poses[1])
-        image = cv2.imread(str(run.folder / "colmap" / "images" / "b.png"))[..., ::-1]
-        np.testing.assert_array_equal(shown[0].picture, image)
+        assert sorted(client for _, client in shown) == [5, 6]
+        for frame, client in shown:
+            index = {5: 1, 6: 2}[client]
+            np.testing.assert_array_equal(frame.T_camera_world, run.poses[index])
+            image = cv2.imread(str(run.folder / "colmap" / "images" / NAMES[index]))[..., ::-1]
+            np.testing.assert_array_equal(frame.picture, image)
+    finally:
+        viewer.close()
+
+
+def test_an_image_that_is_gone_ends_nothing(run: FinishedRun):
+    viewer = FinishedViewer(run, ViewSettings(port=0), "cpu")
+    got: list[np.ndarray] = []
+    viewer.page.show_picture = lambda client, picture: got.append(picture)
+    (run.folder / "colmap" / "images" / "c.png").unlink()
+    try:
+        viewer._chosen.put({5: 2})
+        for mode in ("error", "colour"):
+            looks(viewer, run.poses[2], 96, 64, mode)
+            turns = iter(range(3))
+            viewer.serve(lambda turns=turns: next(turns, None) is None)
+        assert len(got) == 1
     finally:
         viewer.close()
 

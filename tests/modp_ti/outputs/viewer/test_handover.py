@@ -10,8 +10,8 @@ from modp_ti.outputs.viewer.handover import MAX_BROWSERS, BrowserCamera, Gate, L
 from tests.patience import PATIENCE
 
 
-def camera(client: int, x: float = 0.0) -> BrowserCamera:
-    return BrowserCamera(client, np.array([1.0, 0, 0, 0]), np.array([x, 0, 0]), 1.0, 640, 480)
+def camera(client: int, x: float = 0.0, mode: str = "colour") -> BrowserCamera:
+    return BrowserCamera(client, np.array([1.0, 0, 0, 0]), np.array([x, 0, 0]), 1.0, 640, 480, mode)
 
 
 def test_only_the_latest_value_waits():
@@ -92,21 +92,32 @@ def test_a_step_pauses_a_running_map():
 
 
 def test_a_browser_is_served_once_for_each_change_and_only_its_last_view():
-    requests = Requests("colour")
+    requests = Requests()
     assert requests.next() is None
     for x in range(500):
         requests.look(camera(1, x))
     assert requests.next().position[0] == 499
     assert requests.next() is None
     requests.outdate()
-    requests.show("depth")
+    requests.outdate()
     assert requests.next().position[0] == 499
     assert requests.next() is None
-    assert requests.mode == "depth"
+
+
+def test_each_browser_is_served_in_its_own_mode():
+    requests = Requests()
+    requests.look(camera(1, mode="splats"))
+    requests.look(camera(2, mode="depth"))
+    assert requests.shows("splats") and requests.shows("depth") and not requests.shows("colour")
+    assert requests.next(but="splats").mode == "depth"
+    assert requests.next(but="splats") is None
+    requests.look(camera(1, mode="colour"))
+    assert requests.next(but="splats").client == 1
+    assert not requests.shows("splats")
 
 
 def test_browsers_take_turns_and_those_that_left_are_forgotten():
-    requests = Requests("colour")
+    requests = Requests()
     for client in (1, 2, 3):
         requests.look(camera(client))
     first = requests.next().client
@@ -120,7 +131,7 @@ def test_browsers_take_turns_and_those_that_left_are_forgotten():
 
 
 def test_browsers_beyond_the_limit_are_left_out_until_one_goes():
-    requests = Requests("splats")
+    requests = Requests()
     for client in range(MAX_BROWSERS + 5):
         requests.look(camera(client))
     assert len(requests) == MAX_BROWSERS

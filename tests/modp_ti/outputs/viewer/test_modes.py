@@ -14,9 +14,9 @@ from pipelines.render.renderer import RenderedView
 WALL = 4.0  # the plane z = 4 of the world, coloured by where it is
 
 
-def browser(width: int, height: int, fov: float = 1.0, **changes) -> BrowserCamera:
+def browser(width: int, height: int, fov: float = 1.0, mode: str = "colour", **changes) -> BrowserCamera:
     values = {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3), "fov": fov} | changes
-    return BrowserCamera(7, values["wxyz"], values["position"], values["fov"], width, height)
+    return BrowserCamera(7, values["wxyz"], values["position"], values["fov"], width, height, mode)
 
 
 @pytest.mark.parametrize("canvas", [(1920, 1080), (640, 480), (500, 900), (200, 100)])

@@ -6,7 +6,6 @@ import builtins
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from urllib.parse import urlparse
 from urllib.request import urlopen
 
@@ -95,9 +94,9 @@ def test_frustums_have_their_tips_at_the_cameras_and_their_corners_in_the_images
 
 
 def test_scenes_of_any_size_have_one_size_on_the_page(page: Page):
-    page.settle(1e-3, np.eye(4))
+    page.settle(1e-3, np.eye(4), CAMERA)
     assert page.units == pytest.approx(DEPTH_ON_PAGE / 1e-3)
-    page.settle(7.0, np.eye(4))  # once and for all
+    page.settle(7.0, np.eye(4), CAMERA)  # once and for all
     assert page.units == pytest.approx(DEPTH_ON_PAGE / 1e-3)
 
 
@@ -124,22 +123,6 @@ def test_a_browser_that_does_not_listen_neither_blocks_nor_fills_the_memory(page
             page.show_frame(ShownFrame(np.eye(4), CAMERA, np.full((80, 120, 3), i % 256, dtype=np.uint8)))
         grown = resident() - before
         assert grown < 60e6  # of 128 MB that were shown
-
-
-def test_a_browser_has_splats_of_its_own_until_it_leaves(page: Page, monkeypatch: pytest.MonkeyPatch):
-    grey = np.zeros((2, 3), dtype=np.uint8)
-    splats = Splats(np.zeros((2, 3), np.float32), np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)), grey, grey[:, :1], 5)
-    browser = SimpleNamespace(client_id=7, scene=page._server.scene)
-    monkeypatch.setattr(page._server, "get_clients", lambda: {7: browser})
-    page.show_splats(splats, 8)  # one that has left meanwhile
-    assert not page._splats
-    page.show_splats(splats, 7)
-    node = page._splats[7]
-    page.show_splats(splats, 7)
-    assert page._splats == {7: node} and node.visible
-    assert page._note.content == "2 of 5 Gaussians drawn"
-    page._disconnected(browser)
-    assert not page._splats
 
 
 def viser_version() -> str:

@@ -1,0 +1,355 @@
+"""Who comes in at the viewer's port, and what a browser can do to the rest: nothing."""
+
+from __future__ import annotations
+
+import http.client
+import inspect
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+import numpy as np
+import pytest
+import viser
+from viser import _messages
+from viser.infra import _infra
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.sync.client import ClientConnection, connect
+from zstandard import ZstdDecompressor
+
+from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
+from modp_ti.outputs.viewer.handover import Gate
+from modp_ti.outputs.viewer.page import Page
+from modp_ti.outputs.viewer.splats import Splats
+from tests.patience import PATIENCE
+
+CAMERA = PinholeCamera(100.0, 100.0, 60.0, 40.0, 120, 80)
+PROTOCOL = f"viser-v{viser.__version__}"
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    page = Page("127.0.0.1", 0, Gate(), choose=lambda client, frame: None, frames=5)
+    yield page
+    page.close()
+
+
+def get(url: str, **headers: str) -> tuple[int, bytes]:
+    """Status and body of a request with just these headers."""
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection("127.0.0.1", parts.port, timeout=PATIENCE)
+    connection.putrequest("GET", parts.path or "/", skip_host=True, skip_accept_encoding=True)
+    for name, value in ({"Host": f"127.0.0.1:{parts.port}"} | headers).items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+def opened(url: str, **options: Any) -> ClientConnection:
+    given = {"subprotocols": [PROTOCOL], "max_size": None, "compression": None, "open_timeout": PATIENCE} | options
+    return connect(url.replace("http", "ws"), **given)
+
+
+def message(kind: str, **fields: Any) -> bytes:
+    return msgspec.msgpack.encode({"type": kind, **fields})
+
+
+def camera(**changed: Any) -> bytes:
+    place = {"wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 0], "look_at": [0.0, 0, 1], "up_direction": [0.0, -1, 0]}
+    lens = {"fov": 1.0, "near": 0.01, "far": 100.0, "image_height": 480, "image_width": 640}
+    return message("ViewerCameraMessage", **(place | lens | changed))
+
+
+def put(uuid: str, value: Any) -> bytes:
+    return message("GuiUpdateMessage", uuid=uuid, updates={"value": value})
+
+
+def heard(browser: ClientConnection, until: Callable[[dict], bool]) -> dict:
+    """The first message for which `until` holds."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        raw = browser.recv(timeout=PATIENCE)
+        size, packed = (int.from_bytes(raw[at : at + 8], "little") for at in (0, 8))
+        unpacked = ZstdDecompressor().decompress(raw[16 : 16 + packed], max_output_size=size)
+        for found in msgspec.msgpack.decode(unpacked)["messages"]:
+            if until(found):
+                return found
+    raise TimeoutError
+
+
+def entered(page: Page) -> tuple[ClientConnection, dict[str, str]]:
+    """A browser that has said where it looks from, and its controls by label."""
+    browser, controls = opened(page.url), {}
+    browser.send(camera())
+
+    def last(found: dict) -> bool:
+        if "uuid" in found and "label" in found.get("props", {}):
+            controls[found["props"]["label"]] = found["uuid"]
+        return "Link to this view" in controls
+
+    heard(browser, last)
+    end = time.monotonic() + PATIENCE
+    while not len(page.requests):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    return browser, controls
+
+
+def is_alive(page: Page) -> bool:
+    browser, _ = entered(page)
+    browser.close()
+    return get(page.url)[0] == 200
+
+
+def test_viser_is_as_the_door_expects_it():
+    """Where this fails, viser has changed: see whether `Door` still stands in front of all that it serves."""
+    source = inspect.getsource(_infra)
+    assert source.count("websockets.asyncio.server.serve(") == 1 and "create_server" not in source
+    worker = inspect.getsource(_infra.WebsockServer._background_worker)
+    for part in ("process_request=", "ws_handler,", "_live_connections[client_id] = connection"):
+        assert part in worker
+    assert "await websocket.recv()" in inspect.getsource(_infra._message_consumer)
+    used = set(__import__("re").findall(r"\bwebsockets\.(\w+)", worker))
+    assert used <= {"asyncio", "datastructures", "exceptions"}
+    assert {"ShareUrlRequest", "ShareUrlDisconnect"} <= vars(_messages).keys()
+    names = {"type", *inspect.signature(_messages.ViewerCameraMessage).parameters}
+    assert names == msgspec.msgpack.decode(camera()).keys()
+    assert list(inspect.signature(_messages.GuiUpdateMessage).parameters)[:2] == ["uuid", "updates"]
+
+
+def test_a_viser_that_does_not_ask_the_door_is_not_served(monkeypatch: pytest.MonkeyPatch):
+    class Another:
+        def __init__(self, **given: Any) -> None:
+            self.stop = lambda: None
+
+    monkeypatch.setattr(viser, "ViserServer", Another)
+    with pytest.raises(InputError, match="viser"):
+        Page("127.0.0.1", 0)
+
+
+@pytest.mark.parametrize("asked", ["", "/", "/index.html", "/x/", "{token}x/", "/..{token}/", "/{token}"])
+def test_without_the_whole_address_nothing_is_read(page: Page, asked: str):
+    parts = urlsplit(page.url)
+    start, token = f"http://127.0.0.1:{parts.port}", parts.path.rstrip("/")
+    other = start + asked.format(token=token)
+    assert get(page.url)[0] == 200
+    status, body = get(other)
+    assert status == 403 and b"<html" not in body and token.encode() not in body
+    with pytest.raises(InvalidHandshake):
+        opened(other)
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://{host}", "http://{host}.evil"]
+)
+def test_pages_of_other_origins_read_nothing_even_with_the_address(page: Page, origin: str):
+    host = urlsplit(page.url).netloc
+    given = origin.format(host=host)
+    assert get(page.url, Origin=given)[0] == 403
+    with pytest.raises(InvalidHandshake):
+        opened(page.url, origin=given)
+    opened(page.url, origin=f"http://{host}").close()
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example:{port}", "evil.example", "127.0.0.1", "127.0.0.1:1", "10.0.0.1:{port}", ""]
+)
+def test_only_the_served_address_is_a_host(page: Page, host: str):
+    port = urlsplit(page.url).port
+    assert get(page.url, Host=host.format(port=port))[0] == 403
+    assert get(page.url, Host=f"LOCALHOST:{port}")[0] == 200
+
+
+def test_two_pages_have_two_secrets(page: Page):
+    other = Page("127.0.0.1", 0)
+    try:
+        assert get(f"{urlsplit(other.url)._replace(path=urlsplit(page.url).path).geturl()}")[0] == 403
+    finally:
+        other.close()
+
+
+def test_where_no_port_is_left_it_is_said_in_one_line():
+    with socket.create_server(("127.0.0.1", 65535)):
+        with pytest.raises(InputError) as error:
+            Page("127.0.0.1", 65535)
+    assert "\n" not in str(error.value) and "65535" in str(error.value)
+
+
+HOSTILE: dict[str, Callable[[dict[str, str]], bytes | str]] = {
+    "text": lambda c: "hello",
+    "nothing": lambda c: b"",
+    "noise": lambda c: bytes(range(256)) * 8,
+    "no map": lambda c: msgspec.msgpack.encode([1, 2]),
+    "no type": lambda c: msgspec.msgpack.encode({"uuid": "x"}),
+    "type of no kind": lambda c: message([1]),  # pyright: ignore[reportArgumentType]
+    "unknown type": lambda c: message("Nonsense", a=1),
+    "deep": lambda c: b"\x91" * 8000 + b"\xc0",
+    "large": lambda c: camera(padding="x" * 100_000),
+    "huge": lambda c: bytes(60 << 20),
+    "share": lambda c: message("ShareUrlRequest"),
+    "unshare": lambda c: message("ShareUrlDisconnect"),
+    "slider": lambda c: put(c["Frame"], -(10**6)),
+    "slider, text": lambda c: put(c["Frame"], "1"),
+    "slider, not finite": lambda c: put(c["Frame"], float("nan")),
+    "mode": lambda c: put(c["Show"], "nonsense"),
+    "mode, list": lambda c: put(c["Show"], ["splats"]),
+    "box": lambda c: put(c["Keyframes"], "yes"),
+    "another property": lambda c: message("GuiUpdateMessage", uuid=c["Show"], updates={"update_cb": []}),
+    "no such control": lambda c: put("nowhere", 1),
+    "short position": lambda c: camera(position=[0.1, 0]),
+    "position of text": lambda c: camera(position=["a", 0, 0]),
+    "position, not finite": lambda c: camera(position=[float("inf"), 0, 0]),
+    "canvas": lambda c: camera(image_width=1 << 40),
+    "canvas below nothing": lambda c: camera(image_height=-1),
+    "another field": lambda c: camera(owner=3),
+    "upload": lambda c: message(
+        "FileTransferStartUpload",
+        source_component_uuid=c["Frame"],
+        transfer_uuid="a",
+        filename="f",
+        mime_type="t",
+        part_count=10**9,
+        size_bytes=10**12,
+    ),
+    "part": lambda c: message(
+        "FileTransferPart", source_component_uuid=c["Frame"], transfer_uuid="a", part_index=0, content=bytes(15_000)
+    ),
+    "form": lambda c: message("GuiFormDirtyMessage", uuid="x" * 10_000),
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_hostile_message_ends_at_most_its_own_session(page: Page, kind: str, capfd: pytest.CaptureFixture[str]):
+    other, _ = entered(page)
+    browser, controls = entered(page)
+    try:
+        browser.send(HOSTILE[kind](controls))
+        browser.send(camera(position=[0.5, 0, 0]))
+        while True:
+            browser.recv(timeout=0.3)
+    except (ConnectionClosed, TimeoutError):
+        pass
+    browser.close()
+    other.ping().wait(PATIENCE)  # the other browser is still connected
+    other.send(camera(position=[0.25, 0, 0]))
+    other.close()
+    assert is_alive(page)
+    assert capfd.readouterr() == ("", "")
+
+
+def resident() -> int:
+    return 4096 * int(Path("/proc/self/statm").read_text().split()[1])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc")
+def test_no_message_and_no_transfer_fills_the_memory(page: Page):
+    assert is_alive(page)
+    before = resident()
+    for kind in HOSTILE:
+        browser, controls = entered(page)
+        hostile = HOSTILE[kind](controls)
+        try:
+            for _ in range(3 if len(hostile) > 1 << 20 else 300):
+                browser.send(hostile)
+        except ConnectionClosed:
+            pass
+        browser.close()
+    assert is_alive(page)
+    assert resident() - before < 50e6
+
+
+def test_a_fault_of_one_browser_ends_its_session_alone(page: Page):
+    browser, _ = entered(page)
+    (first,) = page._browsers
+    other, _ = entered(page)
+    page.attempt(first, lambda: [][1])
+    with pytest.raises(ConnectionClosed):
+        while True:
+            browser.recv(timeout=PATIENCE)
+    other.ping().wait(PATIENCE)
+    other.close()
+
+
+def test_each_browser_has_its_own_mode_and_frame():
+    chosen: list[tuple[int, int]] = []
+    page = Page("127.0.0.1", 0, choose=lambda *pair: chosen.append(pair), frames=5)
+    try:
+        page.settle(2.0, np.eye(4), CAMERA)
+        grey = np.zeros((2, 3), np.uint8)
+        page.show_splats(Splats(np.zeros((2, 3), np.float32), np.tile(np.eye(3), (2, 1, 1)), grey, grey[:, :1], 2))
+        one, controls = entered(page)
+        other, _ = entered(page)
+        one.send(put(controls["Show"], "depth"))
+        one.send(put(controls["Frame"], 3))
+        end = time.monotonic() + PATIENCE
+        while not (page.requests.shows("depth") and any(frame == 3 for _, frame in chosen)):
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        seen = {}
+        while (request := page.requests.next()) is not None:
+            seen[request.client] = request.mode
+        assert sorted(seen.values()) == ["depth", "splats"]
+        (changed,) = [client for client, mode in seen.items() if mode == "depth"]
+        assert [client for client, frame in chosen if frame == 3] == [changed]
+        # The scale of the depth, of which the other browser hears nothing.
+        scale = heard(one, lambda m: "depth" in str(m.get("updates", {}).get("content")))
+        assert all(number in scale["updates"]["content"] for number in ("0.5", "2", "8"))
+        one.close()
+        other.close()
+    finally:
+        page.close()
+
+
+def test_a_browser_gets_splats_of_its_own(page: Page):
+    browser, _ = entered(page)
+    request = page.requests.next()
+    assert request is not None
+    grey = np.zeros((2, 3), dtype=np.uint8)
+    splats = Splats(np.zeros((2, 3), np.float32), np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)), grey, grey[:, :1], 5)
+    page.show_splats(splats, request.client + 1)  # one that has left meanwhile
+    page.show_splats(splats, request.client)
+    heard(browser, lambda told: told["type"] == "GaussianSplatsMessage")
+    browser.close()
+
+
+def test_the_first_view_is_that_of_the_camera(page: Page):
+    T = np.eye(4)
+    T[:3, 3] = [1.0, 2.0, 3.0]
+    page.settle(2.0, T, CAMERA)
+    browser = opened(page.url)
+    found: dict[str, Any] = {}
+
+    def complete(told: dict) -> bool:
+        if told["type"].startswith("SetCamera"):
+            found[told["type"]] = told
+        return len(found) >= 4
+
+    heard(browser, complete)
+    browser.close()
+    np.testing.assert_allclose(found["SetCameraPositionMessage"]["position"], -T[:3, 3] * page.units)
+    assert found["SetCameraFovMessage"]["fov"] == pytest.approx(2 * np.arctan(0.4))
+
+
+def test_the_browser_that_paused_is_known_until_it_leaves(page: Page):
+    browser, controls = entered(page)
+    other, _ = entered(page)
+    browser.send(put(controls["Pause"], True))
+    gate, end = page._gate, time.monotonic() + PATIENCE
+    assert gate is not None
+    while not gate.paused:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert gate.holder in page.requests
+    browser.close()
+    while gate.holder in page.requests:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert len(page.requests) == 1
+    other.close()
