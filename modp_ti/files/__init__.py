@@ -13,6 +13,7 @@ from modp_ti.files.reading import (
     read_bytes,
     read_text,
     readable,
+    reading,
     text_lines,
 )
 
@@ -28,5 +29,6 @@ __all__ = [
     "read_json",
     "read_text",
     "readable",
+    "reading",
     "text_lines",
 ]
