@@ -23,6 +23,7 @@ from modp_ti.config.unknown_keys import refuse_unknown_keys
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
+from modp_ti.files.terminal import require_text
 from modp_ti.files.yaml_text import parse_yaml
 
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
@@ -105,7 +106,9 @@ def _absolute_path(value: Path, base: Path, name: str) -> Path:
         shown = f"{value}".replace("\0", "")[:40]
         raise InputError(f"{name}: {shown}...: no file can be called that: it is too long, or holds a NUL character")
     try:
-        return (base / value.expanduser()).resolve()
+        path = (base / value.expanduser()).resolve()
+        require_text(os.fspath(path))
+        return path
     except (RuntimeError, OSError) as error:  # no such user (`~name`), or a loop of symbolic links
         raise InputError(f"{name}: {value}: is no path: {error}") from None
 

@@ -10,6 +10,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
+from modp_ti.files.terminal import own_terminal
 from modp_ti.tasks.task import perform
 
 __all__ = ["main"]
@@ -22,6 +23,7 @@ PATIENCE = 30.0
 
 def main() -> None:
     """Serve the parent process; the argument is the descriptor of the pipe to it."""
+    own_terminal()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where a shell started the parent
     connection = Connection(int(sys.argv[1]))
     try:

@@ -18,7 +18,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
 from modp_ti.engine.snapshots.file import read_arrays, write_arrays
 from modp_ti.engine.snapshots.old_versions import convert_version_2, convert_version_3
-from modp_ti.files.errors import InputError
+from modp_ti.files import reading
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
@@ -26,6 +26,7 @@ from pipelines.state import MapState
 
 __all__ = ["Position", "Snapshot", "StreamDigest", "frames_state", "record_state", "version_state"]
 
+AGAIN = "; start the run from its scene"
 UNKNOWN = np.full((3, 4), np.nan)
 # Saved columns of the record's frames and steps. None is saved as NaN.
 FRAME_COLUMNS = {
@@ -121,23 +122,19 @@ class Snapshot:
     def read(cls, path: Path) -> Snapshot:
         """Read a snapshot. Raises InputError with one line if the file cannot be used."""
         arrays, about = read_arrays(path)
-        try:
+        with reading(path, AGAIN):
             if about["version"] == 2:
                 convert_version_2(arrays, about["numbers"])
             if about["version"] <= 3:
                 convert_version_3(arrays, about["numbers"])
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
-        except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise _unfit(path, error) from None
-        return cls(path, settings, position, arrays, numbers)
+            return cls(path, settings, position, arrays, numbers)
 
     @contextmanager
     def fitting(self) -> Iterator[None]:
-        """Convert errors inside this context to a one-line InputError saying that the parts do not fit together."""
-        try:
+        """Report what is raised in this context, where parts do not fit together, as an InputError of one line."""
+        with reading(self.path, AGAIN):
             yield
-        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            raise _unfit(self.path, error) from None
 
     def frames(self, trajectory: Trajectory) -> DeliveredFrames:
         """Return the metadata of the frames, for the map whose trajectory is given.
@@ -183,11 +180,6 @@ class Snapshot:
         record.frames = [FrameNote(*row) for row in zip(*columns.values(), strict=True)]
         record.steps = [StepNote(*row) for row in zip(*(steps[name].tolist() for name in STEP_COLUMNS), strict=True)]
         record.started = float(self.numbers["started"])
-
-
-def _unfit(path: Path, error: Exception) -> InputError:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return InputError(f"{path}: the parts of the snapshot do not fit together ({reason}); start the run from its scene")
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:

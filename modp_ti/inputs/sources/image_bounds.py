@@ -11,6 +11,7 @@ from collections.abc import Callable
 from PIL import BmpImagePlugin, PpmImagePlugin
 from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
 
+from modp_ti.files.errors import InputError
 from modp_ti.files.reading import available_memory
 from modp_ti.inputs.sources.heif import BRANDS, heif_size
 from modp_ti.inputs.sources.image_header import HEADER_ERRORS, JpegHeader, bounded, read_tiff_directory
@@ -22,11 +23,13 @@ MAX_IMAGE_PIXELS = 1 << 27
 
 # Memory per pixel during decoding: up to 16 bits per channel, and the copy in RGB order.
 DECODED_BYTES = 12
+# Memory of an image that any machine decodes: it is the memory that lacks, not the image that is too large.
+ORDINARY = 1 << 28
 # Deflate expands a byte to at most 1032. JPEG spends at least one bit on a block of 64 pixels of the largest channel,
 # whose size is at least a quarter of the image's.
 MOST_INFLATED = 1032
 INFLATED_AT_A_TIME = 1 << 18
-# Pixels of all scans of a progressive JPEG, which usually has about ten of them. A scan costs as much as so many pixels.
+# Pixels of all scans of a progressive JPEG, which usually has about ten of them, and what a scan counts at least.
 MOST_SCANNED, SMALLEST_SCAN, FEW_SCANS = 1 << 31, 1 << 22, 12
 # A marker with a length after it, or the end. Coded bytes have 00 or a restart marker (D0 to D7) after FF.
 JPEG_MARKER = re.compile(rb"\xff([\xc0-\xcf\xd9-\xfe])")
@@ -57,7 +60,13 @@ def why_undecodable(data: bytes) -> str | None:
         return f"its header says {width}x{height} pixels"
     if width * height > MAX_IMAGE_PIXELS:
         return f"its {width}x{height} pixels are more than {MAX_IMAGE_PIXELS:,}"
-    if width * height * DECODED_BYTES > available_memory():
+    needed, left = width * height * DECODED_BYTES, available_memory()
+    if needed > left and needed < ORDINARY:
+        raise InputError(
+            f"an image of {width}x{height} pixels takes {needed >> 20} MB to decode, and this process may have "
+            f"{left >> 20} MB more: end other programs, or raise its limit (ulimit -v)"
+        )
+    if needed > left:
         return f"its {width}x{height} pixels do not fit into this machine's memory"
     if least > len(data):
         return f"the file is cut off: {width}x{height} pixels cannot be in {len(data)} bytes"

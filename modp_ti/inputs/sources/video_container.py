@@ -21,7 +21,7 @@ MATROSKA_SEGMENT = b"\x18S\x80g"
 # Largest number of boxes to visit. A recording has a few at its top level, a fragmented one two per second.
 MAX_BOXES = 1_000_000
 # Further first boxes with which FFmpeg takes a file for one.
-RARE_BOXES = (b"styp", b"sidx", b"moof", b"uuid", b"udta", b"trak", b"junk", b"pict", b"prfl", b"hoov", b"meta", b"emsg")
+RARE_BOXES = (b"styp", b"sidx", b"moof", b"uuid", b"udta", b"trak", b"junk", b"pict", b"prfl", b"hoov", b"meta")
 # Boxes that announce the number of frames, of edits, and a packed index. FFmpeg takes them at any depth.
 INDEX_BOX = re.compile(b"stsz|stz2|trun|elst|cmov")
 # Types of the first box of an MP4 or QuickTime file.
@@ -85,10 +85,7 @@ def end_of_boxes(stream: BinaryIO, size: int) -> int:
     A box starts with 4 bytes of length and 4 of type. Length 1 means that 8 bytes of length follow, 0 that the box
     extends to the end of the file.
     """
-    end = 0
-    for _, end, _ in _boxes(stream, size):
-        pass
-    return end
+    return max((end for _, end, _ in _boxes(stream, size)), default=0)
 
 
 def _boxes(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:

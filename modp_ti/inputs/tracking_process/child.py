@@ -18,6 +18,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
+from modp_ti.files.terminal import own_terminal
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
@@ -44,6 +45,7 @@ REMOVALS = 100
 
 def main() -> None:
     """Serve the parent process, whose descriptors of pipe, ring and board are the arguments."""
+    own_terminal()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent decides what it means
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the end of a stream is told in a note
