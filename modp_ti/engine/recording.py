@@ -25,9 +25,9 @@ from modp_ti.engine.conductor import Conductor, Event
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
-from modp_ti.files import parse_json, reading
 from modp_ti.files.errors import InputError
 from modp_ti.files.limits import BoundedZip, arrays_of
+from modp_ti.files.reading import reading
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.listed_images import decoded_as
@@ -184,7 +184,7 @@ class RecordedSession(Tracker):
             raise InputError(f"{self._path}: there is no recorded session; record one with `export.session: true`")
         with reading(self._path, AGAIN):
             self._zip = BoundedZip(self._path, stored=True)
-            about = parse_json(self._zip.read(ABOUT).decode("utf-8"), f"{self._path}: {ABOUT}")
+            about = json.loads(self._zip.read(ABOUT))
             if about["version"] != VERSION:
                 raise InputError(f"{self._path}: a session of version {about['version']}, this program reads {VERSION}")
             self.settings: dict[str, Any] = dict(about["settings"])

@@ -13,7 +13,6 @@ from modp_ti.files.reading import (
     read_bytes,
     read_text,
     readable,
-    reading,
     text_lines,
 )
 
@@ -29,6 +28,5 @@ __all__ = [
     "read_json",
     "read_text",
     "readable",
-    "reading",
     "text_lines",
 ]

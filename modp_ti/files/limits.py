@@ -90,7 +90,10 @@ def arrays_of(archive: BoundedZip, kinds: str = PLAIN_NUMBERS) -> dict[str, NDAr
         name = info.filename.removesuffix(".npy")
         if name == info.filename or name in found:
             raise ValueError(f"{info.filename} is not an array, or occurs twice")
-        found[name] = array_of(archive.read(info), kinds).copy()
+        try:
+            found[name] = array_of(archive.read(info), kinds).copy()
+        except ValueError as error:
+            raise ValueError(f"{info.filename} {error}") from None
     return found
 
 
@@ -106,13 +109,15 @@ def array_of(data: bytes, kinds: str = PLAIN_NUMBERS) -> NDArray:
     """
     header = NPY_HEADER.match(data)
     if header is None:
-        raise ValueError("it is no array")
+        raise ValueError("holds not plain numbers, or no array")
     try:
         dtype = np.dtype(header[1].decode("ascii"))
     except TypeError:
-        raise ValueError("it is an array of an unknown type") from None
+        raise ValueError("holds an unknown type, not plain numbers") from None
     shape = tuple(int(side) for side in re.findall(rb"\d+", header[3]))
-    if dtype.kind not in kinds or math.prod(shape) * dtype.itemsize != len(data) - header.end():
-        raise ValueError(f"it holds {dtype} of shape {shape}, not plain numbers of that length")
+    if dtype.kind not in kinds:
+        raise ValueError(f"holds {dtype}, not plain numbers")
+    if math.prod(shape) * dtype.itemsize != len(data) - header.end():
+        raise ValueError("does not have the announced length")
     values = np.frombuffer(data, dtype, offset=header.end())
     return values.reshape(shape, order="F" if header[2] == b"True" else "C")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import open_file, parse_json
+from modp_ti.files import open_file
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
 from modp_ti.files.limits import BoundedZip, arrays_of
@@ -48,11 +48,11 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
     try:
         with open_file(path) as file, BoundedZip(file, stored=True) as archive:
             arrays = arrays_of(archive)
-        about = parse_json(bytes(arrays.pop(ABOUT)).decode("utf-8"), f"{path}: {ABOUT}")
+        about = json.loads(bytes(arrays.pop(ABOUT)))
         version = about["version"]
     except OSError as error:
         raise InputError(f"{path}: the snapshot cannot be read: {error.strerror}") from None
-    except (zipfile.BadZipFile, ValueError, KeyError, TypeError) as error:
+    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a snapshot, or a damaged one ({reason}); start the run from its scene") from None
     if version not in range(OLDEST, VERSION + 1):

@@ -10,8 +10,9 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from modp_ti.files import is_file, open_file, readable, reading
+from modp_ti.files import is_file, open_file, readable
 from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.inputs.bags.unpacking import is_packed, limit_unpacking, unpacked
 
 if TYPE_CHECKING:

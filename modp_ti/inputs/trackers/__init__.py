@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from modp_ti.config import tracker_settings as kinds
 from modp_ti.config.capture_settings import CaptureSettings
-from modp_ti.files import reading
+from modp_ti.files.reading import reading
 from modp_ti.inputs.protocol import Progress, Tracker
 
 if TYPE_CHECKING:

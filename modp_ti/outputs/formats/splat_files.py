@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import read_bytes, reading
+from modp_ti.files import read_bytes
 from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.outputs.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from modp_ti.outputs.formats.ksplat import read_ksplat, write_ksplat
 from modp_ti.outputs.formats.sog import read_sog, write_sog

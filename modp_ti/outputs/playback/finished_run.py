@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files import reading
 from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.inputs.sources import NO_DISTORTION
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
