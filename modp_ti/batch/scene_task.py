@@ -37,13 +37,12 @@ def map_scene(settings: dict[str, Any], report: Report) -> dict[str, Any]:
         InputError: If the input cannot be used.
     """
     # Imported here: the command line makes these tasks without loading Taichi.
-    from rich.console import Console
-
     from modp_ti.engine.session import run_scene
     from modp_ti.engine.snapshots import fetch_snapshot
+    from modp_ti.files.terminal import CleanConsole
 
     config = scene_from_data(settings, "the scene")
-    console = Console(stderr=True)
+    console = CleanConsole(stderr=True)
     with sole_use(config.output):
         metrics = finished_metrics(config)
         if metrics is None:

@@ -36,10 +36,9 @@ def check(
     """Look a scene's input over without mapping it. Exit code: 0 fine, 1 with warnings, 2 unusable."""
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for the readers to load.
-        from rich.console import Console
-
         from modp_ti.config.scene_file import load_scene
         from modp_ti.files.run_folder import require_usable
+        from modp_ti.files.terminal import CleanConsole
         from modp_ti.inputs.inspection import report as reports
         from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
         from modp_ti.inputs.scene_paths import refuse_output_in_input
@@ -54,7 +53,7 @@ def check(
         result.code = verdict(report.findings)[1]
         result.data = reports.as_json(report)
         if not as_json:
-            reports.print_report(report, Console())
+            reports.print_report(report, CleanConsole())
 
 
 def inspect_scene(config: SceneConfig, console: Console) -> Report:

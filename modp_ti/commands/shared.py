@@ -18,15 +18,17 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from fields.runtime.engine import EngineError
+from fields.runtime.surroundings import why_too_narrow
 from modp_ti.config.presets import PRESETS
 from modp_ti.files.ending_signals import EndingSignals, exit_code
 from modp_ti.files.errors import InputError
+from modp_ti.files.terminal import own_terminal, shown
 from modp_ti.files.urls import without_secrets
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from modp_ti.outputs.tidy_console import TidyConsole
+    from modp_ti.files.terminal import CleanConsole
 
 __all__ = [
     "BAD_INPUT",
@@ -63,7 +65,7 @@ USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 # Longest error message in characters, since messages may quote the content of a damaged file.
 MAX_MESSAGE = 1000
 
-_consoles: list[TidyConsole] = []  # those of the command that runs
+_consoles: list[CleanConsole] = []  # those of the command that runs
 
 
 class Device(str, Enum):
@@ -153,6 +155,9 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
     outcome is printed as one JSON object, and everything else goes to standard error.
     """
     result, signals = Outcome(), EndingSignals()
+    own_terminal()
+    if as_json and sys.stdout is None:
+        _end(BAD_INPUT, "--json needs standard output, which is closed", as_json=False)
     try:
         with _to_standard_error() if as_json else nullcontext(), _tidy_terminal():
             yield result
@@ -161,15 +166,17 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
     except KeyboardInterrupt as stop:
         _end(exit_code(), str(stop) or "interrupted", as_json)
     except Exception as error:
+        if (narrow := why_too_narrow()) is not None:
+            _end(BAD_INPUT, narrow, as_json)
         sys.stderr.write(without_secrets(traceback.format_exc()))
         what = f"a fault of the program, not of your input; please report what stands above ({error!r})"
         _end(FAULT, without_secrets(what), as_json)
     finally:
         signals.give_back()
     if as_json:
-        typer.echo(json.dumps({"exit_code": result.code, **result.data}, indent=2))
+        _say(json.dumps({"exit_code": result.code, **result.data}, indent=2))
     elif result.text:
-        typer.echo(result.text)
+        _say(shown(result.text))
     if result.code:
         raise typer.Exit(result.code)
 
@@ -205,22 +212,36 @@ def _to_standard_error() -> Iterator[None]:
 
 def one_line(error: object) -> str:
     """Format an error as one line of limited length without control characters."""
-    text = "".join(c if c.isprintable() else "?" for c in " ".join(without_secrets(str(error)).split()))
+    text = shown(" ".join(without_secrets(str(error)).split()))
     return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE // 2]} ... {text[-MAX_MESSAGE // 2 :]}"
 
 
 def _end(code: int, message: str, as_json: bool) -> None:
     typer.echo(f"error: {message}", err=True)
     if as_json:
-        typer.echo(json.dumps({"exit_code": code, "error": message}, indent=2))
+        _say(json.dumps({"exit_code": code, "error": message}, indent=2))
     raise typer.Exit(code) from None
+
+
+def _say(text: str) -> None:
+    """Print a result on standard output. A full disk or a closed pipe there is an error of one line."""
+    try:
+        typer.echo(text)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)  # what is left in the buffer goes there when the interpreter ends
+        os.close(null)
+        typer.echo(f"error: the result cannot be written to standard output: {error.strerror}", err=True)
+        raise typer.Exit(BAD_INPUT) from None
 
 
 def progress_console(quiet: bool) -> Console:
     """A console for progress and notes, on standard error; it prints nothing if `quiet`."""
-    from modp_ti.outputs.tidy_console import TidyConsole
+    from modp_ti.files.terminal import CleanConsole
 
-    console = TidyConsole(stderr=True, quiet=quiet)
+    console = CleanConsole(stderr=True, quiet=quiet)
     _consoles.append(console)
     return console
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
-import math
 import os
-import re
 from collections.abc import Collection, Iterable, Mapping
 from itertools import islice
 from pathlib import Path
@@ -26,7 +24,9 @@ from modp_ti.config.unknown_keys import refuse_unknown_keys
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
+from modp_ti.files.terminal import require_text
 from modp_ti.files.urls import FROM_FILE, shown_url
+from modp_ti.files.yaml_text import parse_yaml
 
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
@@ -65,11 +65,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
         raise InputError(f"{file}: cannot be read as text: {reason}") from None
-    if len(text) > MAX_TEXT:
-        raise InputError(f"{file}: has {len(text):,} characters, which is no scene file: at most {MAX_TEXT:,}")
-
     lines: dict[str, int] = {}
-    data = _parse_yaml(text, str(file), lines)
+    data = parse_yaml(text, str(file), lines)
     if not isinstance(data, dict):
         raise InputError(
             f"{file}: a scene file has keys such as `source:`, `tracker:` and `output:`; this one holds none"
@@ -125,7 +122,9 @@ def _absolute_path(value: Path, base: Path, name: str) -> Path:
         shown = f"{value}".replace("\0", "")[:40]
         raise InputError(f"{name}: {shown}...: no file can be called that: it is too long, or holds a NUL character")
     try:
-        return (base / value.expanduser()).resolve()
+        path = (base / value.expanduser()).resolve()
+        require_text(os.fspath(path))
+        return path
     except (RuntimeError, OSError) as error:  # no such user (`~name`), or a loop of symbolic links
         raise InputError(f"{name}: {value}: is no path: {error}") from None
 
@@ -207,79 +206,8 @@ def _no_such_kind(key: str, error: ErrorDetails) -> str:
     return f"{key}: must be {names} or '{kinds[-1]}', not {as_yaml(given)}{hint}"
 
 
-# Limits of a scene file: characters, YAML events, nesting depth, and characters of an integer.
-MAX_TEXT, MAX_EVENTS, MAX_DEPTH, MAX_DIGITS = 1 << 18, 20_000, 16, 19
 # Limits of common file systems: bytes of a name and of a path.
 MAX_NAME, MAX_PATH = 255, 4095
-
-_INT = re.compile(r"[-+]?[0-9]+")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-
-
-def _parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
-    """Parse YAML 1.2 into plain data: `1e-3` is a number, `no` is text, and duplicate keys are errors.
-
-    `lines` is filled with the line (from 1) of every dotted key.
-    """
-    try:
-        _require_flat(text, name)
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-        return None if node is None else _plain(node, "", name, lines)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        place = f"{name}:{mark.line + 1}" if mark else name
-        raise InputError(f"{place}: not valid YAML: {error.problem or error.context}") from None
-    except yaml.YAMLError as error:
-        raise InputError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
-
-
-def _require_flat(text: str, name: str) -> None:
-    """Raise InputError for YAML that is too deep or too large, before its tree is built.
-
-    Aliases are refused, because a few lines of them can expand to any number of values.
-    """
-    depth = count = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        count += 1
-        line = event.start_mark.line + 1
-        if isinstance(event, yaml.AliasEvent):
-            raise InputError(f"{name}:{line}: an alias (*{event.anchor:.40}) is not taken here: write the value out")
-        if depth > MAX_DEPTH or count > MAX_EVENTS:
-            raise InputError(f"{name}:{line}: deeper or longer than any scene file")
-
-
-def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any:
-    line = node.start_mark.line + 1
-    if isinstance(node, yaml.MappingNode):
-        result: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            key_line = key_node.start_mark.line + 1
-            if not isinstance(key_node, yaml.ScalarNode):
-                raise InputError(f"{name}:{key_line}: a key must be a word")
-            key = str(key_node.value)
-            inner = f"{place}.{key}" if place else key
-            if key in result:
-                raise InputError(f"{name}:{key_line}: `{inner}` stands twice (first in line {lines[inner]})")
-            lines[inner] = key_line
-            result[key] = _plain(value_node, inner, name, lines)
-        return result
-    if isinstance(node, yaml.SequenceNode):
-        return [_plain(item, f"{place}.{i}", name, lines) for i, item in enumerate(node.value)]
-    value = str(node.value)
-    if isinstance(node, yaml.ScalarNode) and node.style is not None:  # quoted or block text
-        return value
-    if value in ("", "~", "null", "Null", "NULL"):
-        return None
-    if value in ("true", "True", "TRUE", "false", "False", "FALSE"):
-        return value[0] in "tT"
-    if _INT.fullmatch(value) and len(value) <= MAX_DIGITS:
-        return int(value)
-    if _FLOAT.fullmatch(value) and math.isfinite(float(value)):
-        return float(value)
-    if _FLOAT.fullmatch(value) or value.lstrip("+-").lower() in (".inf", ".nan"):
-        raise InputError(f"{name}:{line}: {place or 'the value'}: must be a finite number, not {value}")
-    return value
 
 
 def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
@@ -288,7 +216,7 @@ def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) 
     key, origin = key.strip(), f"{OVERRIDE}{key}{equals}{shown_url(text.strip())}"
     if not equals or not key:
         raise InputError(f"{origin}: write it as section.key=value, for example source.scale=0.5")
-    value = _parse_yaml(text, origin, {})
+    value = parse_yaml(text, origin, {})
 
     parts = key.split(".")
     nested: dict[str, Any] = {parts[-1]: value}

@@ -26,7 +26,11 @@ from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.files.errors import InputError
+from modp_ti.files.limits import BoundedZip, arrays_of
+from modp_ti.files.reading import reading
 from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.sources.image_bounds import why_undecodable
+from modp_ti.inputs.sources.listed_images import decoded_as
 from pipelines.pace import Plan, RecordedPace
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings
@@ -37,6 +41,8 @@ FILE = "session.zip"
 # Version of the file. Others are refused.
 VERSION = 2
 ABOUT = "about.json"
+AGAIN = "; record the session again"
+KINDS = "biufU"  # of the arrays: numbers, and names
 # Arrays of a correction, and of its camera where it has one.
 CORRECTION = ("index", "T_camera_world", "ids", "xyz")
 REVISION = ("lookup", "covered")
@@ -177,8 +183,8 @@ class RecordedSession(Tracker):
         self.path = output / FILE
         if not self.path.is_file():
             raise InputError(f"{self.path}: there is no recorded session; record one with `export.session: true`")
-        try:
-            self._zip = zipfile.ZipFile(self.path)
+        with reading(self.path, AGAIN):
+            self._zip = BoundedZip(self.path, stored=True)
             about = json.loads(self._zip.read(ABOUT))
             if about["version"] != VERSION:
                 raise InputError(f"{self.path}: a session of version {about['version']}, this program reads {VERSION}")
@@ -199,8 +205,6 @@ class RecordedSession(Tracker):
                     revision = _correction(arrays).camera
                     self._revisions += [] if revision is None else [revision]
             self.further.append(int(about["further"]))
-        except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, IndexError) as error:
-            raise self._damaged(error) from None
 
     @property
     def notes(self) -> list[str]:
@@ -221,12 +225,10 @@ class RecordedSession(Tracker):
     def events(self) -> Iterator[Event]:
         vignette = None
         for name in self._names:
-            try:
+            with reading(self.path, AGAIN):
                 arrays = self._arrays(name)
                 vignette = arrays.get("vignette", vignette)
                 event = _frame(arrays, vignette) if "image" in arrays else _correction(arrays)
-            except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, cv2.error) as error:
-                raise self._damaged(error) from None
             yield event
 
     def close(self) -> None:
@@ -234,12 +236,8 @@ class RecordedSession(Tracker):
         self._zip.close()
 
     def _arrays(self, name: str) -> dict[str, NDArray]:
-        with np.load(io.BytesIO(self._zip.read(name)), allow_pickle=False) as arrays:
-            return dict(arrays)
-
-    def _damaged(self, error: Exception) -> InputError:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        return InputError(f"{self.path}: not a recorded session, or a damaged one ({reason}); record it again")
+        with BoundedZip(self._zip.read(name), stored=True) as archive:
+            return arrays_of(archive, KINDS)
 
 
 def _numbers(camera: PinholeCamera) -> NDArray[np.float64]:
@@ -252,7 +250,10 @@ def _camera(numbers: NDArray[np.float64]) -> PinholeCamera:
 
 
 def _frame(arrays: dict[str, NDArray], vignette: NDArray[np.float32] | None) -> TrackedFrame:
-    rgba = np.asarray(cv2.imdecode(arrays["image"], cv2.IMREAD_UNCHANGED), dtype=np.uint8)
+    data = arrays["image"].tobytes()
+    rgba = None if why_undecodable(data) else decoded_as(data, cv2.IMREAD_UNCHANGED)
+    if rgba is None or rgba.dtype != np.uint8:
+        raise ValueError("its picture is damaged")
     return TrackedFrame(
         index=int(arrays["index"]),
         timestamp=float(arrays["timestamp"]),

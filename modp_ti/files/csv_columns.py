@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 
 from modp_ti.files import LARGEST, limited_lines, open_file, readable
 from modp_ti.files.errors import InputError
+from modp_ti.files.limits import most_unpacked
 
 __all__ = ["read_csv_blocks"]
 
 BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows and characters of a block, whichever comes first
-# A gzip file may unpack to this many bytes plus this many times its own size. MPS's files unpack to 3 to 10 times.
-UNPACKED_AT_LEAST = 1 << 22
-MOST_SHRUNK = 25
 
 
 def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
@@ -54,16 +52,13 @@ class _Unpacked(gzip.GzipFile):
     def __init__(self, path: Path, stored: BinaryIO) -> None:
         super().__init__(fileobj=stored, mode="rb")
         self._path = path
-        self._left = UNPACKED_AT_LEAST + MOST_SHRUNK * os.fstat(stored.fileno()).st_size
+        self._left = most_unpacked(os.fstat(stored.fileno()).st_size)
 
     def read1(self, size: int = -1) -> bytes:
         data = super().read1(size)
         self._left -= len(data)
         if self._left < 0:
-            raise InputError(
-                f"{self._path}: unpacks to more than {MOST_SHRUNK} times its size, which is no table of numbers; "
-                "copy it again"
-            )
+            raise InputError(f"{self._path}: unpacks to more than a table of numbers would; copy it again")
         return data
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import zipfile
-import zlib
 from abc import ABC, abstractmethod
 from copy import copy
 from pathlib import Path
@@ -12,14 +11,12 @@ from typing import Any
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.json_text import parse_json
+from modp_ti.files.limits import BoundedZip
 from modp_ti.files.reading import is_file, open_file, read_bytes, readable
 
 __all__ = ["Archive", "FileTree", "Folder", "open_tree"]
 
 SETTING = " (source.path)"
-# A member of an archive may unpack to this many bytes, or to this many times its packed size. Pictures and text of
-# numbers stay far below it.
-SMALL, MAX_RATIO = 1 << 20, 100
 
 
 class FileTree(ABC):
@@ -93,12 +90,12 @@ class Archive(FileTree):
         with readable(path, SETTING):
             self._file = open_file(path)
         try:
-            self._zip = zipfile.ZipFile(self._file)
-            infos = self._zip.infolist()
-        except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, UnicodeDecodeError):
+            self._zip = BoundedZip(self._file)
+        except (zipfile.BadZipFile, OSError):
             self._file.close()
             raise InputError(f"{path}: is no zip archive, or is cut off: copy it again{SETTING}") from None
-        members = {info.filename.replace("\\", "/"): info for info in infos if not info.is_dir()}
+        named = (info for info in self._zip.infolist() if info.filename)
+        members = {info.filename.replace("\\", "/"): info for info in named if not info.is_dir()}
         self._members = {name: info for name, info in members.items() if not _is_of_system(name)}
 
     def without_top(self) -> Archive:
@@ -122,12 +119,10 @@ class Archive(FileTree):
         info = self._members.get(name)
         if info is None:
             raise FileNotFoundError(errno.ENOENT, "it is not in the archive")
-        if info.file_size > max(SMALL, MAX_RATIO * info.compress_size):
-            raise OSError(errno.EFBIG, f"it claims to unpack to {info.file_size >> 20} MiB")
         try:
             return self._zip.read(info)
-        except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError):
-            raise OSError(errno.EIO, "it is damaged, encrypted or packed in an unknown way") from None
+        except zipfile.BadZipFile as error:
+            raise OSError(errno.EIO, str(error)) from None
 
     def close(self) -> None:
         self._zip.close()

@@ -9,6 +9,7 @@ import errno
 import io
 import os
 import stat
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +29,7 @@ __all__ = [
     "read_bytes",
     "read_text",
     "readable",
+    "reading",
     "text_lines",
 ]
 
@@ -73,6 +75,29 @@ def readable(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
         raise InputError(f"{path}: cannot be read as text: it holds bytes that are no text{hint}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}{hint}") from None
+
+
+@contextmanager
+def reading(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
+    """Report whatever a reader raises within the block as an InputError that names the file.
+
+    It stands at the borders where a stranger's file is read, so that no damage leads to a traceback. The message names
+    the exception and its place, so that a fault of a reader is seen as one.
+
+    Args:
+        path: The file.
+        hint: End of the message.
+    """
+    try:
+        yield
+    except (InputError, ImportError):
+        raise
+    except MemoryError:
+        raise InputError(f"{path}: takes more memory than there is{hint}") from None
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        reason = f"{type(error).__name__} in {os.path.basename(place.filename)}:{place.lineno}: {str(error)[:150]}"
+        raise InputError(f"{path}: is damaged, or of a form that is not known ({reason}){hint}") from error
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:

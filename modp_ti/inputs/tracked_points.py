@@ -132,7 +132,7 @@ class TrackedPoints:
             ValueError: If an array has the wrong shape or contains invalid indices.
         """
         count, frames = len(state["ids"]), len(held_out)
-        shapes = {"xyz": (count, 3), "colours": (count, 4), "last": (count, 1), "counts": (frames,)}
+        shapes = {"ids": (count,), "xyz": (count, 3), "colours": (count, 4), "last": (count, 1), "counts": (frames,)}
         seen = int(state["counts"].sum())
         for name, shape in (shapes | {"rows": (seen,), "pixels": (seen, 2)}).items():
             if state[name].shape != shape:

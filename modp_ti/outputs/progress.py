@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from modp_ti.files.urls import without_secrets
 from modp_ti.outputs.time_left import RECENT, TimeLeft, duration
@@ -73,7 +74,7 @@ class ProgressLine:
         """Show a status message while work of unknown length is in progress."""
         if self._watch is not None:
             self._watch(StageProgress(what))
-        with self.console.status(what):
+        with self.console.status(Text(what)):
             yield
 
     def note(self, text: str) -> None:
@@ -130,11 +131,11 @@ class ProgressLine:
         self._state = ""
         self._logged = time.monotonic()
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=8),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[state]}{task.fields[left]}"),
+            TextColumn("{task.fields[state]}{task.fields[left]}", markup=False),
             console=self.console,
         )
         self._progress.add_task(what, total=total, completed=done, state="", left="")

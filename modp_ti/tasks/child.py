@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from modp_ti.files.ending_signals import left_to_parent
+from modp_ti.files.terminal import own_terminal
 from modp_ti.tasks.task import perform
 
 __all__ = ["main"]
@@ -25,6 +26,7 @@ def main() -> None:
     """Serve the parent process; the argument is the descriptor of the pipe to it."""
     left_to_parent()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # by which `_listen` passes on that the parent stops
+    own_terminal()
     connection = Connection(int(sys.argv[1]))
     try:
         work = connection.recv()

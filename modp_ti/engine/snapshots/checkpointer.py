@@ -130,9 +130,9 @@ class Checkpointer:
         with snapshot.fitting():
             self.online = snapshot.online()
             self.refined = snapshot.position.refined
-            self.resumed = int(snapshot.numbers["resumed"]) + 1
-            self.written = int(snapshot.numbers["written"])
-            self._clock.resume(float(snapshot.numbers["total"]), float(snapshot.numbers["mapping"]))
+            self.resumed = int(snapshot.number("resumed")) + 1
+            self.written = int(snapshot.number("written"))
+            self._clock.resume(snapshot.number("total"), snapshot.number("mapping"))
             snapshot.record(self._record)
 
     def _snapshot(self, position: Position) -> Snapshot:

@@ -1,15 +1,11 @@
 """The snapshot file: an uncompressed .npz of plain arrays, one of which holds JSON. It contains no executable code.
 
-The reader does not use `numpy.load`, because the file may be damaged or hostile. Before it allocates an array, it
-checks that the entry is stored uncompressed and has the length that its header states.
+The reader does not use `numpy.load`, because the file may be damaged or hostile (`modp_ti.files.limits`).
 """
 
 from __future__ import annotations
 
-import io
 import json
-import math
-import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.files import open_file
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
+from modp_ti.files.limits import BoundedZip, arrays_of
 from modp_ti.version import __version__
 
 __all__ = ["FILE", "VERSION", "of_another_program", "read_arrays", "write_arrays"]
@@ -28,7 +26,6 @@ FILE = "snapshot.npz"
 # Version of the arrays and the JSON. Others are refused, as they hold the state of different code.
 VERSION = 4
 ABOUT = "about"
-KINDS = "biuf"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) -> None:
@@ -48,14 +45,13 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
         InputError: If the file is missing, damaged, not a snapshot, or of another version. The message has one line.
     """
     try:
-        size = os.path.getsize(path)
-        with zipfile.ZipFile(path) as archive:
-            arrays = {name: _array(archive, info, size) for name, info in _members(archive, size).items()}
+        with open_file(path) as file, BoundedZip(file, stored=True) as archive:
+            arrays = arrays_of(archive)
         about = json.loads(bytes(arrays.pop(ABOUT)))
         version = about["version"]
     except OSError as error:
         raise InputError(f"{path}: the snapshot cannot be read: {error.strerror}") from None
-    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a snapshot, or a damaged one ({reason}); start the run from its scene") from None
     if version != VERSION:
@@ -70,31 +66,3 @@ def of_another_program(path: Path, program: object, difference: str) -> InputErr
         f"{path}: {wrote} has written this snapshot, and MODP-Ti {__version__} cannot resume it ({difference}); "
         "resume with that version, or start the run from its scene"
     )
-
-
-def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
-    members = {}
-    total = 0
-    for info in archive.infolist():
-        total += info.file_size
-        if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size or total > size:
-            raise ValueError(f"{info.filename} is compressed, or longer than the file")
-        if not info.filename.endswith(".npy") or info.filename[:-4] in members:
-            raise ValueError(f"{info.filename} is not an array, or occurs twice")
-        members[info.filename[:-4]] = info
-    return members
-
-
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int) -> NDArray:
-    data = archive.read(info)  # at most the file's size; zipfile verifies the CRC
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):
-        raise ValueError(f"{info.filename} is an array of format {version}")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype.kind not in KINDS or fortran or dtype.hasobject or any(side < 0 for side in shape):
-        raise ValueError(f"{info.filename} holds {dtype}, not plain numbers")
-    start = stream.tell()
-    if math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise ValueError(f"{info.filename} does not have the announced length")
-    return np.frombuffer(data, dtype=dtype, offset=start).reshape(shape).copy()

@@ -158,7 +158,7 @@ def replay(
 
     with snapshot.fitting():
         mapper.restore(snapshot.map, snapshot.frames(mapper.pipeline.trajectory), frames(), position.finished)
-        mapper.pipeline.stopwatch.seconds |= snapshot.numbers["watch"]
+        mapper.pipeline.stopwatch.seconds |= {key: snapshot.number("watch", key) for key in snapshot.numbers["watch"]}
     if digest.value != position.digest:
         raise _changed(snapshot, "images, poses or points have changed")
 

@@ -6,6 +6,8 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
 from modp_ti.engine.snapshots.file import read_arrays, write_arrays
-from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
@@ -26,6 +28,7 @@ from pipelines.state import MapState
 
 __all__ = ["Position", "Snapshot", "StreamDigest", "frames_state", "record_state", "version_state"]
 
+AGAIN = "; the parts of the snapshot do not fit together: start the run from its scene"
 UNKNOWN = np.full((3, 4), np.nan)
 # Saved columns of the record's frames and steps. None is saved as NaN.
 FRAME_COLUMNS = {
@@ -138,19 +141,22 @@ class Snapshot:
     def read(cls, path: Path) -> Snapshot:
         """Read a snapshot. Raises InputError with one line if the file cannot be used."""
         arrays, about = read_arrays(path)
-        try:
+        with reading(path, AGAIN):
             position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
-        except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise _unfit(path, error) from None
-        return cls(path, settings, position, arrays, numbers, about.get("program"))
+            return cls(path, settings, position, arrays, numbers, about.get("program"))
 
     @contextmanager
     def fitting(self) -> Iterator[None]:
-        """Convert errors inside this context to a one-line InputError saying that the parts do not fit together."""
-        try:
+        """Report what is raised in this context, where parts do not fit together, as an InputError of one line."""
+        with reading(self.path, AGAIN):
             yield
-        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            raise _unfit(self.path, error) from None
+
+    def number(self, *keys: str) -> float:
+        """Return a count or a number of seconds. Raises ValueError, TypeError or KeyError if it is neither."""
+        number = float(reduce(getitem, keys, self.numbers))
+        if not 0.0 <= number < 1e11:
+            raise ValueError(f"{keys[-1]}: {number} is no time and no count")
+        return number
 
     def frames(self, trajectory: Trajectory) -> DeliveredFrames:
         """Return the metadata of the frames, for the map whose trajectory is given.
@@ -160,6 +166,8 @@ class Snapshot:
         """
         state = MapState(self.arrays, self.numbers["frames"])
         rows, points = state.group("frames"), state.group("points")
+        if not all(isinstance(name, str) for name in state.numbers["name"]) or not np.isfinite(rows["camera"]).all():
+            raise ValueError("a frame's name is no text, or its camera no camera")
         frames = DeliveredFrames(
             index=rows["index"].tolist(),
             name=list(state.numbers["name"]),
@@ -170,12 +178,20 @@ class Snapshot:
             ],
             held_out=rows["held_out"].tolist(),
             trajectory=trajectory,
-            corrections=dict(state.numbers["corrections"]),
+            corrections={name: int(state.numbers["corrections"][name]) for name in ("received", "moved")},
         )
         frames.points.restore(points, frames.held_out)
         if {len(part) for part in (frames.name, frames.timestamp, frames.camera)} != {len(frames)}:
             raise ValueError("the frames' names, times and cameras differ in number")
+        self._require_like(frames_state(frames))
         return frames
+
+    def _require_like(self, again: MapState) -> None:
+        """Raise ValueError unless the arrays have the form in which the restored objects are written again."""
+        for name, array in again.arrays.items():
+            stored = self.arrays[name]
+            if stored.shape != array.shape or (stored.dtype.kind in "iu") != (array.dtype.kind in "iu"):
+                raise ValueError(f"{name} is {stored.dtype} of shape {stored.shape}, not {array.dtype} {array.shape}")
 
     def online(self) -> MapVersion | None:
         """Return the map before refinement, or None if refinement had not begun."""
@@ -184,7 +200,16 @@ class Snapshot:
         if not gaussians:
             return None
         exposures = [None if np.isnan(row).all() else row for row in poses["exposure"]]
-        return MapVersion(gaussians, list(poses["T"]), exposures, int(state.numbers["view_renders"]))
+        version = MapVersion(gaussians, list(poses["T"]), exposures, int(state.numbers["view_renders"]))
+        self._require_like(version_state(version))
+        count, frames = len(gaussians["position"]), len(self.arrays["frames.index"])
+        forms = {"position": (3,), "log_scale": (3,), "quaternion": (4,), "opacity_logit": ()}
+        forms["sh"] = (*gaussians["sh"].shape[1:2], 3)
+        if {len(poses["T"]), len(exposures)} != {frames} or any(
+            gaussians[name].shape != (count, *form) for name, form in forms.items()
+        ):
+            raise ValueError("the map before refinement has another number of frames, or incomplete Gaussians")
+        return version
 
     def record(self, record: RunRecord) -> None:
         """Copy the saved notes into a new record."""
@@ -195,12 +220,8 @@ class Snapshot:
             columns[name] = [None if np.isnan(value) else value for value in columns[name]]
         record.frames = [FrameNote(*row) for row in zip(*columns.values(), strict=True)]
         record.steps = [StepNote(*row) for row in zip(*(steps[name].tolist() for name in STEP_COLUMNS), strict=True)]
-        record.started = float(self.numbers["started"])
-
-
-def _unfit(path: Path, error: Exception) -> InputError:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return InputError(f"{path}: the parts of the snapshot do not fit together ({reason}); start the run from its scene")
+        record.started = self.number("started")
+        self._require_like(record_state(record))
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:

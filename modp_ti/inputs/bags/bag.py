@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from modp_ti.files import is_file, open_file, readable
 from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.inputs.bags.unpacking import is_packed, limit_unpacking, unpacked
 
 if TYPE_CHECKING:
@@ -200,13 +201,8 @@ class Bag:
     @contextmanager
     def _damaged(self, file: Path) -> Iterator[None]:
         """Report what `rosbags` raises as an InputError. It checks little, so that damaged files can raise anything."""
-        try:
+        with reading(file, "; copy the bag again (source.path)"):
             yield
-        except InputError:
-            raise
-        except Exception as error:
-            reason = " ".join(str(error).split())[:150] or type(error).__name__
-            raise InputError(f"{file}: is no bag of ROS, or is damaged: {reason} (source.path)") from None
 
 
 class _SafePath(type(Path())):

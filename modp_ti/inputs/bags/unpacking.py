@@ -6,10 +6,11 @@ import bz2
 import sys
 from typing import Any
 
+from modp_ti.files.limits import most_unpacked
+
 __all__ = ["is_packed", "limit_unpacking", "unpacked"]
 
-# A chunk may unpack to this many bytes, or to this many times its packed size.
-SMALL, MAX_RATIO = 6 << 20, 100
+MAX_RATIO = 100  # of a chunk, which may hold dark images
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -36,7 +37,7 @@ def limit_unpacking() -> None:
 
 
 def _bounded(decompressor: Any, data: bytes) -> bytes:
-    result = decompressor.decompress(data, max(SMALL, MAX_RATIO * len(data)))
+    result = decompressor.decompress(data, most_unpacked(len(data), MAX_RATIO))
     if not decompressor.eof:
         raise ValueError(f"a chunk is cut off, or unpacks to more than {len(result)} bytes")
     return result

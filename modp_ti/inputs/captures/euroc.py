@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fields.geometry.se3 import inverse_se3
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.files.reading import readable
 from modp_ti.files.trajectory import poses_of_quaternions
+from modp_ti.files.yaml_text import parse_yaml
 from modp_ti.inputs.association import associate
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame, checked_numbers, opencv_pose, plausible_camera
 from modp_ti.inputs.captures.tables import read_lines, read_numbers
@@ -22,8 +22,6 @@ __all__ = ["is_euroc", "read_euroc"]
 LISTING, SENSOR, TRUTH = "cam0/data.csv", "cam0/sensor.yaml", "state_groundtruth_estimate0/data.csv"
 MAX_DIFFERENCE = 0.01  # [s] between an image and its pose; the truth has 200 poses a second
 NANOSECOND = 1e-9
-# Bounds on the file of the camera, which has some 40 lines: characters, and lists that could be nested.
-LONGEST_SENSOR, MOST_LISTS = 1 << 14, 64
 
 
 def is_euroc(tree: FileTree) -> bool:
@@ -78,12 +76,8 @@ def _sensor(tree: FileTree, name: str) -> dict[str, Any]:
     """Read the camera's YAML. Some have OpenCV's first line and tags, which are not those of YAML."""
     with readable(tree.path / name, " (source.path)"):
         text = tree.read(name).decode("utf-8-sig")
-    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
-    try:
-        large = len(text) > LONGEST_SENSOR or text.count("[") + text.count("{") > MOST_LISTS
-        data = None if large else yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
-    except (yaml.YAMLError, ValueError, RecursionError):
-        data = None
+    plain = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
+    data = parse_yaml(plain.replace("!!opencv-matrix", ""), str(tree.path / name), {})
     if not isinstance(data, dict):
         raise InputError(f"{tree.path / name}: is no YAML of a camera; copy it again")
     return data

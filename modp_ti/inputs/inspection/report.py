@@ -102,7 +102,7 @@ def print_report(report: Report, console: Console) -> None:
         console.print(_overview(data))
         console.print(_conventions(data))
     for finding in report.findings:
-        console.print(f"{SIGNS[finding.severity]}: ", end="", highlight=False)
+        console.print(f"{SIGNS[finding.severity]}: ", end="", highlight=False, markup=True)
         console.print(finding.text, highlight=False, soft_wrap=True, markup=False)
         if finding.mend:
             console.print(f"    -> {finding.mend}", highlight=False, soft_wrap=True, markup=False)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from PIL import BmpImagePlugin, PpmImagePlugin
 from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
 
+from modp_ti.files.errors import InputError
 from modp_ti.files.reading import available_memory
 from modp_ti.inputs.sources.heif import BRANDS, heif_size
 from modp_ti.inputs.sources.image_header import HEADER_ERRORS, JpegHeader, bounded, read_tiff_directory
@@ -22,10 +23,16 @@ MAX_IMAGE_PIXELS = 1 << 27
 
 # Memory per pixel during decoding: up to 16 bits per channel, and the copy in RGB order.
 DECODED_BYTES = 12
+# Memory of an image that any machine decodes: it is the memory that lacks, not the image that is too large.
+ORDINARY = 1 << 28
 # Deflate expands a byte to at most 1032. JPEG spends at least one bit on a block of 64 pixels of the largest channel,
 # whose size is at least a quarter of the image's.
 MOST_INFLATED = 1032
 INFLATED_AT_A_TIME = 1 << 18
+# Pixels of all scans of a progressive JPEG, which usually has about ten of them, and what a scan counts at least.
+MOST_SCANNED, SMALLEST_SCAN, FEW_SCANS = 1 << 31, 1 << 22, 12
+# A marker with a length after it, or the end. Coded bytes have 00 or a restart marker (D0 to D7) after FF.
+JPEG_MARKER = re.compile(rb"\xff([\xc0-\xcf\xd9-\xfe])")
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
 MOST_JPEG_PIXELS = 2048  # per byte
 # Smallest number of bits per pixel of the PNM formats: text has a digit and a separator per value, except in bitmaps.
@@ -53,12 +60,20 @@ def why_undecodable(data: bytes) -> str | None:
         return f"its header says {width}x{height} pixels"
     if width * height > MAX_IMAGE_PIXELS:
         return f"its {width}x{height} pixels are more than {MAX_IMAGE_PIXELS:,}"
-    if width * height * DECODED_BYTES > available_memory():
+    needed, left = width * height * DECODED_BYTES, available_memory()
+    if needed > left and needed < ORDINARY:
+        raise InputError(
+            f"an image of {width}x{height} pixels takes {needed >> 20} MB to decode, and this process may have "
+            f"{left >> 20} MB more: end other programs, or raise its limit (ulimit -v)"
+        )
+    if needed > left:
         return f"its {width}x{height} pixels do not fit into this machine's memory"
     if least > len(data):
         return f"the file is cut off: {width}x{height} pixels cannot be in {len(data)} bytes"
     if read is _png and not _inflates(data):
         return "its pixels are damaged or missing"
+    if read is _jpeg and (scans := _scans(data)) * max(width * height, SMALLEST_SCAN) > MOST_SCANNED:
+        return f"its {width}x{height} pixels are in {scans} scans"
     return None
 
 
@@ -94,6 +109,21 @@ def _inflates(data: bytes) -> bool:
 def _jpeg(data: bytes) -> Claim:
     width, height = JpegHeader(bounded(io.BytesIO(data))).size
     return width, height, width * height // MOST_JPEG_PIXELS
+
+
+def _scans(data: bytes) -> int:
+    """Return the number of scans of a JPEG. The decoder goes over all pixels for each, however few bytes it has."""
+    scans, at = data.count(b"\xff\xda"), 2
+    if scans <= FEW_SCANS:
+        return scans
+    scans = 0  # count again without what metadata and appended data hold
+    while marker := JPEG_MARKER.search(data, at):
+        kind, at = marker[1][0], marker.end()
+        if kind == 0xD9:  # the end of the image
+            break
+        scans += kind == 0xDA
+        at += int.from_bytes(data[at : at + 2], "big")
+    return scans
 
 
 def _bmp(data: bytes) -> Claim:

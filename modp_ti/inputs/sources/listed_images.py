@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import UnreadableImageError
+from modp_ti.files.terminal import quiet_libraries
 from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced, used_bits
 from modp_ti.inputs.sources.heif import decoded_heif, is_heif
 from modp_ti.inputs.sources.image_bounds import why_undecodable
@@ -213,11 +214,12 @@ def decoded_as(data: bytes, flags: int) -> NDArray | None:
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Silence OpenCV on the terminal within the block. Errors are reported by the caller."""
+    """Silence OpenCV and its libraries on the terminal within the block. Errors are reported by the caller."""
     import cv2
 
     log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        yield
+        with quiet_libraries():
+            yield
     finally:
         cv2.utils.logging.setLogLevel(log_level)

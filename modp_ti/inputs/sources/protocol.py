@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
+from modp_ti.files.terminal import require_text
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 
@@ -62,6 +63,7 @@ class ImageSource(ABC):
 
     def _append(self, name: str, time: float) -> None:
         """Add an image and the time at which it was taken [s]. Live sources do so while they run."""
+        require_text(name)
         self._times.append(float(time))
         self._position[name] = len(self._names)
         self._names.append(name)

@@ -16,7 +16,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.orientation import AS_STORED
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.tone_mapping import PEAK, WHITE
-from modp_ti.inputs.sources.video_container import missing_bytes
+from modp_ti.inputs.sources.video_container import missing_bytes, require_true_index
 
 if TYPE_CHECKING:
     from modp_ti.inputs.sources.video_decoder import VideoDecoder
@@ -64,6 +64,7 @@ class VideoFile(ImageSource):
             raise InputError(f"{self.path}: a video must be a file, this is a folder or a pipe (source.kind)")
         try:
             missing = missing_bytes(self.path)
+            require_true_index(self.path)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be opened: {error.strerror}") from None
         self._lock = Lock()

@@ -16,6 +16,7 @@ from fields.runtime.disk_room import has_room
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader
+from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.listed_images import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -139,6 +140,8 @@ class Spool(ImageSource):
                 f"{what}: its image is {header.width}x{header.height}, HELLO says {width}x{height}",
                 frame.number,
             )
+        if self._encoding is Encoding.JPEG and (reason := why_undecodable(frame.image)) is not None:
+            raise UnfitError(f"{what}: {reason}", frame.number)
 
     def find(self, name: str) -> str | None:
         return name if name in self._position else None

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from modp_ti.config import tracker_settings as kinds
 from modp_ti.config.capture_settings import CaptureSettings
+from modp_ti.files.reading import reading
 from modp_ti.inputs.protocol import Progress, Tracker
 
 if TYPE_CHECKING:
@@ -32,7 +33,9 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         for frame in modp_ti.open_tracker(modp_ti.load_scene("scene.yaml")):
             print(frame.name, len(frame.points))
     """
-    tracker = _opened(config, progress)
+    of_tracker = dict(config.tracker).get("path")
+    with reading(of_tracker or config.source.path or "source.stream"):
+        tracker = _opened(config, progress)
     if config.source.part is None:
         return tracker
     from modp_ti.inputs.replay import ReplayedTracker

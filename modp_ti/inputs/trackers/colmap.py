@@ -117,9 +117,9 @@ def _observed_points(
     observed = image.get_observation_points2D()
     if not observed:
         return SparsePoints()
-    ids = np.array([point.point3D_id for point in observed], dtype=np.int64)
-    if not all(int(i) in positions for i in ids):
+    if not all(point.point3D_id in positions for point in observed):
         raise InputError(f"{folder}: points3D is incomplete: image {image.name} observes points that it lacks")
+    ids = np.array([point.point3D_id for point in observed], dtype=np.int64)
     # A track may have two observations in one image. The first one is used.
     ids, first = np.unique(ids, return_index=True)
     pixels = np.array([point.xy for point in observed])[first]

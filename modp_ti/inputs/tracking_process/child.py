@@ -16,6 +16,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.ending_signals import left_to_parent
 from modp_ti.files.errors import InputError
+from modp_ti.files.terminal import own_terminal
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
@@ -41,6 +42,7 @@ GLANCE = 0.05
 def main() -> None:
     """Serve the parent process, whose descriptors of pipe, ring and board are the arguments."""
     left_to_parent()
+    own_terminal()
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the end of a stream is told in a note
     pipe, ring, board = (int(argument) for argument in sys.argv[1:4])

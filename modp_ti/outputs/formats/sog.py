@@ -18,7 +18,6 @@ import io
 import json
 import os
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.atomic import replace_file
-from modp_ti.files.errors import InputError
+from modp_ti.files.json_text import parse_json
+from modp_ti.files.limits import BoundedZip, most_unpacked
+from modp_ti.files.reading import reading
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.outputs.formats.splat_packing import (
     logits,
@@ -51,11 +52,8 @@ ENTRIES_PER_ROW = 64
 BLOCK = 4096
 # Largest meta.json that is read [bytes].
 MOST_TEXT = 1 << 20
-# What the archive, the images and their numbers raise where they are damaged.
-ERRORS = (
-    *(zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError),
-    *(LookupError, ValueError, TypeError, AttributeError, ArithmeticError),
-)
+# Bytes of a Gaussian in the images. Most pixels of an image beyond twice those that are used, and of a palette.
+SPLAT, SPARE, MOST_PALETTE = 20, 1 << 12, 1 << 20
 
 
 def write_sog(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
@@ -148,49 +146,55 @@ def read_sog(data: bytes, path: Path) -> dict[str, NDArray]:
     Raises:
         InputError: If the file is damaged or of another version.
     """
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if archive.getinfo("meta.json").file_size > MOST_TEXT:
-                raise ValueError("a large meta.json")
-            return _read(archive, json.loads(archive.read("meta.json")))
-    except ERRORS:
-        raise InputError(f"{path}: not a .sog file of version 2, or a damaged one") from None
+    with reading(path, "; a .sog file of version 2 is wanted"), BoundedZip(data) as archive:
+        if archive.getinfo("meta.json").file_size > MOST_TEXT:
+            raise ValueError("a large meta.json")
+        meta = parse_json(archive.read("meta.json").decode("utf-8"), f"{path}: meta.json")
+        count = meta["count"]
+        if meta["version"] != 2 or not isinstance(count, int) or count < 1:
+            raise ValueError("another version")
+        if count * SPLAT > most_unpacked(len(data)):
+            raise ValueError(f"{count} splats in {len(data)} bytes")
+        return _read(archive, meta, count)
 
 
-def _read(archive: zipfile.ZipFile, meta: dict[str, Any]) -> dict[str, NDArray]:
-    count = meta["count"]
-    if meta["version"] != 2 or not isinstance(count, int) or count < 1:
-        raise ValueError("another version")
+def _read(archive: BoundedZip, meta: dict[str, Any], count: int) -> dict[str, NDArray]:
     means, harmonics = meta["means"], meta.get("shN")
     low, high = (np.array(means[bound], np.float64).reshape(3) for bound in ("mins", "maxs"))
     files = means["files"]
-    steps = _pixels(archive, files[0])[:count, :3] + 256.0 * _pixels(archive, files[1])[:count, :3]
+    steps = _pixels(archive, files[0], count)[:, :3] + 256.0 * _pixels(archive, files[1], count)[:, :3]
     place = low + steps / 65535.0 * (high - low)
-    quats = _pixels(archive, meta["quats"]["files"][0])[:count]
-    constant = _pixels(archive, meta["sh0"]["files"][0])[:count]
-    sh = np.array(meta["sh0"]["codebook"], np.float64)[constant[:, :3]][:, None]
+    quats = _pixels(archive, meta["quats"]["files"][0], count)
+    constant = _pixels(archive, meta["sh0"]["files"][0], count)
+    sh = _codes(meta["sh0"])[constant[:, :3]][:, None]
     if harmonics is not None:
         coefficients = {1: 3, 2: 8, 3: 15}[harmonics["bands"]]
-        entries = np.array(harmonics["codebook"], np.float64)[_pixels(archive, harmonics["files"][0])[:, :3]]
-        labels = _pixels(archive, harmonics["files"][1])[:count].astype(np.int64)
+        entries = _codes(harmonics)[_pixels(archive, harmonics["files"][0])[:, :3]]
+        labels = _pixels(archive, harmonics["files"][1], count).astype(np.int64)
         rest = entries.reshape(-1, coefficients, 3)[labels[:, 0] + 256 * labels[:, 1]]
         sh = np.concatenate([sh, rest], axis=1)
     largest = quats[:, 3].astype(np.int64) - 252
-    if not len(steps) == len(quats) == len(constant) == count or largest.min() < 0:
-        raise ValueError("images of different sizes")
+    if largest.min() < 0:
+        raise ValueError("rotations of another form")
     return {
         "position": np.sign(place) * np.expm1(np.abs(place)),
-        "log_scale": np.array(meta["scales"]["codebook"], np.float64)[
-            _pixels(archive, meta["scales"]["files"][0])[:count, :3]
-        ],
+        "log_scale": _codes(meta["scales"])[_pixels(archive, meta["scales"]["files"][0], count)[:, :3]],
         "quaternion": with_largest(largest, (quats[:, :3] / 255.0 * 2.0 - 1.0) * np.sqrt(0.5)),
         "opacity_logit": logits(constant[:, 3] / 255.0),
         "sh": sh,
     }
 
 
-def _pixels(archive: zipfile.ZipFile, name: str) -> NDArray[np.uint8]:
-    """Return the pixels (N, 4) of an image in the archive, row by row."""
+def _codes(part: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the codebook (256,) of a part. Raises ValueError unless it holds so many finite numbers."""
+    codes = np.array(part["codebook"] if len(part["codebook"]) == CODES else np.nan)
+    if codes.shape != (CODES,) or codes.dtype.kind not in "if" or not np.isfinite(codes).all():
+        raise ValueError(f"a codebook of other than {CODES} finite numbers")
+    return codes.astype(np.float64)
+
+
+def _pixels(archive: BoundedZip, name: str, count: int | None = None) -> NDArray[np.uint8]:
+    """Return the first `count` pixels (count, 4) of an image in the archive, row by row; all of a palette's if None."""
     from PIL import Image
 
     # Images hardly shrink further in an archive.
@@ -201,7 +205,9 @@ def _pixels(archive: zipfile.ZipFile, name: str) -> NDArray[np.uint8]:
     if why_undecodable(data) is not None:
         raise ValueError("an image of a wrong size")
     with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-        return np.asarray(image.convert("RGBA")).reshape(-1, 4)
+        if not (count or 0) <= image.width * image.height <= (MOST_PALETTE if count is None else 2 * count + SPARE):
+            raise ValueError(f"an image of {image.width}x{image.height} pixels, which is too small or too large")
+        return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
 
 
 def codebook(values: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

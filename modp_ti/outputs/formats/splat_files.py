@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files import read_bytes
 from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.outputs.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from modp_ti.outputs.formats.ksplat import read_ksplat, write_ksplat
 from modp_ti.outputs.formats.sog import read_sog, write_sog
@@ -47,7 +48,7 @@ def read_any_splats(path: Path) -> dict[str, NDArray[np.float32]]:
         data = read_bytes(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    with np.errstate(all="ignore"):  # infinite numbers are found below
+    with reading(path), np.errstate(all="ignore"):  # infinite numbers are found below
         if suffix in READERS:
             state = READERS[suffix](data, path)
         else:

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files.atomic import replace_file
 from modp_ti.files.errors import InputError
+from modp_ti.files.limits import most_unpacked
 from modp_ti.outputs.formats.splat_packing import (
     logits,
     opacities,
@@ -59,8 +60,8 @@ COARSEST = 1 / 4
 # A rotation by 180 degrees around x flips the sign of the harmonics that are odd in (y, z): degree 1, 2, 3.
 TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float64)
 HALF_TURN = np.array([1.0, -1.0, -1.0])
-# Largest number of Gaussians that is read, the largest ratio of gzip, and the most bytes of extensions.
-MOST, GZIP_RATIO, MOST_EXTRA = 100_000_000, 1040, 1 << 20
+# Largest number of Gaussians that is read, and the most bytes of extensions.
+MOST, MOST_EXTRA = 100_000_000, 1 << 20
 
 
 def write_spz(path: str | os.PathLike[str], state: Mapping[str, NDArray], version: int = DEFAULT_VERSION) -> str:
@@ -180,8 +181,8 @@ def _sizes(version: int, degree: int) -> list[int]:
     return [6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1)]
 
 
-def _header(data: bytes, path: Path) -> tuple[int, int, int, int, int]:
-    """Return version, count, degree, fractional bits and the last byte."""
+def _header(data: bytes, path: Path, size: int) -> tuple[int, int, int, int, int]:
+    """Return version, count, degree, fractional bits and the last byte of a header, for a file of `size` bytes."""
     if len(data) < HEADER.size:
         raise InputError(f"{path}: the .spz file is damaged or cut off")
     magic, version, count, degree, fractional, _, last = HEADER.unpack_from(data)
@@ -189,6 +190,8 @@ def _header(data: bytes, path: Path) -> tuple[int, int, int, int, int]:
         raise InputError(f"{path}: not an .spz file of version 1 to 4")
     if count == 0:
         raise InputError(f"{path}: holds no splat")
+    if count * sum(_sizes(version, degree)) > most_unpacked(size):
+        raise InputError(f"{path}: {count:,} splats cannot be in {size:,} bytes; the .spz file is damaged")
     return version, count, degree, fractional, last
 
 
@@ -197,11 +200,9 @@ def _unzipped(data: bytes, path: Path) -> tuple[tuple[int, int, int], list[NDArr
     try:
         stream = zlib.decompressobj(wbits=31)
         head = stream.decompress(data, HEADER.size)
-        version, count, degree, fractional, _ = _header(head, path)
+        version, count, degree, fractional, _ = _header(head, path, len(data))
         sizes = _sizes(version, degree)
-        content = b""
-        if 0 < count * sum(sizes) <= GZIP_RATIO * len(data):
-            content = stream.decompress(stream.unconsumed_tail, count * sum(sizes))
+        content = stream.decompress(stream.unconsumed_tail, count * sum(sizes))
         stream.decompress(stream.unconsumed_tail, MOST_EXTRA)
     except zlib.error:
         raise InputError(f"{path}: not an .spz file, or a damaged one") from None
@@ -215,7 +216,7 @@ def _unzipped(data: bytes, path: Path) -> tuple[tuple[int, int, int], list[NDArr
 
 def _plain(data: bytes, path: Path) -> tuple[tuple[int, int, int], list[NDArray[np.uint8]]]:
     """Return the same of a file of version 4."""
-    version, count, degree, fractional, streams = _header(data, path)
+    version, count, degree, fractional, streams = _header(data, path, len(data))
     damaged = InputError(f"{path}: the .spz file is damaged or cut off")
     sizes = _sizes(version, degree)
     wanted = [size * count for size in sizes if size * count]

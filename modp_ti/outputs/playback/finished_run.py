@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.files.run_folder import require_whole
 from modp_ti.inputs.sources import NO_DISTORTION
 from modp_ti.inputs.sources.intrinsics import require_plausible
@@ -103,11 +104,12 @@ def open_run(folder: Path) -> FinishedRun:
         )
     if missing:
         raise InputError(f"{folder}: not the output of a finished run, {missing[0]} is missing")
-    timestamps, poses = read_trajectory(folder / "trajectory.txt")
-    names, cameras = _read_model(folder / "colmap")
-    if len(names) != len(poses) or not names:
-        raise InputError(f"{folder}: trajectory.txt has {len(poses)} frames, colmap/ {len(names)}: not of one run")
-    return FinishedRun(folder, names, timestamps, poses, cameras, read_frames(folder / "frames.json", len(poses)))
+    with reading(folder):
+        timestamps, poses = read_trajectory(folder / "trajectory.txt")
+        names, cameras = _read_model(folder / "colmap")
+        if len(names) != len(poses) or not names:
+            raise InputError(f"{folder}: trajectory.txt has {len(poses)} frames, colmap/ {len(names)}: not of one run")
+        return FinishedRun(folder, names, timestamps, poses, cameras, read_frames(folder / "frames.json", len(poses)))
 
 
 def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
