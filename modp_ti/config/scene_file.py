@@ -7,7 +7,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,9 +29,6 @@ from modp_ti.files.errors import InputError
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
 M = TypeVar("M", bound=BaseModel)
-
-# How the origin of an overridden key begins, in messages.
-OVERRIDE = "--set "
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
@@ -74,7 +71,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
         )
     where = {key: f"{file}:{line}" for key, line in lines.items()}
     config = _resolved(data, where, str(file), overrides, preset)
-    typed = {key for key, origin in where.items() if origin.startswith(OVERRIDE)}
+    typed = frozenset(key for key, origin in where.items() if origin.startswith("--set "))
     return _with_absolute_paths(config, file.resolve().parent, typed)
 
 
@@ -97,7 +94,7 @@ def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
     replace_text(path, text)
 
 
-def _with_absolute_paths(model: M, base: Path, typed: Collection[str] = (), section: str = "") -> M:
+def _with_absolute_paths(model: M, base: Path, typed: frozenset[str] = frozenset(), section: str = "") -> M:
     """Resolve paths against `base`, and those of the dotted keys or sections `typed` against the working directory."""
     update: dict[str, Any] = {}
     for name, value in model:
@@ -275,7 +272,7 @@ def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any
 
 def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
     """Write one "section.key=value" into the raw data."""
-    origin = f"{OVERRIDE}{override}"
+    origin = f"--set {override}"
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
