@@ -24,6 +24,7 @@ __all__ = [
     "machine",
     "other_figures",
     "remarks",
+    "scene_folders",
     "shareable",
     "shown",
     "stages",
@@ -44,17 +45,6 @@ STAGES = {
     "evaluate": "evaluating the saved map",
     "other": "the rest",
 }
-OTHERS = {
-    "frames_per_second": ("frames per second while mapping", ".2f", ""),
-    "peak_memory_mb": ("most memory held", ",.0f", " MB"),
-    "ate_rmse_tracked": ("trajectory error of the tracker [units of the ground truth]", ".4g", ""),
-    "ate_rmse": ("trajectory error after mapping [units of the ground truth]", ".4g", ""),
-    "ate_rmse_rigid": ("trajectory error after mapping, with the map's own scale [same units]", ".4g", ""),
-    "reprojection_error_tracked": ("tracked points from their pixels, tracker's poses", ".3f", " px"),
-    "reprojection_error": ("tracked points from their pixels, poses after mapping", ".3f", " px"),
-    "reprojection_error_anew_tracked": ("points placed anew from their pixels, tracker's poses", ".3f", " px"),
-    "reprojection_error_anew": ("points placed anew from their pixels, poses after mapping", ".3f", " px"),
-}
 # What a good figure is, by the name of its metric.
 YARDSTICKS = {
     "psnr": "PSNR: 25 dB is fair, 30 dB good, 35 dB and more hard to tell from the frame.",
@@ -67,32 +57,22 @@ YARDSTICKS = {
 }
 # An absolute path, or one in the home folder.
 PATH = re.compile(r"""(?<![\w.:~/\\-])(~|/[^\s/"':,;()]+|[A-Za-z]:)(?:[/\\]+[^\s/\\"':,;()]+)+""")
+OTHERS = {
+    "frames_per_second": ("frames per second while mapping", ".2f", ""),
+    "peak_memory_mb": ("most memory held", ",.0f", " MB"),
+    "ate_rmse_tracked": ("trajectory error of the tracker [units of the ground truth]", ".4g", ""),
+    "ate_rmse": ("trajectory error after mapping [units of the ground truth]", ".4g", ""),
+    "ate_rmse_rigid": ("trajectory error after mapping, with the map's own scale [same units]", ".4g", ""),
+    "reprojection_error_tracked": ("tracked points from their pixels, tracker's poses", ".3f", " px"),
+    "reprojection_error": ("tracked points from their pixels, poses after mapping", ".3f", " px"),
+    "reprojection_error_anew_tracked": ("points placed anew from their pixels, tracker's poses", ".3f", " px"),
+    "reprojection_error_anew": ("points placed anew from their pixels, poses after mapping", ".3f", " px"),
+}
 
 
 def without_credentials(text: str) -> str:
     """Remove user names and passwords from URLs in the text, since reports are shared."""
     return re.sub(r"(?<=://)[^/@\s\"']+@", "", text)
-
-
-def shareable(text: str, *folders: Path) -> str:
-    """Remove from text what a page must not give away, since pages are shared.
-
-    User names and passwords of URLs are left out. Paths in one of the folders become relative to it; of other absolute
-    paths, the last name is left.
-    """
-    text = without_credentials(text)
-    for folder in sorted({*folders} - {Path(folder.anchor) for folder in folders}, key=lambda f: -len(str(f))):
-        text = re.sub(rf"(?<![\w./-]){re.escape(str(folder))}[/\\]+", "", text)
-    home = os.path.expanduser("~")
-    if len(Path(home).parts) > 1:
-        text = re.sub(rf"(?<![\w./-]){re.escape(home)}(?!\w)", "~", text)
-    # A name that no folder at the root has is no path but, for example, a topic of a bag.
-    return PATH.sub(lambda m: re.split(r"[/\\]", m[0])[-1] if m[1] == "~" or Path(m[1]).exists() else m[0], text)
-
-
-def scene_folders(config: SceneConfig) -> list[Path]:
-    """Return the folders that paths of a page are relative to: those of the recording and of the output."""
-    return [path.parent for path in (config.source.path, config.output) if path is not None]
 
 
 def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
@@ -105,7 +85,7 @@ def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
     for entry, value in documented_values(config):
         text = "" if value is None else as_yaml(value)
         if text != entry.default:
-            changes.append((entry.key, shareable(text, *scene_folders(config)), entry.default))
+            changes.append((entry.key, without_credentials(text), entry.default))
     return changes
 
 
@@ -138,6 +118,27 @@ def _processor() -> str:
         text = ""
     found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
     return found[1].strip() if found else platform.processor() or platform.machine()
+
+
+def shareable(text: str, *folders: Path) -> str:
+    """Remove from text what a page must not give away, since pages are shared.
+
+    User names and passwords of URLs are left out. Paths in one of the folders become relative to it; of other absolute
+    paths, the last name is left.
+    """
+    text = re.sub(r"(?<=://)[^/@\s\"']+@", "", text)
+    for folder in sorted({*folders} - {Path(folder.anchor) for folder in folders}, key=lambda f: -len(str(f))):
+        text = re.sub(rf"(?<![\w./-]){re.escape(str(folder))}[/\\]+", "", text)
+    home = os.path.expanduser("~")
+    if len(Path(home).parts) > 1:
+        text = re.sub(rf"(?<![\w./-]){re.escape(home)}(?!\w)", "~", text)
+    # A name that no folder at the root has is no path but, for example, a topic of a bag.
+    return PATH.sub(lambda m: re.split(r"[/\\]", m[0])[-1] if m[1] == "~" or Path(m[1]).exists() else m[0], text)
+
+
+def scene_folders(config: SceneConfig) -> list[Path]:
+    """Return the folders that paths of a page are relative to: those of the recording and of the output."""
+    return [path.parent for path in (config.source.path, config.output) if path is not None]
 
 
 def last_stage(metrics: Mapping[str, Any]) -> str:
@@ -216,9 +217,9 @@ def yardsticks(metrics: Mapping[str, Any]) -> list[str]:
     return [text for name, text in YARDSTICKS.items() if known.get(name) is not None]
 
 
-def remarks(config: SceneConfig, metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
+def remarks(metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
     """Return the run's notes, with a warning if no frame was held out."""
-    said = [shareable(note, *scene_folders(config)) for note in notes]
+    said = [without_credentials(note) for note in notes]
     scores = metrics[last_stage(metrics)]
     if not scores["held_out"]["count"]:
         said.append("no frame was held out: the scores are of frames that the map was made of, and flatter it")
