@@ -19,6 +19,7 @@ from modp_ti.version import __version__
 
 __all__ = [
     "changed_settings",
+    "good_figures",
     "headline",
     "last_stage",
     "machine",
@@ -29,7 +30,6 @@ __all__ = [
     "shown",
     "stages",
     "without_credentials",
-    "yardsticks",
 ]
 
 PACKAGES = {"PyTorch": "torch", "NumPy": "numpy", "OpenCV": "opencv-python-headless"}
@@ -46,7 +46,7 @@ STAGES = {
     "other": "the rest",
 }
 # What a good figure is, by the name of its metric.
-YARDSTICKS = {
+GOOD_FIGURES = {
     "psnr": "PSNR: 25 dB is fair, 30 dB good, 35 dB and more hard to tell from the frame.",
     "ssim": "SSIM: 0.85 is fair, 0.9 good, 0.95 and more very good; 1 is the frame itself.",
     "lpips": "LPIPS: less is better; 0.3 is fair, 0.2 good, 0.1 and less very good; 0 is the frame itself.",
@@ -211,10 +211,10 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def yardsticks(metrics: Mapping[str, Any]) -> list[str]:
+def good_figures(metrics: Mapping[str, Any]) -> list[str]:
     """Return what good figures are, one line for each kind of figure that the run has."""
     known = {**metrics, **metrics[last_stage(metrics)]["all"]}
-    return [text for name, text in YARDSTICKS.items() if known.get(name) is not None]
+    return [text for name, text in GOOD_FIGURES.items() if known.get(name) is not None]
 
 
 def remarks(metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
