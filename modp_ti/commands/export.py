@@ -76,6 +76,7 @@ def export(
         from modp_ti.outputs.progress import ProgressLine
 
         options = ExportOptions(voxel, texture, device.value, spz_version)
+        options.require_used(format.value)
         line = ProgressLine(progress_console(quiet))
         with line.working("reading the run"):
             run = open_run(out)

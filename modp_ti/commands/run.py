@@ -99,12 +99,12 @@ def run(
     if scene is not None and "=" in scene.name and not scene.exists():  # `--stream 0 --set seed=1 source.stop=600`
         scene, more = None, [str(scene), *(more or [])]
     sources = [source for source in (scene, stream, resume, replay) if source is not None]
+    if not sources:
+        raise typer.BadParameter(
+            "name a scene file, a video or a folder of images, a camera (--stream 0), or the output folder of a run to "
+            "go on with (--resume OUT)"
+        )
     with outcome(as_json) as result:
-        if not sources:
-            raise InputError(
-                "name a scene file, a video or a folder of images, a camera (--stream 0), or the output folder of a "
-                "run to go on with (--resume OUT)"
-            )
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
         if onto is not None:
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")

@@ -272,9 +272,9 @@ def _parsed(main: Callable[..., Any], args: Sequence[str] | None = None, **setti
     try:
         sys.exit(main(given, **settings | {"standalone_mode": False}) or 0)
     except USAGE_ERROR as error:
-        message = one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
+        message = one_line(error.format_message()).removeprefix("Invalid value: ").replace("Value error, ", "")
         with suppress(typer.Exit):
-            _end(BAD_INPUT, f"{message}; see --help", "--json" in given)
+            _end(BAD_INPUT, f"{message.rstrip('.')}; see --help", "--json" in given)
         sys.exit(BAD_INPUT)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,9 +31,6 @@ from modp_ti.files.yaml_text import parse_yaml
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
 M = TypeVar("M", bound=BaseModel)
-
-# How the origin of an overridden key begins, in messages.
-OVERRIDE = "--set "
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
@@ -73,7 +70,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
         )
     where = {key: f"{file}:{line}" for key, line in lines.items()}
     config = _resolved(data, where, str(file), overrides, preset)
-    typed = {key for key, origin in where.items() if origin.startswith(OVERRIDE)}
+    typed = frozenset(key for key, origin in where.items() if origin.startswith("--set "))
     return _with_absolute_paths(config, file.resolve().parent, typed)
 
 
@@ -101,7 +98,7 @@ def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
     replace_text(path, text)
 
 
-def _with_absolute_paths(model: M, base: Path, typed: Collection[str] = (), section: str = "") -> M:
+def _with_absolute_paths(model: M, base: Path, typed: frozenset[str] = frozenset(), section: str = "") -> M:
     """Resolve paths against `base`, and those of the dotted keys or sections `typed` against the working directory."""
     update: dict[str, Any] = {}
     for name, value in model:
@@ -213,7 +210,7 @@ MAX_NAME, MAX_PATH = 255, 4095
 def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
     """Write one "section.key=value" into the raw data."""
     key, equals, text = override.partition("=")
-    key, origin = key.strip(), f"{OVERRIDE}{key}{equals}{shown_url(text.strip())}"
+    key, origin = key.strip(), f"--set {key}{equals}{shown_url(text.strip())}"
     if not equals or not key:
         raise InputError(f"{origin}: write it as section.key=value, for example source.scale=0.5")
     value = parse_yaml(text, origin, {})

@@ -72,6 +72,12 @@ class ExportOptions:
     device: str = "auto"
     spz_version: int | None = None
 
+    def require_used(self, format: str) -> None:
+        """Raise InputError if an option is given that the format ignores."""
+        for option, given, of in (("voxel", self.voxel, "mesh"), ("spz-version", self.spz_version, "spz")):
+            if given is not None and format != of:
+                raise InputError(f"--{option}: --format {format} has none; use --format {of}, or leave it out")
+
 
 def export_map(run: FinishedRun, format: str, output: Path | None, options: ExportOptions, line: ProgressLine) -> Path:
     """Write a run in one of the formats of DEFAULT_NAMES.
@@ -89,12 +95,10 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     Raises:
         InputError: If the export is not possible.
     """
-    given = {"voxel": options.voxel is not None, "texture": options.texture, "spz-version": options.spz_version}
-    for option, of in (("voxel", "mesh"), ("texture", "mesh"), ("spz-version", "spz")):
-        if given[option] and format != of:
-            raise InputError(f"--{option}: --format {format} has none; use --format {of}, or leave it out")
     default = output is None and format not in FOLDERS
     if options.texture:
+        if format != "mesh":
+            raise InputError(f"--texture: --format {format} has no texture; use --format mesh")
         output = run.folder / TEXTURED_NAME if output is None else output
     target = _target(run, format, output)
     if default:

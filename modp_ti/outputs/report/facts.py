@@ -19,15 +19,16 @@ from modp_ti.version import __version__
 
 __all__ = [
     "changed_settings",
+    "good_figures",
     "headline",
     "last_stage",
     "machine",
     "other_figures",
     "remarks",
+    "scene_folders",
     "shareable",
     "shown",
     "stages",
-    "yardsticks",
 ]
 
 PACKAGES = {"PyTorch": "torch", "NumPy": "numpy", "OpenCV": "opencv-python-headless"}
@@ -43,6 +44,18 @@ STAGES = {
     "evaluate": "evaluating the saved map",
     "other": "the rest",
 }
+# What a good figure is, by the name of its metric.
+GOOD_FIGURES = {
+    "psnr": "PSNR: 25 dB is fair, 30 dB good, 35 dB and more hard to tell from the frame.",
+    "ssim": "SSIM: 0.85 is fair, 0.9 good, 0.95 and more very good; 1 is the frame itself.",
+    "lpips": "LPIPS: less is better; 0.3 is fair, 0.2 good, 0.1 and less very good; 0 is the frame itself.",
+    "detail": "Detail: the share of the finest detail that the map shows; 0.5 is sharp, 0 is a blurred frame.",
+    "ate_rmse": "Trajectory error: root mean square distance of the cameras from the ground truth after the best turn, "
+    "shift and scale; 1 % of the size of the path is good. With the map's own scale, it includes the error of the "
+    "scale, which a single camera cannot measure.",
+}
+# An absolute path, or one in the home folder.
+PATH = re.compile(r"""(?<![\w.:~/\\-])(~|/[^\s/"':,;()]+|[A-Za-z]:)(?:[/\\]+[^\s/\\"':,;()]+)+""")
 OTHERS = {
     "frames_per_second": ("frames per second while mapping", ".2f", ""),
     "peak_memory_mb": ("most memory held", ",.0f", " MB"),
@@ -54,37 +67,6 @@ OTHERS = {
     "reprojection_error_anew_tracked": ("points placed anew from their pixels, tracker's poses", ".3f", " px"),
     "reprojection_error_anew": ("points placed anew from their pixels, poses after mapping", ".3f", " px"),
 }
-# What a good figure is, by the name of its metric.
-YARDSTICKS = {
-    "psnr": "PSNR: 25 dB is fair, 30 dB good, 35 dB and more hard to tell from the frame.",
-    "ssim": "SSIM: 0.85 is fair, 0.9 good, 0.95 and more very good; 1 is the frame itself.",
-    "lpips": "LPIPS: less is better; 0.3 is fair, 0.2 good, 0.1 and less very good; 0 is the frame itself.",
-    "detail": "Detail: the share of the finest detail that the map shows; 0.5 is sharp, 0 is a blurred frame.",
-    "ate_rmse": "Trajectory error: root mean square distance of the cameras from the ground truth after the best turn, "
-    "shift and scale; 1 % of the size of the path is good. With the map's own scale, it includes the error of the "
-    "scale, which a single camera cannot measure.",
-}
-# An absolute path, or one in the home folder.
-PATH = re.compile(r"""(?<![\w.:~/\\-])(~|/[^\s/"':,;()]+|[A-Za-z]:)(?:[/\\]+[^\s/\\"':,;()]+)+""")
-
-
-def shareable(text: str, *folders: Path) -> str:
-    """Remove from text what a page must not give away, since pages are shared.
-
-    Paths in one of the folders become relative to it; of other absolute paths, the last name is left.
-    """
-    for folder in sorted({*folders} - {Path(folder.anchor) for folder in folders}, key=lambda f: -len(str(f))):
-        text = re.sub(rf"(?<![\w./-]){re.escape(str(folder))}[/\\]+", "", text)
-    home = os.path.expanduser("~")
-    if len(Path(home).parts) > 1:
-        text = re.sub(rf"(?<![\w./-]){re.escape(home)}(?!\w)", "~", text)
-    # A name that no folder at the root has is no path but, for example, a topic of a bag.
-    return PATH.sub(lambda m: re.split(r"[/\\]", m[0])[-1] if m[1] == "~" or Path(m[1]).exists() else m[0], text)
-
-
-def scene_folders(config: SceneConfig) -> list[Path]:
-    """Return the folders that paths of a page are relative to: those of the recording and of the output."""
-    return [path.parent for path in (config.source.path, config.output) if path is not None]
 
 
 def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
@@ -97,7 +79,7 @@ def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
     for entry, value in documented_values(config):
         text = "" if value is None else as_yaml(value)
         if text != entry.default:
-            changes.append((entry.key, shareable(text, *scene_folders(config)), entry.default))
+            changes.append((entry.key, text, entry.default))
     return changes
 
 
@@ -130,6 +112,25 @@ def _processor() -> str:
         text = ""
     found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
     return found[1].strip() if found else platform.processor() or platform.machine()
+
+
+def shareable(text: str, *folders: Path) -> str:
+    """Remove from text what a page must not give away, since pages are shared.
+
+    Paths in one of the folders become relative to it; of other absolute paths, the last name is left.
+    """
+    for folder in sorted({*folders} - {Path(folder.anchor) for folder in folders}, key=lambda f: -len(str(f))):
+        text = re.sub(rf"(?<![\w./-]){re.escape(str(folder))}[/\\]+", "", text)
+    home = os.path.expanduser("~")
+    if len(Path(home).parts) > 1:
+        text = re.sub(rf"(?<![\w./-]){re.escape(home)}(?!\w)", "~", text)
+    # A name that no folder at the root has is no path but, for example, a topic of a bag.
+    return PATH.sub(lambda m: re.split(r"[/\\]", m[0])[-1] if m[1] == "~" or Path(m[1]).exists() else m[0], text)
+
+
+def scene_folders(config: SceneConfig) -> list[Path]:
+    """Return the folders that paths of a page are relative to: those of the recording and of the output."""
+    return [path.parent for path in (config.source.path, config.output) if path is not None]
 
 
 def last_stage(metrics: Mapping[str, Any]) -> str:
@@ -202,15 +203,15 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def yardsticks(metrics: Mapping[str, Any]) -> list[str]:
+def good_figures(metrics: Mapping[str, Any]) -> list[str]:
     """Return what good figures are, one line for each kind of figure that the run has."""
     known = {**metrics, **metrics[last_stage(metrics)]["all"]}
-    return [text for name, text in YARDSTICKS.items() if known.get(name) is not None]
+    return [text for name, text in GOOD_FIGURES.items() if known.get(name) is not None]
 
 
-def remarks(config: SceneConfig, metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
+def remarks(metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
     """Return the run's notes, with a warning if no frame was held out."""
-    said = [shareable(note, *scene_folders(config)) for note in notes]
+    said = list(notes)
     scores = metrics[last_stage(metrics)]
     if not scores["held_out"]["count"]:
         said.append("no frame was held out: the scores are of frames that the map was made of, and flatter it")

@@ -71,11 +71,12 @@ def write_report(path: Path, run: ReportedRun) -> None:
     page = environment.get_template("page.html.j2").render(
         run=run,
         facts=facts,
+        folders=facts.scene_folders(run.config),
         name=run.config.output.name,
         started=time.strftime("%d %B %Y, %H:%M", time.localtime(run.record.started)),
         stage=facts.last_stage(run.metrics),
         maps=[stage for stage in ("online", "refined", "offline") if run.metrics[stage] is not None],
-        remarks=facts.remarks(run.config, run.metrics, run.record.notes),
+        remarks=facts.remarks(run.metrics, run.record.notes),
         drawings={name: as_uri("svg+xml", svg.encode("utf-8")) for name, svg in _drawings(run).items()},
         scale=_scale(),
         full_scale=FULL_SCALE,
