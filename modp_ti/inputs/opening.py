@@ -24,7 +24,7 @@ from modp_ti.inputs.sources.intrinsics import given_intrinsics
 from modp_ti.inputs.sources.paced import PacedSource
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
-from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile
+from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile, is_video
 
 __all__ = ["open_source", "recognised_kind"]
 
@@ -86,7 +86,7 @@ def recognised_kind(path: Path) -> str:
             return kind
         if suffix == ".vrs":
             return "vrs"
-        if suffix in VIDEO_SUFFIXES:
+        if suffix in VIDEO_SUFFIXES or (path.exists() and is_video(path)):
             return "video"
         if path.exists():
             raise InputError(
@@ -122,7 +122,7 @@ def _open_bag(path: Path, source: SourceSettings) -> ImageSource:
 
 
 _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
-    "images": lambda path, source: ImageFolder(path, source.fps),
+    "images": lambda path, source: ImageFolder(path, source.fps, masks=source.masks),
     "video": lambda path, source: VideoFile(path, source.fps, source.stop),
     "tum_rgbd": lambda path, _: open_tum_rgbd(path),
     "replica": lambda path, source: open_replica(path, source.fps),

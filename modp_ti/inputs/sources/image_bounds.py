@@ -13,7 +13,13 @@ from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, TILELENGTH, TILEWIDTH
 
 from modp_ti.files.reading import available_memory
 from modp_ti.inputs.sources.heif import BRANDS, heif_size
-from modp_ti.inputs.sources.image_header import HEADER_ERRORS, JpegHeader, bounded, read_tiff_directory
+from modp_ti.inputs.sources.image_header import (
+    HEADER_ERRORS,
+    JpegHeader,
+    bounded,
+    read_image_header,
+    read_tiff_directory,
+)
 
 __all__ = ["MAX_IMAGE_PIXELS", "why_undecodable"]
 
@@ -26,6 +32,7 @@ DECODED_BYTES = 12
 # whose size is at least a quarter of the image's.
 MOST_INFLATED = 1032
 INFLATED_AT_A_TIME = 1 << 18
+HEADER_BYTES = 1 << 12  # in which a JPEG 2000 image states its size
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
 MOST_JPEG_PIXELS = 2048  # per byte
 # Smallest number of bits per pixel of the PNM formats: text has a digit and a separator per value, except in bitmaps.
@@ -44,7 +51,7 @@ def why_undecodable(data: bytes) -> str | None:
     """
     read = next((reader for magic, reader in FORMATS if re.match(magic, data[:16], re.DOTALL)), None)
     if read is None:
-        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM, PGM, HEIC or AVIF)"
+        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM, PGM, JPEG 2000, HEIC or AVIF)"
     try:
         width, height, least = read(data)
     except HEADER_ERRORS:
@@ -110,22 +117,20 @@ def _pnm(data: bytes) -> Claim:
 
 
 def _webp(data: bytes) -> Claim:
-    """Read a WebP header without Pillow, whose reader allocates two canvases of the stated size."""
-    kind = data[12:16]
-    if kind == b"VP8 ":
-        width, height = struct.unpack_from("<HH", data, 26)
-        return width & 0x3FFF, height & 0x3FFF, 0
-    if kind == b"VP8L":
-        (bits,) = struct.unpack_from("<I", data, 21)
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1, 0
-    if kind == b"VP8X":
-        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
-        return width, height, 0
-    raise ValueError
+    header = read_image_header(io.BytesIO(data))
+    if header is None:
+        raise ValueError
+    return header.width, header.height, 0
 
 
 def _heif(data: bytes) -> Claim:
     return *heif_size(data), 0
+
+
+def _jp2(data: bytes) -> Claim:
+    """Read the size of a JPEG 2000 image from the first box `ihdr`."""
+    height, width = struct.unpack_from(">II", data, data.index(b"ihdr", 0, HEADER_BYTES) + 4)
+    return width, height, 0
 
 
 def _tiff(data: bytes) -> Claim:
@@ -144,5 +149,6 @@ FORMATS: tuple[tuple[bytes, Callable[[bytes], Claim]], ...] = (
     (rb"II\*\0|MM\0\*|II\+\0|MM\0\+", _tiff),
     (rb"RIFF....WEBP", _webp),
     (rb"P[1-6]\s", _pnm),
+    (rb"\0\0\0\x0cjP  ", _jp2),
     (rb"....ftyp(?:" + b"|".join(BRANDS) + rb")", _heif),
 )

@@ -2,7 +2,8 @@
 
 Decoders differ in what they do with a truncated file (older OpenCV versions fill the rest with grey), and a run should
 report it in its first second, not at frame 400. JPEG and PNG files are checked by their end markers, HEIC and AVIF
-files by the lengths of their boxes; other formats are left to the decoder.
+files by the lengths of their boxes; other formats are left to the decoder. EXIF orientation, colour profile and alpha
+channel of PNG, WebP and TIFF files are found here too.
 
 Pillow keeps everything that it reads from a header, and thousands of TIFF or EXIF tags can refer to the same bytes:
 Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `bounded` file.
@@ -11,12 +12,15 @@ Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `
 from __future__ import annotations
 
 import io
+import re
 import struct
 import warnings
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, BinaryIO
 
+import numpy as np
 from PIL import ExifTags, JpegImagePlugin, TiffImagePlugin
 
 from modp_ti.files import open_file
@@ -37,6 +41,14 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"IEND\xaeB`\x82"
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+# Chunks of PNG and WebP files that are kept, at most so many bytes of each, and chunks that are visited.
+KEPT = (b"eXIf", b"iCCP", b"tRNS", b"EXIF", b"ICCP", b"VP8X", b"VP8L", b"VP8 ")
+LONGEST_CHUNK, MOST_CHUNKS = 1 << 22, 10_000
+# Bytes at the end of a PNG file where EXIF is looked for: some programs append it.
+PNG_TAIL = 1 << 16
+SAMPLES, EXTRA_SAMPLES, PROFILE = 277, 338, 34675  # tags of TIFF
+GPANO = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular")
 # A header may read HEADER_BYTES plus half of the file. Each call counts as CALL_BYTES in addition.
 HEADER_BYTES, CALL_BYTES = 1 << 23, 1 << 7
 
@@ -54,16 +66,26 @@ class ImageHeader:
     Attributes:
         width: Width [px] of the decoded image, before any EXIF rotation; 0 if the header is damaged.
         height: Height [px], likewise.
-        complete: Whether the end of the file is there.
-        orientation: EXIF orientation of a JPEG or AVIF file, 1 to 8; 1 if it states none.
+        complete: Whether the end of the file is there; None if only the decoder finds out.
+        orientation: EXIF orientation, 1 to 8, which is left to apply; 1 if the file states none.
         bits: Bits per channel.
+        alpha: Whether a PNG, WebP or TIFF file has an alpha channel.
+        grey: Whether a PNG or TIFF file has one channel.
+        profile: ICC profile of the colours; empty without.
+        panorama: Whether GPano in a JPEG file says that the image is equirectangular.
+        is_tiff: Whether it is a TIFF file, which OpenCV turns upright by itself.
     """
 
     width: int
     height: int
-    complete: bool
+    complete: bool | None
     orientation: int = 1
     bits: int = 8
+    alpha: bool = False
+    grey: bool = False
+    profile: bytes = b""
+    panorama: bool = False
+    is_tiff: bool = False
 
 
 class _Bounded(io.BufferedIOBase):
@@ -106,7 +128,7 @@ class JpegHeader(JpegImagePlugin.JpegImageFile):
 
 
 def read_image_header(file: BinaryIO) -> ImageHeader | None:
-    """Read the header of an open JPEG, PNG, HEIC or AVIF file. Returns None for all other files.
+    """Read the header of an open JPEG, PNG, WebP, TIFF, HEIC or AVIF file. Returns None for all other files.
 
     Raises:
         InputError: If the package that reads HEIC or AVIF is missing.
@@ -115,13 +137,14 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
     if is_heif(signature):
         return _heif_header(file)
     if signature.startswith(PNG_SIGNATURE):
-        # Pillow would also unpack the texts and the colour profile that follow. The size is at a fixed offset.
-        file.seek(8)
-        chunk = file.read(17)
-        if len(chunk) < 17 or chunk[4:8] != b"IHDR":
-            return ImageHeader(0, 0, complete=False)
-        width, height = struct.unpack(">II", chunk[8:16])
-        return ImageHeader(width, height, _ends_with(file, PNG_END), bits=chunk[16])
+        return _png_header(file)
+    try:
+        if signature[:4] == b"RIFF" and signature[8:] == b"WEBP":
+            return _webp_header(file)
+        if signature[:4] in TIFF_SIGNATURES:
+            return _tiff_header(file)
+    except HEADER_ERRORS:  # the decoder finds out
+        return None
     if signature[:2] != JPEG_SIGNATURE:
         return None
     file.seek(0)
@@ -131,7 +154,9 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
         file.seek(-min(2, file.seek(0, 2)), 2)
         return ImageHeader(0, 0, complete=file.read() == JPEG_END)
     # Coded data never holds FF D9 except as the end marker, so the first one after the scan's start is it.
-    return ImageHeader(*header.size, _ends_with(file, JPEG_END), _orientation(header))
+    complete = _ends_with(file, JPEG_END)
+    profile, xmp = header.info.get("icc_profile") or b"", header.info.get("xmp") or b""
+    return ImageHeader(*header.size, complete, _orientation(header), profile=profile, panorama=bool(GPANO.search(xmp)))
 
 
 def _heif_header(file: BinaryIO) -> ImageHeader:
@@ -141,7 +166,82 @@ def _heif_header(file: BinaryIO) -> ImageHeader:
     complete = end_of_boxes(file, len(data)) <= len(data)
     if header is None:
         return ImageHeader(0, 0, complete)
-    return ImageHeader(header.width, header.height, complete, header.orientation)
+    return ImageHeader(header.width, header.height, complete, header.orientation, profile=header.profile)
+
+
+def _png_header(file: BinaryIO) -> ImageHeader:
+    """Read the chunks before the pixels. Pillow would also unpack all texts. The size is at a fixed offset."""
+    file.seek(8)
+    chunk = file.read(18)
+    if len(chunk) < 18 or chunk[4:8] != b"IHDR":
+        return ImageHeader(0, 0, complete=False)
+    width, height, bits, kind = struct.unpack(">IIBB", chunk[8:])
+    file.seek(33)
+    chunks = _chunks(file, png=True)
+    complete = _ends_with(file, PNG_END)
+    tiff = chunks.get(b"eXIf")
+    if tiff is None:
+        file.seek(-min(PNG_TAIL, file.seek(0, 2)), 2)
+        tiff = file.read().rpartition(b"eXIf")[2]
+    profile = b""
+    try:
+        # A name, a zero, the method of compression, and the compressed profile.
+        packed = chunks[b"iCCP"].partition(b"\0")[2][1:]
+        profile = zlib.decompressobj().decompress(packed, LONGEST_CHUNK)
+    except (KeyError, zlib.error):
+        pass
+    alpha = bool(kind & 4) or b"tRNS" in chunks
+    return ImageHeader(width, height, complete, _exif_orientation(tiff), bits, alpha, kind == 0, profile)
+
+
+def _webp_header(file: BinaryIO) -> ImageHeader:
+    """Read a WebP header without Pillow, whose reader allocates two canvases of the stated size."""
+    chunks = _chunks(file, png=False)
+    if b"VP8X" in chunks:
+        about, tiff = chunks[b"VP8X"], chunks.get(b"EXIF", b"").removeprefix(b"Exif\0\0")
+        width, height = (int.from_bytes(about[at : at + 3], "little") + 1 for at in (4, 7))
+        alpha, profile = bool(about[0] & 0x10), chunks.get(b"ICCP", b"")
+        return ImageHeader(width, height, None, _exif_orientation(tiff), alpha=alpha, profile=profile)
+    if b"VP8L" in chunks:
+        (bits,) = struct.unpack_from("<I", chunks[b"VP8L"], 1)
+        return ImageHeader((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1, None, alpha=bool(bits >> 28 & 1))
+    width, height = struct.unpack_from("<HH", chunks[b"VP8 "], 6)
+    return ImageHeader(width & 0x3FFF, height & 0x3FFF, None)
+
+
+def _chunks(file: BinaryIO, png: bool) -> dict[bytes, bytes]:
+    """Read the chunks in KEPT of a PNG or WebP file from its position on; of PNG, those before the pixels."""
+    found = {}
+    for _ in range(MOST_CHUNKS):
+        head = file.read(8)
+        if len(head) < 8:
+            break
+        length, kind = struct.unpack(">I4s", head) if png else struct.unpack("<4sI", head)[::-1]
+        if kind == b"IDAT":
+            break
+        after = file.tell() + length + (4 if png else length % 2)
+        if kind in KEPT and kind not in found:
+            found[kind] = file.read(min(length, LONGEST_CHUNK))
+        file.seek(after)
+    return found
+
+
+def _tiff_header(file: BinaryIO) -> ImageHeader:
+    file.seek(0)
+    tags = read_tiff_directory(file.read())
+    bits = tags.get(TiffImagePlugin.BITSPERSAMPLE, 8)
+    orientation, profile = tags.get(ExifTags.Base.Orientation, 1), tags.get(PROFILE, b"")
+    return ImageHeader(
+        int(tags[TiffImagePlugin.IMAGEWIDTH]),
+        int(tags[TiffImagePlugin.IMAGELENGTH]),
+        complete=None,
+        orientation=orientation if orientation in range(1, 9) else 1,
+        bits=int(max(bits) if isinstance(bits, tuple) else bits),
+        alpha=any(kind in (1, 2) for kind in np.ravel(tags.get(EXTRA_SAMPLES, 0))),
+        grey=tags.get(SAMPLES, 1) == 1,
+        profile=profile if isinstance(profile, bytes) else b"",
+        is_tiff=True,
+    )
 
 
 def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlugin.ImageFileDirectory_v2:
@@ -166,7 +266,17 @@ def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlug
 def _orientation(header: JpegHeader) -> int:
     """Return the EXIF orientation that a JPEG file states, or 1."""
     try:
-        value = read_tiff_directory(_tiff(header))[ExifTags.Base.Orientation]
+        return _exif_orientation(_tiff(header))
+    except HEADER_ERRORS:
+        return 1
+
+
+def _exif_orientation(tiff: bytes) -> int:
+    """Return the orientation in the TIFF structure of EXIF, or 1."""
+    if tiff[:4] not in TIFF_SIGNATURES:
+        return 1
+    try:
+        value = read_tiff_directory(tiff)[ExifTags.Base.Orientation]
     except HEADER_ERRORS:
         return 1
     return value if isinstance(value, int) and 1 <= value <= 8 else 1

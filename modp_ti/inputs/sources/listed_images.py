@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -15,11 +16,12 @@ from numpy.typing import NDArray
 from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import UnreadableImageError
 from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced, used_bits
+from modp_ti.inputs.sources.colour_profile import in_srgb, profile_name
 from modp_ti.inputs.sources.heif import decoded_heif, is_heif
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turns_of
+from modp_ti.inputs.sources.orientation import AS_STORED, Scalar, Turn, turn_of_exif, turns_of
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 
 __all__ = ["ListedImages", "decoded", "decoded_as", "quiet_opencv"]
@@ -85,7 +87,7 @@ class ListedImages(ImageSource):
                 header = read_image_header(file)
         except OSError as error:
             raise self._unreadable(name, error.strerror or "it cannot be opened") from None
-        if header is None:
+        if header is None or header.complete is None:
             height, width = self.read(name).shape[:2]
             return width, height
         if not header.complete:
@@ -105,11 +107,27 @@ class ListedImages(ImageSource):
             UnreadableImageError: If the image is unreadable or truncated.
         """
         turn, bits = self.turn(name), self._bits
-        data = self._checked(name)
-        image = decoded(data, bits)
+        data, header = self._checked(name)
+        image = decoded(data, bits, header)
         if image is None:
-            raise self._unreadable(name, "it is damaged or no image")
+            raise self._unreadable(name, why_undecoded(data))
         return turn.image(image)
+
+    def valid(self, name: str) -> NDArray[np.bool_] | None:
+        """Return the pixels (H, W) whose alpha is at least half, turned upright; None if there is no alpha."""
+        if name not in self._transparent:
+            return None
+        data, header = self._checked(name)
+        alpha = _alpha(data, header)
+        return None if alpha is None else self.turn(name).image(alpha)
+
+    def leave_out(self, names: Collection[str]) -> None:
+        """Take images out of the source, such as masks that a tracker's file names."""
+        kept = [(name, time) for name, time in zip(self._names, self._times, strict=True) if name not in names]
+        self._names, self._times, self._position, self._by_stem = [], [], {}, {}
+        for name, time in kept:
+            self._append(name, time)
+            self._by_stem.setdefault(str(PurePosixPath(name).with_suffix("")), name)
 
     def _open(self, name: str) -> BinaryIO:
         """Open an image file. Raises OSError."""
@@ -119,7 +137,7 @@ class ListedImages(ImageSource):
         """Read an image file. Raises OSError."""
         return read_bytes(self.path / name)
 
-    def _checked(self, name: str) -> bytes:
+    def _checked(self, name: str) -> tuple[bytes, ImageHeader | None]:
         """Read an image file and check that it can be decoded. Raises UnreadableImageError."""
         try:
             data = self._content(name)
@@ -128,12 +146,12 @@ class ListedImages(ImageSource):
         header = read_image_header(io.BytesIO(data))
         if not data:
             raise self._unreadable(name, "the file is empty")
-        if header is not None and not header.complete:
+        if header is not None and header.complete is False:
             raise self._unreadable(name, "the file is cut off")
         reason = why_undecodable(data)
         if reason is not None:
             raise self._unreadable(name, reason)
-        return data
+        return data, header
 
     @cached_property
     def _turns(self) -> dict[str, Turn]:
@@ -141,7 +159,28 @@ class ListedImages(ImageSource):
         turns, note = turns_of(self._headers)
         if note is not None:
             self.add_note(f"{self.path}: {note}")
+        names = Counter(profile_name(header.profile) for header in self._headers.values())
+        names.pop(None, None)
+        if names:
+            count = f"{names.total()} of {len(self)} images are" if names.total() < len(self) else "the images are"
+            self.add_note(f"{self.path}: {count} of colours of {', '.join(map(str, names))}: converted to sRGB")
+        if self._transparent:
+            self.add_note(f"{self.path}: transparent pixels are masked ({len(self._transparent)} images have alpha)")
         return turns
+
+    @cached_property
+    def _transparent(self) -> frozenset[str]:
+        """The images whose alpha is a mask: none if it is all opaque, or all transparent, in some of them."""
+        names = [name for name, header in self._headers.items() if header.alpha]
+        some = []
+        for name in names[:: max(1, len(names) // SAMPLED)]:
+            with suppress(UnreadableImageError):
+                some.append(_alpha(*self._checked(name)))
+        masked = any(alpha is not None and not alpha.all() for alpha in some)
+        if masked and not any(alpha is None or alpha.any() for alpha in some):
+            self.add_note(f"{self.path}: the alpha of the images is 0 everywhere: not used")
+            return frozenset()
+        return frozenset(names if masked else ())
 
     @cached_property
     def _bits(self) -> int:
@@ -150,7 +189,7 @@ class ListedImages(ImageSource):
         images: list[NDArray] = []
         for name in deep[:: max(1, len(deep) // SAMPLED)]:
             with suppress(UnreadableImageError):
-                image = decoded_deep(self._checked(name))
+                image = decoded_deep(self._checked(name)[0])
                 if image is None or image.dtype != np.uint16:
                     break
                 images.append(image)
@@ -161,7 +200,7 @@ class ListedImages(ImageSource):
 
     @cached_property
     def _headers(self) -> dict[str, ImageHeader]:
-        """The header of each JPEG, PNG, HEIC and AVIF file that can be read, by name. All are read at once."""
+        """The header of each file that `read_image_header` can read, by name. All are read at once."""
         headers = {}
         for name in self.names:
             with suppress(OSError), self._open(name) as file:
@@ -176,20 +215,53 @@ class ListedImages(ImageSource):
         )
 
 
-def decoded(data: bytes, bits: int = DEPTHS[-1]) -> NDArray[np.uint8] | None:
+def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = None) -> NDArray[np.uint8] | None:
     """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation (HEIC upright); None if that fails.
 
     Args:
         data: The file's content.
         bits: How many bits an image of 16 bits per channel uses.
+        header: The file's header, whose colour profile is applied; None to keep the colours as they are stored.
     """
     import cv2
 
+    profile = b"" if header is None else header.profile
     if is_heif(data[:12]):
-        return decoded_heif(data)
+        image = decoded_heif(data)
+        return None if image is None else in_srgb(image, profile)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = decoded_as(data, flags) if bits == DEPTHS[-1] else decoded_deep(data)
-    return None if image is None else np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    if image is None:
+        return None
+    rgb = np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return _as_stored(in_srgb(rgb, profile), header)
+
+
+def why_undecoded(data: bytes) -> str:
+    """Return why an image file whose header is fine could not be decoded."""
+    import cv2
+
+    image = decoded_as(data, cv2.IMREAD_UNCHANGED)
+    if image is not None and image.dtype.kind == "f":
+        return "its values are floating-point numbers: convert it to 8 or 16 bits"
+    return "it is damaged or no image"
+
+
+def _as_stored(image: NDArray[Scalar], header: ImageHeader | None) -> NDArray[Scalar]:
+    """Undo what OpenCV does to the image of a TIFF file, which it turns as EXIF says."""
+    if header is None or not header.is_tiff or header.orientation == 1:
+        return image
+    return np.ascontiguousarray(turn_of_exif(header.orientation).stored(image))
+
+
+def _alpha(data: bytes, header: ImageHeader | None) -> NDArray[np.bool_] | None:
+    """Return where the alpha of an image file's content is at least half (H, W); None if it has no alpha."""
+    import cv2
+
+    image = decoded_as(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.shape[2] != 4 or image.dtype not in (np.uint8, np.uint16):
+        return None
+    return _as_stored(image[..., 3] > np.iinfo(image.dtype).max // 2, header)
 
 
 def decoded_deep(data: bytes) -> NDArray | None:
