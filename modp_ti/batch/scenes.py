@@ -7,10 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bare_recording import is_recording, recorded_scene
+from modp_ti.inputs.bare_recording import named_scene
 from modp_ti.tasks import Resources
 
 __all__ = ["SNAPSHOT_EVERY", "Scene", "for_a_task", "read_scenes", "with_resources", "with_store"]
@@ -64,10 +63,7 @@ def read_scenes(given: Iterable[Path], overrides: Sequence[str] = (), preset: st
 
 
 def _read(path: Path, overrides: Sequence[str], preset: str | None, taken: list[Path]) -> SceneConfig:
-    if is_recording(path):
-        config = recorded_scene(path, overrides, preset, taken)
-    else:
-        config = load_scene(path, overrides, preset)
+    config = named_scene(path, overrides, preset, taken)
     if config.is_live:
         raise InputError(f"{path}: a live source has no place in a batch: map it with `modp-ti run`")
     if config.parts is not None:

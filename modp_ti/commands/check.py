@@ -23,12 +23,13 @@ __all__ = ["EXAMPLES", "check", "inspect_scene"]
 EXAMPLES = examples(
     "modp-ti check scene.yaml",
     "modp-ti check scene.yaml --quiet && modp-ti run scene.yaml",
+    "modp-ti check room.mp4   (or a folder, as for modp-ti run)",
     "modp-ti check scene.yaml --json > check.json",
 )
 
 
 def check(
-    scene: Annotated[Path, typer.Argument(help="scene file (YAML); its paths are relative to it")],
+    scene: Annotated[Path, typer.Argument(help="scene file (YAML), whose paths are relative to it; or a recording")],
     set_: Overrides = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -38,12 +39,14 @@ def check(
         # Imported here, so that `--help` does not wait for the readers to load.
         from rich.console import Console
 
-        from modp_ti.config.scene_file import load_scene
+        from modp_ti.inputs.bare_recording import named_scene
         from modp_ti.inputs.inspection import report as reports
         from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
+        from modp_ti.outputs.progress import ProgressLine
 
         try:
-            report = inspect_scene(load_scene(scene, set_ or []), progress_console(quiet))
+            console = progress_console(quiet)
+            report = inspect_scene(named_scene(scene, set_ or [], say=ProgressLine(console).note), console)
         except InputError as error:
             report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", one_line(error))])
         result.code = verdict(report.findings)[1]

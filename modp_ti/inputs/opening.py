@@ -21,12 +21,14 @@ from modp_ti.inputs.sources.data_sets import (
 from modp_ti.inputs.sources.faces import PanoramaFaces
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.intrinsics import given_intrinsics
+from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.paced import PacedSource
+from modp_ti.inputs.sources.panorama import looks_panoramic
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile, is_video
 
-__all__ = ["open_source", "recognised_kind"]
+__all__ = ["is_panoramic", "open_source", "recognised_kind", "require_pinhole"]
 
 
 def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSource:
@@ -62,6 +64,33 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
         return _scaled(PanoramaFaces(images, source.panorama), source)
     images = _scaled(_with_camera(images, source), source)
     return PacedSource(images) if source.realtime else images
+
+
+def is_panoramic(images: ImageSource, name: str) -> bool:
+    """Whether an image of twice its height's width is a panorama, as GPano in its header or its edges tell."""
+    width, height = images.size(name)
+    if width != 2 * height:
+        return False
+    header = images.header(name) if isinstance(images, ListedImages) else None
+    return (header is not None and header.panorama) or looks_panoramic(images.read(name))
+
+
+def require_pinhole(images: ImageSource, source: SourceSettings, name: str) -> None:
+    """Check that images of an unknown camera are no panoramas, unless `source.panorama` has been set.
+
+    Raises:
+        InputError: If the image `name` is one.
+    """
+    width, height = images.size(name)
+    if width != 2 * height or source.panorama.model_fields_set:
+        return
+    shape = f"{images.path}: images of {width}x{height}"
+    if is_panoramic(images, name):
+        raise InputError(
+            f"{shape} that see all round: set source.panorama.projection=equirectangular with tracker.kind=klt, or "
+            "=none where one lens took them"
+        )
+    images.add_note(f"{shape} are taken to be of one lens; source.panorama.projection is for 360-degree images")
 
 
 def recognised_kind(path: Path) -> str:

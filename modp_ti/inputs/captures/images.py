@@ -79,7 +79,7 @@ def open_capture_images(path: Path, kind: str, fps: float, stop: int | None) -> 
         images: ImageSource = CaptureImages(capture)
         images.intrinsics = Intrinsics(first.camera, first.lens)
         return images
-    images = VideoFile(path / capture.video, fps, stop)
+    images = VideoFile(capture.tree.path / capture.video, fps, stop)
     count, posed = len(images.names), len(capture.frames)
     size = images.frame_size
     frames = [

@@ -71,6 +71,10 @@ class ListedImages(ImageSource):
                 return self._by_stem[tail]
         return None
 
+    def header(self, name: str) -> ImageHeader | None:
+        """Return the header of the image; None if it cannot be read."""
+        return self._headers.get(name)
+
     def with_stem(self, stem: str) -> str | None:
         """Return the image whose path without suffix is `stem`, or None."""
         return self._by_stem.get(stem)
