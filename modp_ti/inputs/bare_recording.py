@@ -32,13 +32,12 @@ RECORDING_SUFFIXES = (*VIDEO_SUFFIXES, ".vrs", *ARCHIVES, *SUFFIXES)
 # Longest name of an output folder [characters]. File systems take 255 bytes, and a run adds a suffix for a time.
 MAX_NAME = 60
 SCENE_SUFFIXES, PACKED = (".yaml", ".yml", ".json", ".txt"), (".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 # Kind of the tracker and file of poses, by `source.kind`, in the order in which they are looked for.
 POSES = {
     "images": (
-        *(("transforms", file) for file in ("transforms.json", "transforms_train.json")),
-        *(("colmap", f"{top}/images.{end}") for top in MODELS for end in ("bin", "txt")),
-        *(("tum", file) for file in ("groundtruth.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt")),
+        *(("transforms", "transforms.json"), ("transforms", "transforms_train.json")),
+        *(("colmap", f"{top}/images.*") for top in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")),
+        *(("tum", "groundtruth.txt"), ("tum", "*Trajectory.txt")),
     ),
     "tum_rgbd": (("tum", "groundtruth.txt"),),
     "replica": (("replica", "traj.txt"),),
@@ -66,10 +65,10 @@ def named_scene(
     taken: Collection[Path] = (),
     say: Say = _silent,
 ) -> SceneConfig:
-    """Return the settings of a scene file or, as `recorded_scene` does, of a recording.
+    """Return the settings of a scene file or, as `recorded_scene` does and with its arguments, of a recording.
 
     Raises:
-        InputError: As for `load_scene` and `recorded_scene`; or if it is a URL, one picture or an archive.
+        InputError: As for both; or if it is a URL, one picture or an archive.
     """
     suffix = path.suffix.lower()
     if re.match("[A-Za-z][A-Za-z0-9+]+:/", str(path)) and not exists(path):
@@ -111,11 +110,14 @@ def recorded_scene(
     if (path / SCENE).is_file():
         raise InputError(f"{path} has a {SCENE}: name that file, or the folder of the images")
     name = path.resolve().name if path.is_dir() else path.stem
-    kind = recognised_kind(path)
-    images = _images(path) if kind == "images" and path.is_dir() else path
+    kind, images = recognised_kind(path), path
+    if kind == "images" and path.is_dir():
+        images = _images(path)
+        if not images.is_dir():
+            return recorded_scene(images, overrides, preset, taken, say)
     output = _free(name, images, taken)
 
-    def settings(tracker: dict[str, Any], more: Iterable[str] = ()) -> SceneConfig:
+    def settings(tracker: dict[str, Any], *more: str) -> SceneConfig:
         scene = _scene({"path": str(images)}, output, tracker)
         return scene_from_data(scene, str(path), [*overrides, *more], preset)
 
@@ -124,20 +126,22 @@ def recorded_scene(
     config = settings({"kind": "klt"})
     if any(override.strip().startswith("tracker.") for override in overrides):
         return config
-    poses = next(((tracker, file) for tracker, file in POSES.get(kind, ()) if next(path.glob(file), None)), None)
-    if poses is not None:
-        tracker, file = poses[0], next(path.glob(poses[1]))
-        if tracker != "tum" or config.source.intrinsics.given or _calibrated(config):
-            say(f"the poses of {file} are used; tracker.kind=klt is to track the images alone")
-            given = {} if tracker == "sevenscenes" else {"path": str(file.parent if tracker == "colmap" else file)}
-            return settings({"kind": tracker, **given})
-        say(f"the poses of {file} are used with tracker.kind={tracker} and source.intrinsics; klt tracks the images")
-    if images.is_dir() and kind == "images" and not config.source.panorama.model_fields_set:
+    for tracker, pattern in POSES.get(kind, ()):
+        file = next(path.glob(pattern), None)
+        if file is None:
+            continue
+        if tracker == "tum" and not (config.source.intrinsics.given or _is_calibrated(config)):
+            say(f"{file} is not used without source.intrinsics (tracker.kind=tum): klt tracks the images")
+            break
+        say(f"the poses of {file} are used; tracker.kind=klt would track the images alone")
+        given = {} if tracker == "sevenscenes" else {"path": str(file.parent if tracker == "colmap" else file)}
+        return settings({"kind": tracker, **given})
+    if kind == "images" and not config.source.panorama.model_fields_set:
         first = ImageFolder(images).names[:1]
         with suppress(UnreadableImageError):
             if is_panoramic(ListedImages(images, first, [0.0]), first[0]):
-                say(f"the images of {images} see all round: source.panorama.projection=equirectangular is set")
-                return settings({"kind": "klt"}, ["source.panorama.projection=equirectangular"])
+                say(f"{images}: the images see all round: source.panorama.projection=equirectangular")
+                return settings({"kind": "klt"}, "source.panorama.projection=equirectangular")
     return config
 
 
@@ -145,25 +149,26 @@ def _images(path: Path) -> Path:
     """Return where the images of a folder of unknown layout are: in it, in its folder `images`, or in its only video.
 
     Raises:
-        InputError: If it holds recordings of which none is the only one.
+        InputError: If it holds recordings instead.
     """
     inside = sorted(each for each in path.iterdir() if not each.name.startswith("."))
     if any(each.suffix.lower() in IMAGE_SUFFIXES for each in inside):
         return path
     if (path / "images").is_dir():
         return path / "images"
-    videos = [each for each in inside if each.suffix.lower() in VIDEO_SUFFIXES and each.is_file()]
     folders = [each for each in inside if each.is_dir()]
-    recordings = [each for each in folders if recognised_kind(each) != "images"] or videos
-    if len(recordings) == 1 and not (videos and folders):
-        return recordings[0]
+    recordings = [each for each in folders if recognised_kind(each) != "images"]
+    if not folders:
+        recordings = [each for each in inside if each.suffix.lower() in RECORDING_SUFFIXES]
+        if len(recordings) == 1:
+            return recordings[0]
     if recordings:
         names = ", ".join(each.name for each in recordings[:4])
-        raise InputError(f"{path}: holds recordings ({names}): name one of them, or map each by `modp-ti batch`")
+        raise InputError(f"{path}: holds recordings ({names}): name one of them, or map all of them by `modp-ti batch`")
     return path
 
 
-def _calibrated(config: SceneConfig) -> bool:
+def _is_calibrated(config: SceneConfig) -> bool:
     images = open_source(config.source)
     images.close()
     return images.intrinsics is not None

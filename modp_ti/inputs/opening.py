@@ -67,30 +67,25 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
 
 
 def is_panoramic(images: ImageSource, name: str) -> bool:
-    """Whether an image of twice its height's width is a panorama, as GPano in its header or its edges tell."""
+    """Whether an image sees all round: it is twice as wide as high, and GPano in its header or its edges say so."""
     width, height = images.size(name)
     if width != 2 * height:
         return False
-    header = images.header(name) if isinstance(images, ListedImages) else None
+    header = images.headers.get(name) if isinstance(images, ListedImages) else None
     return (header is not None and header.panorama) or looks_panoramic(images.read(name))
 
 
 def require_pinhole(images: ImageSource, source: SourceSettings, name: str) -> None:
-    """Check that images of an unknown camera are no panoramas, unless `source.panorama` has been set.
+    """Check that images of an unknown camera do not see all round, by one of them, unless `source.panorama` is set.
 
     Raises:
-        InputError: If the image `name` is one.
+        InputError: If they do.
     """
-    width, height = images.size(name)
-    if width != 2 * height or source.panorama.model_fields_set:
-        return
-    shape = f"{images.path}: images of {width}x{height}"
-    if is_panoramic(images, name):
+    if not source.panorama.model_fields_set and is_panoramic(images, name):
         raise InputError(
-            f"{shape} that see all round: set source.panorama.projection=equirectangular with tracker.kind=klt, or "
-            "=none where one lens took them"
+            f"{images.path}: the images see all round: set source.panorama.projection=equirectangular with "
+            "tracker.kind=klt, or =none if a common lens took them"
         )
-    images.add_note(f"{shape} are taken to be of one lens; source.panorama.projection is for 360-degree images")
 
 
 def recognised_kind(path: Path) -> str:

@@ -118,9 +118,8 @@ class Bag:
         self._lock = Lock()
         self._first = files[0].suffix == ".bag"
         self._types = get_typestore(Stores.ROS1_NOETIC if self._first else Stores.ROS2_HUMBLE)
-        stamped = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
-        if not self._first:
-            self._types.register(get_types_from_msg(stamped, VIDEO))
+        # Foxglove's type begins with a time and a frame, which are the bytes of a header.
+        self._types.register(get_types_from_msg("std_msgs/Header header\nuint8[] data\nstring format", VIDEO))
         if self._first:  # the types that ROS 1 ships separately
             for kind in TREES:
                 self._types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
@@ -223,7 +222,7 @@ class Bag:
             reason = " ".join(str(error).split())[:150] or type(error).__name__
             mend = MENDS.get(file.suffix, "ros2 bag reindex")
             raise InputError(
-                f"{file}: is no bag of ROS, or is damaged: {reason}; where it was cut off, `{mend} {file.name}` mends it "
+                f"{file}: is no bag of ROS, or is damaged: {reason}; if it was cut off, `{mend} {file.name}` mends it "
                 "(source.path)"
             ) from None
 

@@ -17,7 +17,6 @@ from modp_ti.inputs.bags.camera_info import camera_of_info, info_beside, is_rect
 from modp_ti.inputs.bags.frame_tree import clean, seconds
 from modp_ti.inputs.bags.pictures import (
     begins_video,
-    header_of,
     is_compressed,
     is_deep,
     is_depth,
@@ -74,7 +73,7 @@ class BagImages(ImageSource):
         try:
             self.topic, others = _chosen_topic(self.bag, settings.image)
             first = self.bag.first(self.topic)
-            self.frame_id = clean(header_of(first).frame_id)
+            self.frame_id = clean(first.header.frame_id)
             codec = video_codec(first)
             found, size, left_out = self._listed(stop) if codec is None else self._video_listed(codec, stop)
             found.sort(key=lambda image: image.time)
@@ -145,7 +144,7 @@ class BagImages(ImageSource):
             if its != size:
                 left_out += 1
                 continue
-            time = seconds(header_of(message).stamp)
+            time = seconds(message.header.stamp)
             stamped |= time != 0.0
             images.append(_Image(time, place))
         if size is None:
@@ -163,7 +162,7 @@ class BagImages(ImageSource):
             for place, message in self.bag.messages(self.topic):
                 if images or begins_video(message):
                     stream.write(message.data.tobytes())
-                    images.append(_Image(seconds(header_of(message).stamp), place))
+                    images.append(_Image(seconds(message.header.stamp), place))
         if not images:
             raise InputError(f"{self.bag.path}: the video of {self.topic} ({codec}) has no start, so none is decoded")
         self._video = VideoFile(file, stop=stop)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from modp_ti.inputs.sources.listed_images import decoded
 __all__ = [
     "DEPTH_ENCODINGS",
     "begins_video",
-    "header_of",
     "is_compressed",
     "is_deep",
     "is_depth",
@@ -35,7 +33,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 # By what the messages of a video may state.
 CODECS = {"h264": "h264", "avc": "h264", "h265": "h265", "hevc": "h265"}
 # The start of a unit of parameters in the stream of a codec.
-PARAMETERS = {"h264": re.compile(rb"\0\0\1[\x07\x27\x47\x67]"), "h265": re.compile(rb"\0\0\1[\x40\x42]")}
+PARAMETERS = {"h264": re.compile(rb"\0\0\x01[\x07\x27\x47\x67]"), "h265": re.compile(rb"\0\0\x01[\x40\x42]")}
 
 
 class Layout(NamedTuple):
@@ -75,13 +73,6 @@ LAYOUTS = {
 def is_compressed(message: Any) -> bool:
     """Whether an image message is a sensor_msgs/CompressedImage, or the like for video."""
     return message.__msgtype__ in (COMPRESSED, VIDEO)
-
-
-def header_of(message: Any) -> Any:
-    """Return the header of an image message, with `stamp` and `frame_id`."""
-    if message.__msgtype__ == VIDEO:
-        return SimpleNamespace(stamp=message.timestamp, frame_id=message.frame_id)
-    return message.header
 
 
 def video_codec(message: Any) -> str | None:

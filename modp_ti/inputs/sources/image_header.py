@@ -15,13 +15,12 @@ import io
 import re
 import struct
 import warnings
-import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, BinaryIO
 
 import numpy as np
-from PIL import ExifTags, JpegImagePlugin, TiffImagePlugin
+from PIL import ExifTags, ImageFile, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 
 from modp_ti.files import open_file
 from modp_ti.inputs.sources.heif import is_heif, read_heif_header
@@ -42,12 +41,6 @@ PNG_END = b"IEND\xaeB`\x82"
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-# Chunks of PNG and WebP files that are kept, at most so many bytes of each, and chunks that are visited.
-KEPT = (b"eXIf", b"iCCP", b"tRNS", b"EXIF", b"ICCP", b"VP8X", b"VP8L", b"VP8 ")
-LONGEST_CHUNK, MOST_CHUNKS = 1 << 22, 10_000
-# Bytes at the end of a PNG file where EXIF is looked for: some programs append it.
-PNG_TAIL = 1 << 16
-SAMPLES, EXTRA_SAMPLES, PROFILE = 277, 338, 34675  # tags of TIFF
 GPANO = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular")
 # A header may read HEADER_BYTES plus half of the file. Each call counts as CALL_BYTES in addition.
 HEADER_BYTES, CALL_BYTES = 1 << 23, 1 << 7
@@ -138,13 +131,10 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
         return _heif_header(file)
     if signature.startswith(PNG_SIGNATURE):
         return _png_header(file)
-    try:
-        if signature[:4] == b"RIFF" and signature[8:] == b"WEBP":
-            return _webp_header(file)
-        if signature[:4] in TIFF_SIGNATURES:
-            return _tiff_header(file)
-    except HEADER_ERRORS:  # the decoder finds out
-        return None
+    if signature[:4] == b"RIFF" and signature[8:] == b"WEBP":
+        return _header_by_pillow(file, WebPImagePlugin.WebPImageFile)
+    if signature[:4] in TIFF_SIGNATURES:
+        return _header_by_pillow(file, TiffImagePlugin.TiffImageFile)
     if signature[:2] != JPEG_SIGNATURE:
         return None
     file.seek(0)
@@ -170,78 +160,38 @@ def _heif_header(file: BinaryIO) -> ImageHeader:
 
 
 def _png_header(file: BinaryIO) -> ImageHeader:
-    """Read the chunks before the pixels. Pillow would also unpack all texts. The size is at a fixed offset."""
+    # The size is at a fixed offset.
     file.seek(8)
-    chunk = file.read(18)
-    if len(chunk) < 18 or chunk[4:8] != b"IHDR":
+    chunk = file.read(17)
+    if len(chunk) < 17 or chunk[4:8] != b"IHDR":
         return ImageHeader(0, 0, complete=False)
-    width, height, bits, kind = struct.unpack(">IIBB", chunk[8:])
-    file.seek(33)
-    chunks = _chunks(file, png=True)
-    complete = _ends_with(file, PNG_END)
-    tiff = chunks.get(b"eXIf")
-    if tiff is None:
-        file.seek(-min(PNG_TAIL, file.seek(0, 2)), 2)
-        tiff = file.read().rpartition(b"eXIf")[2]
-    profile = b""
-    try:
-        # A name, a zero, the method of compression, and the compressed profile.
-        packed = chunks[b"iCCP"].partition(b"\0")[2][1:]
-        profile = zlib.decompressobj().decompress(packed, LONGEST_CHUNK)
-    except (KeyError, zlib.error):
-        pass
-    alpha = bool(kind & 4) or b"tRNS" in chunks
-    return ImageHeader(width, height, complete, _exif_orientation(tiff), bits, alpha, kind == 0, profile)
+    width, height = struct.unpack(">II", chunk[8:16])
+    header = ImageHeader(width, height, _ends_with(file, PNG_END), bits=chunk[16])
+    more = _header_by_pillow(file, PngImagePlugin.PngImageFile)
+    return header if more is None else replace(more, complete=header.complete, bits=header.bits)
 
 
-def _webp_header(file: BinaryIO) -> ImageHeader:
-    """Read a WebP header without Pillow, whose reader allocates two canvases of the stated size."""
-    chunks = _chunks(file, png=False)
-    if b"VP8X" in chunks:
-        about, tiff = chunks[b"VP8X"], chunks.get(b"EXIF", b"").removeprefix(b"Exif\0\0")
-        width, height = (int.from_bytes(about[at : at + 3], "little") + 1 for at in (4, 7))
-        alpha, profile = bool(about[0] & 0x10), chunks.get(b"ICCP", b"")
-        return ImageHeader(width, height, None, _exif_orientation(tiff), alpha=alpha, profile=profile)
-    if b"VP8L" in chunks:
-        (bits,) = struct.unpack_from("<I", chunks[b"VP8L"], 1)
-        return ImageHeader((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1, None, alpha=bool(bits >> 28 & 1))
-    width, height = struct.unpack_from("<HH", chunks[b"VP8 "], 6)
-    return ImageHeader(width & 0x3FFF, height & 0x3FFF, None)
-
-
-def _chunks(file: BinaryIO, png: bool) -> dict[bytes, bytes]:
-    """Read the chunks in KEPT of a PNG or WebP file from its position on; of PNG, those before the pixels."""
-    found = {}
-    for _ in range(MOST_CHUNKS):
-        head = file.read(8)
-        if len(head) < 8:
-            break
-        length, kind = struct.unpack(">I4s", head) if png else struct.unpack("<4sI", head)[::-1]
-        if kind == b"IDAT":
-            break
-        after = file.tell() + length + (4 if png else length % 2)
-        if kind in KEPT and kind not in found:
-            found[kind] = file.read(min(length, LONGEST_CHUNK))
-        file.seek(after)
-    return found
-
-
-def _tiff_header(file: BinaryIO) -> ImageHeader:
+def _header_by_pillow(file: BinaryIO, form: type[ImageFile.ImageFile]) -> ImageHeader | None:
+    """Read the header of a PNG, WebP or TIFF file with Pillow; None if it is damaged, or has a form unknown to it."""
     file.seek(0)
-    tags = read_tiff_directory(file.read())
-    bits = tags.get(TiffImagePlugin.BITSPERSAMPLE, 8)
-    orientation, profile = tags.get(ExifTags.Base.Orientation, 1), tags.get(PROFILE, b"")
-    return ImageHeader(
-        int(tags[TiffImagePlugin.IMAGEWIDTH]),
-        int(tags[TiffImagePlugin.IMAGELENGTH]),
-        complete=None,
-        orientation=orientation if orientation in range(1, 9) else 1,
-        bits=int(max(bits) if isinstance(bits, tuple) else bits),
-        alpha=any(kind in (1, 2) for kind in np.ravel(tags.get(EXTRA_SAMPLES, 0))),
-        grey=tags.get(SAMPLES, 1) == 1,
-        profile=profile if isinstance(profile, bytes) else b"",
-        is_tiff=True,
-    )
+    try:
+        image = form(bounded(file))
+        tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
+        orientation = tags.get(ExifTags.Base.Orientation, 1)
+        if not tags:
+            orientation = _exif_orientation(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))
+        return ImageHeader(
+            *image.size,
+            complete=None,
+            orientation=orientation,
+            bits=int(np.max(tags.get(TiffImagePlugin.BITSPERSAMPLE, 8))),
+            alpha=image.has_transparency_data,
+            grey=len(image.getbands()) == 1 and image.mode != "P",
+            profile=image.info.get("icc_profile") or b"",
+            is_tiff=bool(tags),
+        )
+    except HEADER_ERRORS:
+        return None
 
 
 def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlugin.ImageFileDirectory_v2:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import UnreadableImageError
 from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced, used_bits
-from modp_ti.inputs.sources.colour_profile import in_srgb, profile_name
+from modp_ti.inputs.sources.colour_profile import in_srgb, way_to_srgb
 from modp_ti.inputs.sources.heif import decoded_heif, is_heif
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header
@@ -71,10 +70,6 @@ class ListedImages(ImageSource):
                 return self._by_stem[tail]
         return None
 
-    def header(self, name: str) -> ImageHeader | None:
-        """Return the header of the image; None if it cannot be read."""
-        return self._headers.get(name)
-
     def with_stem(self, stem: str) -> str | None:
         """Return the image whose path without suffix is `stem`, or None."""
         return self._by_stem.get(stem)
@@ -85,7 +80,7 @@ class ListedImages(ImageSource):
         Raises:
             UnreadableImageError: If the image is unreadable or truncated.
         """
-        turn, _ = self.turn(name), self._bits  # both add their notes when the source is opened
+        turn, _, _ = self.turn(name), self._bits, self._transparent  # they add their notes when the source is opened
         try:
             with self._open(name) as file:
                 header = read_image_header(file)
@@ -114,15 +109,16 @@ class ListedImages(ImageSource):
         data, header = self._checked(name)
         image = decoded(data, bits, header)
         if image is None:
-            raise self._unreadable(name, why_undecoded(data))
+            deep = decoded_as(data, -1)  # as it is stored
+            what = "it is damaged or no image" if deep is None else f"{deep.dtype} is not read: convert it to 16 bits"
+            raise self._unreadable(name, what)
         return turn.image(image)
 
     def valid(self, name: str) -> NDArray[np.bool_] | None:
         """Return the pixels (H, W) whose alpha is at least half, turned upright; None if there is no alpha."""
         if name not in self._transparent:
             return None
-        data, header = self._checked(name)
-        alpha = _alpha(data, header)
+        alpha = _alpha(*self._checked(name))
         return None if alpha is None else self.turn(name).image(alpha)
 
     def leave_out(self, names: Collection[str]) -> None:
@@ -160,36 +156,38 @@ class ListedImages(ImageSource):
     @cached_property
     def _turns(self) -> dict[str, Turn]:
         """The turn of each image that is not kept as it is stored, by name."""
-        turns, note = turns_of(self._headers)
+        turns, note = turns_of(self.headers)
         if note is not None:
             self.add_note(f"{self.path}: {note}")
-        names = Counter(profile_name(header.profile) for header in self._headers.values())
-        names.pop(None, None)
-        if names:
-            count = f"{names.total()} of {len(self)} images are" if names.total() < len(self) else "the images are"
-            self.add_note(f"{self.path}: {count} of colours of {', '.join(map(str, names))}: converted to sRGB")
-        if self._transparent:
-            self.add_note(f"{self.path}: transparent pixels are masked ({len(self._transparent)} images have alpha)")
+        if any(way_to_srgb(header.profile) for header in self.headers.values()):
+            self.add_note(
+                f"{self.path}: the images have a colour profile other than sRGB's: they are converted to sRGB"
+            )
         return turns
 
     @cached_property
     def _transparent(self) -> frozenset[str]:
-        """The images whose alpha is a mask: none if it is all opaque, or all transparent, in some of them."""
-        names = [name for name, header in self._headers.items() if header.alpha]
-        some = []
+        """The images whose alpha is a mask: those that have one, unless it is 0 everywhere in some of them."""
+        names = [name for name, header in self.headers.items() if header.alpha]
+        some: list[NDArray[np.bool_]] = []
         for name in names[:: max(1, len(names) // SAMPLED)]:
             with suppress(UnreadableImageError):
-                some.append(_alpha(*self._checked(name)))
-        masked = any(alpha is not None and not alpha.all() for alpha in some)
-        if masked and not any(alpha is None or alpha.any() for alpha in some):
-            self.add_note(f"{self.path}: the alpha of the images is 0 everywhere: not used")
-            return frozenset()
-        return frozenset(names if masked else ())
+                alpha = _alpha(*self._checked(name))
+                some += [] if alpha is None else [alpha]
+        used = not some or any(alpha.any() for alpha in some)
+        if not all(alpha.all() for alpha in some):
+            what = (
+                "pixels of less than half the alpha are masked"
+                if used
+                else "their alpha is 0 everywhere: it is not used"
+            )
+            self.add_note(f"{self.path}: of the images with an alpha channel, {what}")
+        return frozenset(names if used else ())
 
     @cached_property
     def _bits(self) -> int:
         """How many bits the images of 16 bits per channel use, by some of them; 16 where there are none."""
-        deep = [name for name in self.names if name not in self._headers or self._headers[name].bits > 8]
+        deep = [name for name in self.names if name not in self.headers or self.headers[name].bits > 8]
         images: list[NDArray] = []
         for name in deep[:: max(1, len(deep) // SAMPLED)]:
             with suppress(UnreadableImageError):
@@ -203,7 +201,7 @@ class ListedImages(ImageSource):
         return bits
 
     @cached_property
-    def _headers(self) -> dict[str, ImageHeader]:
+    def headers(self) -> dict[str, ImageHeader]:
         """The header of each file that `read_image_header` can read, by name. All are read at once."""
         headers = {}
         for name in self.names:
@@ -239,16 +237,6 @@ def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = No
         return None
     rgb = np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)
     return _as_stored(in_srgb(rgb, profile), header)
-
-
-def why_undecoded(data: bytes) -> str:
-    """Return why an image file whose header is fine could not be decoded."""
-    import cv2
-
-    image = decoded_as(data, cv2.IMREAD_UNCHANGED)
-    if image is not None and image.dtype.kind == "f":
-        return "its values are floating-point numbers: convert it to 8 or 16 bits"
-    return "it is damaged or no image"
 
 
 def _as_stored(image: NDArray[Scalar], header: ImageHeader | None) -> NDArray[Scalar]:

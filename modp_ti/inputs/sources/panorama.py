@@ -111,12 +111,9 @@ def projection_of(settings: PanoramaSettings, width: int, height: int, what: str
 def looks_panoramic(image: NDArray[np.uint8]) -> bool:
     """Whether an image (H, W, 3) is probably equirectangular.
 
-    It is twice as wide as high, its left and right edges show the same, which is not uniform, and the top and the
-    bottom row, each the surroundings of one direction, are uniform.
+    Its left and right edges show the same, which is not uniform; the top and the bottom row, each around one direction,
+    are uniform.
     """
-    height, width = image.shape[:2]
-    if width != 2 * height:
-        return False
     values = image.astype(np.int64)
     left, right = values[:, 0], values[:, -1]
     steps = np.abs(values[:, 1] - left).mean() + np.abs(values[:, -2] - right).mean()
