@@ -180,8 +180,9 @@ def _header_by_pillow(file: BinaryIO, form: type[ImageFile.ImageFile]) -> ImageH
         orientation = tags.get(ExifTags.Base.Orientation, 1)
         if not tags:
             orientation = _exif_orientation(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))
+        size = (TiffImagePlugin.IMAGEWIDTH, TiffImagePlugin.IMAGELENGTH)  # Pillow states that of the upright image
         return ImageHeader(
-            *image.size,
+            *([int(tags[tag]) for tag in size] if tags else image.size),
             complete=None,
             orientation=orientation,
             bits=int(np.max(tags.get(TiffImagePlugin.BITSPERSAMPLE, 8))),
