@@ -15,7 +15,7 @@ from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.association import associate
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame, checked_numbers, opencv_pose, plausible_camera
 from modp_ti.inputs.captures.tables import read_lines, read_numbers
-from modp_ti.inputs.sources.distortion import Distortion, lens_of_model
+from modp_ti.inputs.sources.distortion import EQUIDISTANT, PLUMB_BOB, Distortion, lens_of_model
 
 __all__ = ["is_euroc", "read_euroc"]
 
@@ -106,6 +106,8 @@ def _lens(sensor: dict[str, Any], where: str) -> Distortion:
     model, values = str(sensor.get("distortion_model", "none")).lower(), sensor.get("distortion_coefficients")
     if model in ("none", "null"):
         return Distortion()
+    if model not in (*PLUMB_BOB, *EQUIDISTANT):
+        raise InputError(f"{where}: the lens model {model[:40]!r} is not supported (radial-tangential, equidistant)")
     count = len(values) if isinstance(values, list) and len(values) in (5, 8) else 4
     return lens_of_model(model, checked_numbers(values, count, f"{where}: `distortion_coefficients`"), where)
 

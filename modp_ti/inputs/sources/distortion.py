@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["NO_DISTORTION", "Distortion", "colmap_intrinsics", "lens_of_model"]
+__all__ = ["EQUIDISTANT", "NO_DISTORTION", "PLUMB_BOB", "Distortion", "colmap_intrinsics", "lens_of_model"]
 
 Points = NDArray[np.float64]
 
 TABLE_SIZE = 4096
 # Newton's method ends for a point whose error in distorted coordinates is smaller. Rounding is some 1e-16.
 CONVERGED = 1e-14
+# Names of two lens models.
 PLUMB_BOB, EQUIDISTANT = ("plumb_bob", "radial-tangential", "radtan"), ("equidistant", "equi", "fisheye")
 
 

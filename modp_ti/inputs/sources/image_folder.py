@@ -25,7 +25,6 @@ __all__ = ["IMAGE_SUFFIXES", "ImageFolder", "natural_key", "times_of_names"]
 UNITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}
 NOT_READ = tuple(".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .pef .srw .jxl .gif .exr .hdr .tga .psd .jxr .svg".split())
 """Suffixes of pictures that are not read."""
-RECORDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv", ".vrs", ".bag", ".mcap", ".db3", ".r3d", ".zip")
 BESIDE = re.compile(r"(?:^|/)(?:masks?|depths?|depth_?maps?|confidences?|normals?)/", re.IGNORECASE)
 SECONDS = re.compile(r"[0-9]{10}\.[0-9]{2,}")
 
@@ -69,19 +68,20 @@ class ImageFolder(ListedImages):
             inside = Path(folder).relative_to(path)
             files += [(inside / name).as_posix() for name in names if not name.startswith(".")]
         found = [name for name in files if name.lower().endswith(IMAGE_SUFFIXES)]
-        stems = {PurePosixPath(name).with_suffix("") for name in found}  # cameras write raw files beside JPEG ones
-        pure = [PurePosixPath(name) for name in files if name.lower().endswith(NOT_READ)]
-        others = Counter(name.suffix.lower() for name in pure if name.with_suffix("") not in stems)
-        passed = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
+        pure = [PurePosixPath(name) for name in files]
         if not found:
-            recordings = [name for name in sorted(files) if name.lower().endswith(RECORDINGS)]
-            hint = f"; it holds {passed}, which are not read: convert them to JPEG or PNG" if passed else ""
-            hint = f"; it holds {recordings[0]}: name that file" if recordings else hint
-            raise InputError(f"{path}: holds no image ({', '.join(IMAGE_SUFFIXES)}){hint} ({setting})")
+            kinds = Counter(name.suffix.lower() for name in pure).most_common(3)
+            there = ", ".join(f"{count} {suffix or 'files without suffix'}" for suffix, count in kinds)
+            raise InputError(
+                f"{path}: holds no image ({', '.join(IMAGE_SUFFIXES)}), but {there or 'nothing'}: convert pictures to "
+                f"JPEG or PNG, and name a recording itself ({setting})"
+            )
         notes = []
         if setting == "source.path":
+            stems = {PurePosixPath(name).with_suffix("") for name in found}  # cameras write raw files beside JPEG ones
+            passed = [name for name in pure if name.suffix.lower() in NOT_READ and name.with_suffix("") not in stems]
             if passed:
-                notes.append(f"{path}: {passed} are not read and passed over: convert them to JPEG or PNG to use them")
+                notes.append(f"{path}: {len(passed)} pictures are of formats that are not read, such as {passed[0]}")
             found, left_out = _frames(path, found)
             if left_out:
                 notes.append(f"{path}: {len(left_out)} depth maps or masks are not mapped, such as {left_out[0]}")
@@ -98,14 +98,12 @@ def _frames(path: Path, found: list[str]) -> tuple[list[str], list[str]]:
         kinds.setdefault(re.sub("[0-9]+", "0", name), []).append(name)
     depths = {name for names in kinds.values() if _is_depth(path / names[0]) for name in names}
     stems = {PurePosixPath(name).stem for name in found if not BESIDE.search(name)}
-    left_out = [
-        name
-        for name, stem in ((name, PurePosixPath(name).stem) for name in found)
-        if name in depths or (BESIDE.search(name) and {stem, PurePosixPath(stem).stem} & stems)
-    ]
+    pure = [PurePosixPath(name) for name in found if BESIDE.search(name)]
+    beside = {str(name) for name in pure if {name.stem, name.with_suffix("").stem} & stems}
+    left_out = depths | beside
     if len(left_out) in (0, len(found)):
         return found, []
-    return [name for name in found if name not in set(left_out)], sorted(left_out, key=natural_key)
+    return [name for name in found if name not in left_out], sorted(left_out, key=natural_key)
 
 
 def _is_depth(path: Path) -> bool:

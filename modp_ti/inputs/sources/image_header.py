@@ -191,7 +191,7 @@ def _header_by_pillow(file: BinaryIO, form: type[ImageFile.ImageFile]) -> ImageH
             profile=image.info.get("icc_profile") or b"",
             is_tiff=bool(tags),
         )
-    except HEADER_ERRORS:
+    except (*HEADER_ERRORS, EOFError, RuntimeError, MemoryError):
         return None
 
 

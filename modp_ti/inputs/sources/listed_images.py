@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from modp_ti.inputs.sources.heif import decoded_heif, is_heif
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.orientation import AS_STORED, Scalar, Turn, turn_of_exif, turns_of
+from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turn_of_exif, turns_of
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 
 __all__ = ["ListedImages", "decoded", "decoded_as", "quiet_opencv"]
@@ -160,28 +160,22 @@ class ListedImages(ImageSource):
         if note is not None:
             self.add_note(f"{self.path}: {note}")
         if any(way_to_srgb(header.profile) for header in self.headers.values()):
-            self.add_note(
-                f"{self.path}: the images have a colour profile other than sRGB's: they are converted to sRGB"
-            )
+            self.add_note(f"{self.path}: images of another colour profile than sRGB are converted to sRGB")
         return turns
 
     @cached_property
     def _transparent(self) -> frozenset[str]:
         """The images whose alpha is a mask: those that have one, unless it is 0 everywhere in some of them."""
         names = [name for name, header in self.headers.items() if header.alpha]
-        some: list[NDArray[np.bool_]] = []
+        some = []
         for name in names[:: max(1, len(names) // SAMPLED)]:
             with suppress(UnreadableImageError):
                 alpha = _alpha(*self._checked(name))
-                some += [] if alpha is None else [alpha]
-        used = not some or any(alpha.any() for alpha in some)
-        if not all(alpha.all() for alpha in some):
-            what = (
-                "pixels of less than half the alpha are masked"
-                if used
-                else "their alpha is 0 everywhere: it is not used"
-            )
-            self.add_note(f"{self.path}: of the images with an alpha channel, {what}")
+                some.append(True if alpha is None else alpha)
+        used = not some or any(map(np.any, some))
+        if not all(map(np.all, some)):
+            what = "where their alpha is below half" if used else "nowhere, as their alpha is 0 everywhere"
+            self.add_note(f"{self.path}: images with an alpha channel are masked {what}")
         return frozenset(names if used else ())
 
     @cached_property
@@ -239,7 +233,7 @@ def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = No
     return _as_stored(in_srgb(rgb, profile), header)
 
 
-def _as_stored(image: NDArray[Scalar], header: ImageHeader | None) -> NDArray[Scalar]:
+def _as_stored(image: NDArray[Any], header: ImageHeader | None) -> NDArray[Any]:
     """Undo what OpenCV does to the image of a TIFF file, which it turns as EXIF says."""
     if header is None or not header.is_tiff or header.orientation == 1:
         return image

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,7 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.sources.distortion import Distortion
 from modp_ti.inputs.sources.image_header import ImageHeader
 
-__all__ = ["AS_STORED", "Scalar", "Turn", "turn_of_exif", "turns_of"]
-
-Scalar = TypeVar("Scalar", bound=np.generic)
+__all__ = ["AS_STORED", "Turn", "turn_of_exif", "turns_of"]
 
 
 @dataclass(frozen=True)
@@ -34,13 +32,13 @@ class Turn:
         """Return the size (width, height) of the turned image."""
         return (height, width) if self.quarters % 2 else (width, height)
 
-    def image(self, stored: NDArray[Scalar]) -> NDArray[Scalar]:
+    def image(self, stored: NDArray[Any]) -> NDArray[Any]:
         """Turn an image (H, W, ...)."""
         if self == AS_STORED:
             return stored
         return np.ascontiguousarray(np.rot90(stored[:, ::-1] if self.mirrored else stored, -self.quarters))
 
-    def stored(self, turned: NDArray[Scalar]) -> NDArray[Scalar]:
+    def stored(self, turned: NDArray[Any]) -> NDArray[Any]:
         """Undo the turn of an image (H, W, ...)."""
         back = np.rot90(turned, self.quarters)
         return back[:, ::-1] if self.mirrored else back

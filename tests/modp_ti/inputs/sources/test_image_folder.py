@@ -53,7 +53,7 @@ def test_pictures_that_are_not_read_are_counted_unless_their_jpeg_is_there(folde
     assert folder("a.jpg", "b.jpg").notes == []
     (tmp_path / "c.cr2").touch()
     (note,) = ImageFolder(tmp_path).notes
-    assert "1 .cr2" in note and "dng" not in note
+    assert "c.cr2" in note and "DNG" not in note
 
 
 @pytest.mark.parametrize("beside", ["depth/1.png", "1.depth.png", "masks/1.png", "left/mask/1.jpg.png"])
