@@ -124,15 +124,20 @@ class Messages:
 
 
 def write_bag(
-    path: Path, form: str, messages: Iterable[tuple[str, int, Any]], packed: str = "", defined: bool = True
+    path: Path,
+    form: str,
+    messages: Iterable[tuple[str, int, Any]],
+    packed: str = "",
+    defined: bool = True,
+    store: Any = None,
 ) -> Path:
     """Write topic, time of recording [ns] and content of messages, and return the path of the bag.
 
     form: `ros1` (a file), `sqlite3` or `mcap` (folders). packed: how chunks are packed by ROS 1, or what by ROS 2.
-    defined: whether the bag has the definitions of the messages.
+    defined: whether the bag has the definitions of the messages. store: their types, those of ROS if None.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    store = Messages(form).store
+    store = Messages(form).store if store is None else store
     if form == "ros1":
         writer: Any = Writer1(path)
         if packed:

@@ -23,12 +23,13 @@ __all__ = ["EXAMPLES", "check", "inspect_scene"]
 EXAMPLES = examples(
     "modp-ti check scene.yaml",
     "modp-ti check scene.yaml --quiet && modp-ti run scene.yaml",
+    "modp-ti check room.mp4   (or a folder, as for modp-ti run)",
     "modp-ti check scene.yaml --json > check.json",
 )
 
 
 def check(
-    scene: Annotated[Path, typer.Argument(help="scene file (YAML); its paths are relative to it")],
+    scene: Annotated[Path, typer.Argument(help="scene file (YAML), whose paths are relative to it; or a recording")],
     set_: Overrides = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -36,18 +37,20 @@ def check(
     """Look a scene's input over without mapping it. Exit code: 0 fine, 1 with warnings, 2 unusable."""
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for the readers to load.
-        from modp_ti.config.scene_file import load_scene
         from modp_ti.files.run_folder import require_usable
         from modp_ti.files.terminal import CleanConsole
+        from modp_ti.inputs.bare_recording import is_recording, named_scene
         from modp_ti.inputs.inspection import report as reports
         from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
         from modp_ti.inputs.scene_paths import refuse_output_in_input
+        from modp_ti.outputs.progress import ProgressLine
 
         try:
-            config = load_scene(scene, set_ or [])
-            refuse_output_in_input(config, scene.resolve().parent)
+            console = progress_console(quiet)
+            config = named_scene(scene, set_ or [], say=ProgressLine(console).note)
+            refuse_output_in_input(config, Path.cwd() if is_recording(scene) else scene.resolve().parent)
             require_usable(config.output)
-            report = inspect_scene(config, progress_console(quiet))
+            report = inspect_scene(config, console)
         except InputError as error:
             report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", one_line(error))])
         result.code = verdict(report.findings)[1]

@@ -105,6 +105,8 @@ def run(
             "go on with (--resume OUT)"
         )
     with outcome(as_json) as result:
+        if scene is not None and any("=" not in word for word in more or []):
+            raise InputError("one recording at a time: `modp-ti batch` maps several; of pictures, name their folder")
         overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
         if onto is not None:
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
@@ -159,7 +161,7 @@ def _run(
             raise InputError(f"{scene}: --resume has the recording already; leave it out")
         config, snapshot = load_resumed(resume, scene, overrides, preset)
     else:
-        config = _new_scene(scene, stream, overrides, preset)
+        config = _new_scene(scene, stream, overrides, preset, quiet)
         at = Path.cwd() if scene is None or is_recording(scene) else scene.resolve().parent
         refuse_output_in_input(config, at)
         require_usable(config.output)  # once more in the run: here, before Taichi is loaded
@@ -178,15 +180,17 @@ def _run(
     return folder
 
 
-def _new_scene(scene: Path | None, stream: str | None, overrides: list[str], preset: str | None) -> SceneConfig:
+def _new_scene(
+    scene: Path | None, stream: str | None, overrides: list[str], preset: str | None, quiet: bool
+) -> SceneConfig:
     """Return the settings of a scene file, of a recording, or of a stream."""
-    from modp_ti.config.scene_file import load_scene
-    from modp_ti.inputs.bare_recording import is_recording, recorded_scene, streamed_scene
+    from modp_ti.inputs.bare_recording import named_scene, streamed_scene
+    from modp_ti.outputs.progress import ProgressLine
 
     if stream is not None:
         return streamed_scene(stream, overrides, preset)
     assert scene is not None, "run() asks for one of them"
-    return recorded_scene(scene, overrides, preset) if is_recording(scene) else load_scene(scene, overrides, preset)
+    return named_scene(scene, overrides, preset, say=ProgressLine(progress_console(quiet)).note)
 
 
 def _replay(recorded: Path, overrides: list[str], quiet: bool) -> Path:

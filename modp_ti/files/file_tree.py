@@ -137,13 +137,14 @@ def open_tree(path: Path) -> list[FileTree]:
     """Open a folder or an archive.
 
     Returns:
-        The tree, and for an archive with a top folder the tree below that as well.
+        The tree, and if one folder holds the files that matter, as in most archives, the tree below that as well.
 
     Raises:
         InputError: If it is neither.
     """
     if path.is_dir():
-        return [Folder(path)]
+        folders = [each for each in path.iterdir() if each.is_dir() and not _is_of_system(each.name)]
+        return [Folder(path), *map(Folder, folders[:1] if len(folders) == 1 else ())]
     archive = Archive(path)
     inner = archive.without_top()
     return [archive] if inner is archive else [archive, inner]

@@ -7,59 +7,172 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files.errors import InputError
+from modp_ti.files import exists, is_file
+from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.bags import SUFFIXES, has_poses
 from modp_ti.inputs.captures import ARCHIVES, KINDS
-from modp_ti.inputs.opening import recognised_kind
-from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES
+from modp_ti.inputs.opening import is_panoramic, open_source, recognised_kind
+from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageFolder
+from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, is_video
 
-__all__ = ["is_recording", "recorded_scene", "streamed_scene"]
+__all__ = ["is_recording", "named_scene", "recorded_scene", "streamed_scene"]
 
 OUTPUTS = Path("out")
 SCENE = "scene.yaml"
 RECORDING_SUFFIXES = (*VIDEO_SUFFIXES, ".vrs", *ARCHIVES, *SUFFIXES)
 # Longest name of an output folder [characters]. File systems take 255 bytes, and a run adds a suffix for a time.
 MAX_NAME = 60
+SCENE_SUFFIXES, PACKED = (".yaml", ".yml", ".json", ".txt"), (".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
+# Kind of the tracker and file of poses, by `source.kind`, in the order in which they are looked for.
+POSES = {
+    "images": (
+        *(("transforms", "transforms.json"), ("transforms", "transforms_train.json")),
+        *(("colmap", f"{top}/images.*") for top in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")),
+        *(("tum", "groundtruth.txt"), ("tum", "*Trajectory.txt")),
+    ),
+    "tum_rgbd": (("tum", "groundtruth.txt"),),
+    "replica": (("replica", "traj.txt"),),
+    "sevenscenes": (("sevenscenes", "frame-*.pose.txt"), ("sevenscenes", "poses/frame-*.pose.txt")),
+    "release": (("modp", "trajectory.json"),),
+}
+Say = Callable[[str], None]
+
+
+def _silent(what: str) -> None:
+    """Notes that nobody reads."""
 
 
 def is_recording(path: Path) -> bool:
     """Whether the argument of `modp-ti run` is a recording and not a scene file: a folder, video, archive or bag."""
-    return path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES
+    if path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES:
+        return True
+    return path.suffix.lower() not in SCENE_SUFFIXES and is_file(path) and is_video(path)
+
+
+def named_scene(
+    path: Path,
+    overrides: Iterable[str] = (),
+    preset: str | None = None,
+    taken: Collection[Path] = (),
+    say: Say = _silent,
+) -> SceneConfig:
+    """Return the settings of a scene file or, as `recorded_scene` does and with its arguments, of a recording.
+
+    Raises:
+        InputError: As for both; or if it is a URL, one picture or an archive.
+    """
+    suffix = path.suffix.lower()
+    if re.match("[A-Za-z][A-Za-z0-9+]+:/", str(path)) and not exists(path):
+        raise InputError("a URL is mapped as a stream: modp-ti run --stream URL; or load the file down first")
+    if is_file(path) and suffix in (*IMAGE_SUFFIXES, *NOT_READ) and suffix not in VIDEO_SUFFIXES:
+        raise InputError(f"{path}: is one picture: name the folder of all pictures")
+    if suffix in PACKED:
+        raise InputError(f"{path}: is an archive that is not read: unpack it, and name the folder")
+    if is_recording(path):
+        return recorded_scene(path, overrides, preset, taken, say)
+    return load_scene(path, overrides, preset)
 
 
 def recorded_scene(
-    path: Path, overrides: Iterable[str] = (), preset: str | None = None, taken: Collection[Path] = ()
+    path: Path,
+    overrides: Iterable[str] = (),
+    preset: str | None = None,
+    taken: Collection[Path] = (),
+    say: Say = _silent,
 ) -> SceneConfig:
     """Return the settings for a video, a VRS recording, a capture, a ROS bag or a folder that has no scene file.
 
     The output folder is `out/NAME`, where NAME is that of the file without its suffix or of the folder. If it holds
-    the map of another recording, it is `out/NAME-2` and so on.
+    the map of another recording, it is `out/NAME-2` and so on. Poses that lie in the folder are used, unless a setting
+    of `tracker` is given.
 
     Args:
         path: The recording, as for `source.path`, relative to the working directory.
         overrides: As for `load_scene`.
         preset: As for `load_scene`.
         taken: Output folders of other recordings, which are not used.
+        say: Called with a line on what has been found.
 
     Raises:
-        InputError: As for `load_scene`; or if the folder has a scene file, which is probably meant.
+        InputError: As for `load_scene`; or if the folder has a scene file, which is probably meant, or holds several
+            recordings.
     """
-    path = path.expanduser().absolute()
+    path, overrides = path.expanduser().absolute(), list(overrides)
     if (path / SCENE).is_file():
         raise InputError(f"{path} has a {SCENE}: name that file, or the folder of the images")
     name = path.resolve().name if path.is_dir() else path.stem
-    source = {"path": str(path)}
-    kind = recognised_kind(path)
-    tracker = kind if kind in KINDS or (kind == "bag" and has_poses(path)) else "klt"
-    return scene_from_data(_scene(source, _free(name, path, taken), tracker), str(path), overrides, preset)
+    kind, images = recognised_kind(path), path
+    if kind == "images" and path.is_dir():
+        images = _images(path)
+        if not images.is_dir():
+            return recorded_scene(images, overrides, preset, taken, say)
+    output = _free(name, images, taken)
+
+    def settings(tracker: dict[str, Any], *more: str) -> SceneConfig:
+        scene = _scene({"path": str(images)}, output, tracker)
+        return scene_from_data(scene, str(path), [*overrides, *more], preset)
+
+    if kind in KINDS or (kind == "bag" and has_poses(path)):
+        return settings({"kind": kind})
+    config = settings({"kind": "klt"})
+    if any(override.strip().startswith("tracker.") for override in overrides):
+        return config
+    for tracker, pattern in POSES.get(kind, ()):
+        file = next(path.glob(pattern), None)
+        if file is None:
+            continue
+        if tracker == "tum" and not (config.source.intrinsics.given or _is_calibrated(config)):
+            say(f"{file} is not used without source.intrinsics (tracker.kind=tum): klt tracks the images")
+            break
+        say(f"the poses of {file} are used; tracker.kind=klt would track the images alone")
+        given = {} if tracker == "sevenscenes" else {"path": str(file.parent if tracker == "colmap" else file)}
+        return settings({"kind": tracker, **given})
+    if kind == "images" and not config.source.panorama.model_fields_set:
+        first = ImageFolder(images).names[:1]
+        with suppress(UnreadableImageError):
+            if is_panoramic(ListedImages(images, first, [0.0]), first[0]):
+                say(f"{images}: the images see all round: source.panorama.projection=equirectangular")
+                return settings({"kind": "klt"}, "source.panorama.projection=equirectangular")
+    return config
+
+
+def _images(path: Path) -> Path:
+    """Return where the images of a folder of unknown layout are: in it, in its folder `images`, or in its only video.
+
+    Raises:
+        InputError: If it holds recordings instead.
+    """
+    inside = sorted(each for each in path.iterdir() if not each.name.startswith("."))
+    if any(each.suffix.lower() in IMAGE_SUFFIXES for each in inside):
+        return path
+    if (path / "images").is_dir():
+        return path / "images"
+    folders = [each for each in inside if each.is_dir()]
+    recordings = [each for each in folders if recognised_kind(each) != "images"]
+    if not folders:
+        recordings = [each for each in inside if each.suffix.lower() in RECORDING_SUFFIXES]
+        if len(recordings) == 1:
+            return recordings[0]
+    if recordings:
+        names = ", ".join(each.name for each in recordings[:4])
+        raise InputError(f"{path}: holds recordings ({names}): name one of them, or map all of them by `modp-ti batch`")
+    return path
+
+
+def _is_calibrated(config: SceneConfig) -> bool:
+    images = open_source(config.source)
+    images.close()
+    return images.intrinsics is not None
 
 
 def streamed_scene(stream: str, overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
@@ -77,11 +190,11 @@ def streamed_scene(stream: str, overrides: Iterable[str] = (), preset: str | Non
         InputError: As for `load_scene`.
     """
     source = {"stream": int(stream) if stream.isdecimal() else stream}
-    return scene_from_data(_scene(source, _free(_stream_name(stream))), "--stream", overrides, preset)
+    return scene_from_data(_scene(source, _free(_stream_name(stream)), {"kind": "klt"}), "--stream", overrides, preset)
 
 
-def _scene(source: dict[str, Any], output: Path, tracker: str = "klt") -> dict[str, Any]:
-    return {"source": source, "tracker": {"kind": tracker}, "output": str(output)}
+def _scene(source: dict[str, Any], output: Path, tracker: dict[str, Any]) -> dict[str, Any]:
+    return {"source": source, "tracker": tracker, "output": str(output)}
 
 
 def _stream_name(stream: str) -> str:

@@ -22,12 +22,14 @@ from modp_ti.inputs.sources.data_sets import (
 from modp_ti.inputs.sources.faces import PanoramaFaces
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.intrinsics import given_intrinsics
+from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.paced import PacedSource
+from modp_ti.inputs.sources.panorama import looks_panoramic
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
-from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile
+from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile, is_video
 
-__all__ = ["open_source", "recognised_kind"]
+__all__ = ["is_panoramic", "open_source", "recognised_kind", "require_pinhole"]
 
 
 def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSource:
@@ -66,6 +68,28 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
     return PacedSource(images) if source.realtime else images
 
 
+def is_panoramic(images: ImageSource, name: str) -> bool:
+    """Whether an image sees all round: it is twice as wide as high, and GPano in its header or its edges say so."""
+    width, height = images.size(name)
+    if width != 2 * height:
+        return False
+    header = images.headers.get(name) if isinstance(images, ListedImages) else None
+    return (header is not None and header.panorama) or looks_panoramic(images.read(name))
+
+
+def require_pinhole(images: ImageSource, source: SourceSettings, name: str) -> None:
+    """Check that images of an unknown camera do not see all round, by one of them, unless `source.panorama` is set.
+
+    Raises:
+        InputError: If they do.
+    """
+    if not source.panorama.model_fields_set and is_panoramic(images, name):
+        raise InputError(
+            f"{images.path}: the images see all round: set source.panorama.projection=equirectangular with "
+            "tracker.kind=klt, or =none if a common lens took them"
+        )
+
+
 def recognised_kind(path: Path) -> str:
     """Return the `source.kind` of a file or folder.
 
@@ -88,7 +112,7 @@ def recognised_kind(path: Path) -> str:
             return kind
         if suffix == ".vrs":
             return "vrs"
-        if suffix in VIDEO_SUFFIXES:
+        if suffix in VIDEO_SUFFIXES or (path.exists() and is_video(path)):
             return "video"
         if path.exists():
             raise InputError(
@@ -124,7 +148,7 @@ def _open_bag(path: Path, source: SourceSettings) -> ImageSource:
 
 
 _OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
-    "images": lambda path, source: ImageFolder(path, source.fps),
+    "images": lambda path, source: ImageFolder(path, source.fps, masks=source.masks),
     "video": lambda path, source: VideoFile(path, source.fps, source.stop),
     "tum_rgbd": lambda path, _: open_tum_rgbd(path),
     "replica": lambda path, source: open_replica(path, source.fps),

@@ -6,8 +6,6 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
-from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +65,7 @@ class StreamDigest:
                 self._take(*(array for array in (event.camera.lookup, event.camera.covered) if array is not None))
             return
         camera, points = event.camera, event.points
-        self._images[event.name] = zlib.adler32(event.rgba)
+        self._images[event.name] = _checksum(event.rgba)
         self.value = zlib.crc32(event.name.encode("utf-8"), self.value)
         numbers = [event.index, event.timestamp, camera.fx, camera.fy, camera.cx, camera.cy]
         self._take(np.array(numbers, dtype=np.float64), event.T_camera_world, points.xyz, points.pixels, points.ids)
@@ -83,7 +81,7 @@ class StreamDigest:
         """
         index = dict(zip(frames.name, frames.index, strict=True))
         for frame in again:
-            if frame.name in index and self._images.get(frame.name) in (None, zlib.adler32(frame.rgba)):
+            if frame.name in index and self._images.get(frame.name) in (None, _checksum(frame.rgba)):
                 yield frame if frame.index == index[frame.name] else replace(frame, index=index[frame.name])
 
     def _take(self, *arrays: np.ndarray) -> None:
@@ -153,7 +151,10 @@ class Snapshot:
 
     def number(self, *keys: str) -> float:
         """Return a count or a number of seconds. Raises ValueError, TypeError or KeyError if it is neither."""
-        number = float(reduce(getitem, keys, self.numbers))
+        value: Any = self.numbers
+        for key in keys:
+            value = value[key]
+        number = float(value)
         if not 0.0 <= number < 1e11:
             raise ValueError(f"{keys[-1]}: {number} is no time and no count")
         return number
@@ -256,3 +257,7 @@ def record_state(record: RunRecord) -> MapState:
 
     groups = {"record": arrays(record.frames, FRAME_COLUMNS), "record_steps": arrays(record.steps, STEP_COLUMNS)}
     return MapState.of(groups, {})
+
+
+def _checksum(image: NDArray[np.uint8]) -> int:
+    return zlib.adler32(np.ascontiguousarray(image).data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,12 +20,13 @@ if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
-__all__ = ["CLOUD", "IMAGES", "INFO", "POSES", "SUFFIXES", "TREES", "Bag", "Place", "has_poses", "is_bag"]
+__all__ = ["CLOUD", "IMAGES", "INFO", "POSES", "SUFFIXES", "TREES", "VIDEO", "Bag", "Place", "has_poses", "is_bag"]
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 """Suffixes of bags: ROS 1, and ROS 2 by sqlite3 and MCAP."""
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+VIDEO = "foxglove_msgs/msg/CompressedVideo"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", VIDEO)
 INFO = "sensor_msgs/msg/CameraInfo"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 # In the order in which they are preferred.
@@ -34,9 +36,13 @@ POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
 )
+# Topics of poses that are where a robot should go, or where an operator says that it is.
+COMMANDS = re.compile("goal|initial_?pose|set_?point|target|way_?point|command|clicked", re.IGNORECASE)
 TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 STATIC = "tf_static"  # last part of the topic of transforms that hold for all times
 
+# Programs that mend a bag that was cut off, by its suffix.
+MENDS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
 LARGE = 1 << 16  # reads of more bytes are checked against the size of the file
 
 
@@ -56,16 +62,17 @@ class Place:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path is a file with a bag's suffix, or a folder that ROS 2 has recorded."""
+    """Whether the path is a file with a bag's suffix, or a folder that ROS 2 has recorded, or that holds only a bag."""
     if path.is_dir():
-        return is_file(path / "metadata.yaml") and bool(_files(path))
+        files = _files(path)
+        return bool(files) and (is_file(path / "metadata.yaml") or [*path.iterdir()] == files)
     return path.suffix in SUFFIXES
 
 
 def has_poses(path: Path) -> bool:
     """Whether a bag holds poses or transforms that change. Raises InputError if it cannot be read."""
     bag = Bag(path)
-    moving = any(topic.rpartition("/")[2] != STATIC for topic in bag.of_types(*POSES, *TREES))
+    moving = any(topic.rpartition("/")[2] != STATIC for topic in [*bag.pose_topics, *bag.of_types(*TREES)])
     bag.close()
     return moving
 
@@ -112,6 +119,8 @@ class Bag:
         self._lock = Lock()
         self._first = files[0].suffix == ".bag"
         self._types = get_typestore(Stores.ROS1_NOETIC if self._first else Stores.ROS2_HUMBLE)
+        # Foxglove's type begins with a time and a frame, which are the bytes of a header.
+        self._types.register(get_types_from_msg("std_msgs/Header header\nuint8[] data\nstring format", VIDEO))
         if self._first:  # the types that ROS 1 ships separately
             for kind in TREES:
                 self._types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
@@ -140,6 +149,11 @@ class Bag:
     def of_types(self, *types: str) -> list[str]:
         """Return the topics of these message types, by type and then by name."""
         return [topic for kind in types for topic, its in sorted(self.topics.items()) if its == kind]
+
+    @property
+    def pose_topics(self) -> list[str]:
+        """The topics of poses, by type and then by name, without those of commands."""
+        return [topic for topic in self.of_types(*POSES) if not COMMANDS.search(topic)]
 
     def chosen(self, topic: str, types: tuple[str, ...], setting: str) -> str:
         """Return a topic that the user has named. Raises InputError if there is none of these types."""
@@ -201,7 +215,8 @@ class Bag:
     @contextmanager
     def _damaged(self, file: Path) -> Iterator[None]:
         """Report what `rosbags` raises as an InputError. It checks little, so that damaged files can raise anything."""
-        with reading(file, "; copy the bag again (source.path)"):
+        mend = MENDS.get(file.suffix, "ros2 bag reindex")
+        with reading(file, f"; if it was cut off, `{mend} {file.name}` mends it (source.path)"):
             yield
 
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.captures.capture import checked_numbers, plausible_camera
-from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, lens_of_model
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 
 __all__ = ["camera_of_info", "info_beside", "is_rectified"]
@@ -31,7 +28,7 @@ def camera_of_info(message: Any, rectified: bool, where: str) -> Intrinsics | No
     if fx == 0.0:
         return None
     D = checked_numbers(values["d"], len(values["d"]), f"{where}: D")
-    lens = NO_DISTORTION if rectified else _lens(message.distortion_model, D, where)
+    lens = NO_DISTORTION if rectified else lens_of_model(message.distortion_model, D, where)
     # The calibration has pixel centres at whole numbers.
     camera = plausible_camera(fx, fy, cx + 0.5, cy + 0.5, (message.width, message.height), where, lens)
     return Intrinsics(camera, lens)
@@ -44,8 +41,9 @@ def info_beside(topic: str, infos: list[str]) -> str | None:
     """
     above = topic.rpartition("/")[0]
     while True:
-        if f"{above}/camera_info" in infos:
-            return f"{above}/camera_info"
+        for beside in (f"{above}/camera_info", f"{above}/info/camera_info"):  # the second one is of RealSense Viewer
+            if beside in infos:
+                return beside
         if not above:
             return infos[0] if len(infos) == 1 else None
         above = above.rpartition("/")[0]
@@ -55,18 +53,3 @@ def is_rectified(topic: str) -> bool:
     """Whether the images of a topic are rectified, by its name."""
     name = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[2]
     return name.startswith("image_rect")
-
-
-def _lens(model: str, D: list[float], where: str) -> Distortion:
-    if not np.any(D):
-        return Distortion(fisheye=True) if model in ("equidistant", "fisheye") else NO_DISTORTION
-    if model == "plumb_bob" and len(D) in (4, 5):
-        return Distortion((D[0], D[1], *D[4:]), tangential=(D[2], D[3]))
-    if model in ("rational_polynomial", "plumb_bob") and len(D) >= 8 and not np.any(D[8:]):
-        return Distortion((D[0], D[1], D[4]), (D[5], D[6], D[7]), (D[2], D[3]))
-    if model in ("equidistant", "fisheye") and len(D) == 4:
-        return Distortion((D[0], D[1], D[2], D[3]), fisheye=True)
-    raise InputError(
-        f"{where}: the lens model {model[:40]!r} of {len(D)} coefficients is not supported (plumb_bob, "
-        "rational_polynomial, equidistant): give source.intrinsics, or the topic of rectified images"
-    )

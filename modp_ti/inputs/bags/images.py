@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,21 @@ from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.bags.bag import IMAGES, INFO, Bag, Place
 from modp_ti.inputs.bags.camera_info import camera_of_info, info_beside, is_rectified
 from modp_ti.inputs.bags.frame_tree import clean, seconds
-from modp_ti.inputs.bags.pictures import is_compressed, is_deep, is_depth, is_grey, picture, picture_size, stored_values
+from modp_ti.inputs.bags.pictures import (
+    begins_video,
+    is_compressed,
+    is_deep,
+    is_depth,
+    is_grey,
+    picture,
+    picture_size,
+    stored_values,
+    video_codec,
+)
 from modp_ti.inputs.sources.bit_depth import DEPTHS, used_bits
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.video_file import VideoFile
 
 __all__ = ["BagImages"]
 
@@ -57,11 +69,13 @@ class BagImages(ImageSource):
         self, path: Path, settings: BagImagesSettings, stop: int | None = None, calibrated: bool = True
     ) -> None:
         self.bag = Bag(path)
+        self._video: VideoFile | None = None
         try:
             self.topic, others = _chosen_topic(self.bag, settings.image)
             first = self.bag.first(self.topic)
             self.frame_id = clean(first.header.frame_id)
-            found, size, left_out = self._listed(stop)
+            codec = video_codec(first)
+            found, size, left_out = self._listed(stop) if codec is None else self._video_listed(codec, stop)
             found.sort(key=lambda image: image.time)
             images = [image for n, image in enumerate(found) if n == 0 or image.time > found[n - 1].time]
             names = [f"{path.stem}_{n:06d}" for n in range(len(images))]
@@ -88,6 +102,8 @@ class BagImages(ImageSource):
         Raises:
             UnreadableImageError: If it is damaged.
         """
+        if self._video is not None:
+            return self._video.read(self._frame_of[self._place[name]])
         message = self.bag.read(self.topic, self._place[name])
         try:
             image = picture(message, self._bits)
@@ -99,6 +115,8 @@ class BagImages(ImageSource):
 
     def close(self) -> None:
         self.bag.close()
+        if self._video is not None:
+            self._video.close()
 
     def _used_bits(self) -> int:
         """Return how many bits the images of 16 bits per channel use, by some of them, with a note."""
@@ -134,6 +152,28 @@ class BagImages(ImageSource):
         if not stamped:
             images = [_Image(image.place.written * 1e-9, image.place) for image in images]
         return images, size, left_out
+
+    def _video_listed(self, codec: str, stop: int | None) -> tuple[list[_Image], tuple[int, int], int]:
+        """Return the same of messages that hold the pictures of a video, which is unpacked to a temporary file."""
+        self._folder = TemporaryDirectory(prefix="modp-ti-")
+        file = Path(self._folder.name) / f"{self.bag.path.stem}.{codec}"
+        images: list[_Image] = []
+        with file.open("wb") as stream:
+            for place, message in self.bag.messages(self.topic):
+                if images or begins_video(message):
+                    stream.write(message.data.tobytes())
+                    images.append(_Image(seconds(message.header.stamp), place))
+        if not images:
+            raise InputError(f"{self.bag.path}: the video of {self.topic} ({codec}) has no start, so none is decoded")
+        self._video = VideoFile(file, stop=stop)
+        images, names = images[:stop], self._video.names
+        if len(names) != len(images):
+            raise InputError(
+                f"{self.bag.path}: {len(images)} messages of {self.topic} hold {len(names)} pictures of a video "
+                f"({codec}), which must be as many: convert it to a video file, and map that"
+            )
+        self._frame_of = {image.place: name for image, name in zip(images, names, strict=True)}
+        return images, self._video.frame_size, 0
 
     def _camera(self, given: str | None) -> Intrinsics | None:
         """Return the camera of the images, with notes on where it comes from; None if the bag does not tell it."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.inputs.bags.bag import VIDEO
 from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import read_image_header
@@ -15,6 +17,7 @@ from modp_ti.inputs.sources.listed_images import decoded
 
 __all__ = [
     "DEPTH_ENCODINGS",
+    "begins_video",
     "is_compressed",
     "is_deep",
     "is_depth",
@@ -22,10 +25,15 @@ __all__ = [
     "picture",
     "picture_size",
     "stored_values",
+    "video_codec",
 ]
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
+# By what the messages of a video may state.
+CODECS = {"h264": "h264", "avc": "h264", "h265": "h265", "hevc": "h265"}
+# The start of a unit of parameters in the stream of a codec.
+PARAMETERS = {"h264": re.compile(rb"\0\0\x01[\x07\x27\x47\x67]"), "h265": re.compile(rb"\0\0\x01[\x40\x42]")}
 
 
 class Layout(NamedTuple):
@@ -63,8 +71,19 @@ LAYOUTS = {
 
 
 def is_compressed(message: Any) -> bool:
-    """Whether an image message is a sensor_msgs/CompressedImage."""
-    return message.__msgtype__ == COMPRESSED
+    """Whether an image message is a sensor_msgs/CompressedImage, or the like for video."""
+    return message.__msgtype__ in (COMPRESSED, VIDEO)
+
+
+def video_codec(message: Any) -> str | None:
+    """Return the codec of an image message that holds a picture of a video, None for others."""
+    stated = message.format.lower() if is_compressed(message) else ""
+    return next((codec for name, codec in CODECS.items() if name in stated), None)
+
+
+def begins_video(message: Any) -> bool:
+    """Whether a picture of a video can be decoded without those before: it brings the stream's parameters."""
+    return PARAMETERS[str(video_codec(message))].search(message.data.tobytes()) is not None
 
 
 def is_depth(message: Any) -> bool:

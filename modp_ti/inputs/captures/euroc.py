@@ -15,11 +15,13 @@ from modp_ti.files.yaml_text import parse_yaml
 from modp_ti.inputs.association import associate
 from modp_ti.inputs.captures.capture import Capture, CapturedFrame, checked_numbers, opencv_pose, plausible_camera
 from modp_ti.inputs.captures.tables import read_lines, read_numbers
-from modp_ti.inputs.sources.distortion import Distortion
+from modp_ti.inputs.sources.distortion import EQUIDISTANT, PLUMB_BOB, Distortion, lens_of_model
 
 __all__ = ["is_euroc", "read_euroc"]
 
-LISTING, SENSOR, TRUTH = "cam0/data.csv", "cam0/sensor.yaml", "state_groundtruth_estimate0/data.csv"
+LISTING, SENSOR = "cam0/data.csv", "cam0/sensor.yaml"
+# The true poses of the body, or those of markers on it: EuRoC's, TUM-VI's and EuRoC's raw ones.
+TRUTHS = "state_groundtruth_estimate0", "mocap0", "vicon0"
 MAX_DIFFERENCE = 0.01  # [s] between an image and its pose; the truth has 200 poses a second
 NANOSECOND = 1e-9
 
@@ -32,7 +34,7 @@ def is_euroc(tree: FileTree) -> bool:
 def read_euroc(tree: FileTree) -> Capture:
     """Read the images of the left camera with the true poses. Images without one, as before the truth begins, stay.
 
-    T_world_camera is T_world_body of the truth times T_BS of the camera.
+    T_world_camera is T_world_body of the truth times T_BS of the camera. A sequence without the truth has no poses.
 
     Raises:
         InputError: If a file is missing or malformed.
@@ -45,19 +47,24 @@ def read_euroc(tree: FileTree) -> Capture:
     lens = _lens(sensor, where)
     # The calibration has pixel centres at whole numbers.
     camera = plausible_camera(fx, fy, cx + 0.5, cy + 0.5, (size[0], size[1]), where, lens)
-    mount = sensor.get("T_BS")
-    mount = mount.get("data") if isinstance(mount, dict) else None
-    T_camera_body = opencv_pose(checked_numbers(mount, 16, f"{where}: `T_BS`"), f"{where}: `T_BS`")
+    T_camera_body = opencv_pose(_mount(sensor, where), f"{where}: `T_BS`")
 
     listed = [_listed(line, f"{tree.path / (top + LISTING)}:{n}") for n, line in read_lines(tree, top + LISTING)]
     there = [(time, f"{top}cam0/data/{name}") for time, name in listed if tree.has(f"{top}cam0/data/{name}")]
     if not there:
         raise InputError(f"{tree.path / (top + LISTING)}: none of its {len(listed)} images is there")
-    rows, lines = read_numbers(tree, top + TRUTH, 8, "time, px, py, pz, qw, qx, qy, qz, ...")
-    of_line = lambda n: f"{tree.path / (top + TRUTH)}:{lines[n]}"  # noqa: E731
-    T_world_body = poses_of_quaternions(rows[:, 1:4], rows[:, [5, 6, 7, 4]], of_line)
-    times = np.array([time for time, _ in there])
-    pose_of = dict(associate(times, rows[:, 0] * NANOSECOND, MAX_DIFFERENCE).tolist())
+    folder = next((name for name in TRUTHS if tree.has(f"{top}{name}/data.csv")), TRUTHS[0])
+    origin, markers = f"{top}{folder}/data.csv", f"{top}{folder}/sensor.yaml"
+    pose_of, T_world_body = {}, np.zeros((0, 4, 4))
+    if tree.has(origin):
+        rows, lines = read_numbers(tree, origin, 8, "time, px, py, pz, qw, qx, qy, qz, ...")
+        of_line = lambda n: f"{tree.path / origin}:{lines[n]}"  # noqa: E731
+        T_world_body = poses_of_quaternions(rows[:, 1:4], rows[:, [5, 6, 7, 4]], of_line)
+        if folder != TRUTHS[0] and tree.has(markers):
+            T_world_body = T_world_body @ opencv_pose(_mount(_sensor(tree, markers), markers), f"{markers}: `T_BS`")
+        pose_of = dict(
+            associate(np.array([time for time, _ in there]), rows[:, 0] * NANOSECOND, MAX_DIFFERENCE).tolist()
+        )
     frames = []
     for n, (time, name) in enumerate(there):
         T = T_camera_body @ inverse_se3(T_world_body[pose_of[n]]) if n in pose_of else None
@@ -65,7 +72,7 @@ def read_euroc(tree: FileTree) -> Capture:
     notes = [f"{tree.path}: is a sequence in EuRoC's layout, of which the left camera is used"]
     if len(there) < len(listed):
         notes.append(f"{len(listed) - len(there)} of the {len(listed)} images that {top}{LISTING} lists are not there")
-    return Capture("euroc", tree, top + TRUTH, frames, notes)
+    return Capture("euroc", tree, origin, frames, notes)
 
 
 def _top(tree: FileTree) -> str | None:
@@ -83,17 +90,20 @@ def _sensor(tree: FileTree, name: str) -> dict[str, Any]:
     return data
 
 
+def _mount(sensor: dict[str, Any], where: str) -> list[float]:
+    """The numbers of `T_BS`, sensor to body, row by row."""
+    mount = sensor.get("T_BS")
+    return checked_numbers(mount.get("data") if isinstance(mount, dict) else None, 16, f"{where}: `T_BS`")
+
+
 def _lens(sensor: dict[str, Any], where: str) -> Distortion:
-    model = str(sensor.get("distortion_model", "none")).lower()
-    values = sensor.get("distortion_coefficients")
+    model, values = str(sensor.get("distortion_model", "none")).lower(), sensor.get("distortion_coefficients")
     if model in ("none", "null"):
         return Distortion()
-    k1, k2, third, fourth = checked_numbers(values, 4, f"{where}: `distortion_coefficients`")
-    if model in ("radial-tangential", "radtan", "plumb_bob"):
-        return Distortion((k1, k2), tangential=(third, fourth))
-    if model in ("equidistant", "equi", "fisheye"):
-        return Distortion((k1, k2, third, fourth), fisheye=True)
-    raise InputError(f"{where}: the lens model {model[:40]!r} is not supported (radial-tangential, equidistant)")
+    if model not in (*PLUMB_BOB, *EQUIDISTANT):
+        raise InputError(f"{where}: the lens model {model[:40]!r} is not supported (radial-tangential, equidistant)")
+    count = len(values) if isinstance(values, list) and len(values) in (5, 8) else 4
+    return lens_of_model(model, checked_numbers(values, count, f"{where}: `distortion_coefficients`"), where)
 
 
 def _listed(line: str, where: str) -> tuple[float, str]:

@@ -16,6 +16,7 @@ from modp_ti.inputs.captures.capture import Capture
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.undistortion import both_valid
 from modp_ti.inputs.sources.video_file import VideoFile
 
 __all__ = ["CaptureImages", "open_capture_images"]
@@ -45,12 +46,13 @@ class CaptureImages(ListedImages):
     def valid(self, name: str) -> NDArray[np.bool_] | None:
         assert self.capture is not None
         border = self.capture.border
+        seen = super().valid(name)
         if not border:
-            return None
+            return seen
         width, height = self.size(name)
         mask = np.zeros((height, width), dtype=bool)
         mask[border:-border, border:-border] = True
-        return mask
+        return both_valid(mask, seen)
 
     def close(self) -> None:
         assert self.capture is not None
@@ -77,7 +79,7 @@ def open_capture_images(path: Path, kind: str, fps: float, stop: int | None) -> 
         images: ImageSource = CaptureImages(capture)
         images.intrinsics = Intrinsics(first.camera, first.lens)
         return images
-    images = VideoFile(path / capture.video, fps, stop)
+    images = VideoFile(capture.tree.path / capture.video, fps, stop)
     count, posed = len(images.names), len(capture.frames)
     size = images.frame_size
     frames = [

@@ -27,7 +27,7 @@ def read_kitti(tree: FileTree) -> Capture:
     """Read the images of one camera, the left colour one if it is there.
 
     The poses are those of camera 0, from `poses.txt` in the folder or `poses/NAME.txt` two folders up. The offset of
-    another camera is that of its projection matrix.
+    another camera is that of its projection matrix. Sequences 11 to 21 have none.
 
     Raises:
         InputError: If a file is missing or malformed.
@@ -51,7 +51,9 @@ def read_kitti(tree: FileTree) -> Capture:
 
     times, _ = read_numbers(tree, TIMES, 1, "the time of an image [s]")
     place, file = _poses_file(tree)
-    rows, lines = read_numbers(place, file, 12, "a 3x4 matrix, camera to world, row by row")
+    rows, lines = np.zeros((0, 12)), []
+    if place.has(file):
+        rows, lines = read_numbers(place, file, 12, "a 3x4 matrix, camera to world, row by row")
     frames = []
     for n, name in enumerate(images[: len(times)]):
         T = opencv_pose(rows[n], f"{place.path / file}:{lines[n]}") if n < len(rows) else None
@@ -78,11 +80,6 @@ def _projection(tree: FileTree, camera: int) -> np.ndarray:
 
 
 def _poses_file(tree: FileTree) -> tuple[FileTree, str]:
-    """Return the file of the poses, and the folder that it lies in."""
-    if tree.has("poses.txt"):
-        return tree, "poses.txt"
-    name = tree.path.resolve().name
-    above = Folder(tree.path.resolve().parent.parent)
-    if above.has(f"poses/{name}.txt"):
-        return above, f"poses/{name}.txt"
-    raise InputError(f"{tree.path}: its poses are neither in poses.txt nor in {above.path / 'poses' / name}.txt")
+    """Return the file of the poses, which need not be there, and the folder that it lies in."""
+    name, above = f"poses/{tree.path.resolve().name}.txt", Folder(tree.path.resolve().parent.parent)
+    return (tree, "poses.txt") if tree.has("poses.txt") else (above, name)

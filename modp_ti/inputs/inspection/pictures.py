@@ -52,7 +52,7 @@ def blurred(frames: Sequence[FrameRecord]) -> list[int]:
 @each_view
 def duplicates(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames whose image repeats the one before."""
-    return [i for i, frame in enumerate(frames) if frame.change < SAME]
+    return [i for i, frame in enumerate(frames) if frame.change < SAME and frame.masked < 1]
 
 
 @each_view

@@ -15,7 +15,7 @@ from modp_ti.inputs.klt.calibration import ADVICE, TYPICAL_FOCAL, estimated_intr
 from modp_ti.inputs.klt.pose_graph import solver_is_there
 from modp_ti.inputs.klt.selected_images import available, followed_scale, read_image, require_size
 from modp_ti.inputs.klt.tracker import KltTracker
-from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.opening import open_source, require_pinhole
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import readable_sizes
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, require_intrinsics
@@ -71,6 +71,8 @@ def open_klt(
     intrinsics = None if images.intrinsics is None else require_intrinsics(images)
     blank = Intrinsics(PinholeCamera(max(width, height), max(width, height), width / 2, height / 2, width, height))
     reader.require_fitting([(name, (intrinsics or blank).undistorter(1.0)) for name in there])
+    if intrinsics is None and images.arrivals is None:
+        require_pinhole(images, source, there[0])
     if intrinsics is None and images.arrivals is not None:
         intrinsics, note = _guessed(reader, blank)
         return KltTracker(reader, intrinsics, seed, [note], is_guess=True, loops=loops)

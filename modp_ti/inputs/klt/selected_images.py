@@ -44,6 +44,6 @@ def require_size(images: ImageSource, name: str, size: tuple[int, int], first: t
     """Raise InputError if an image is not of the first one's size (width, height)."""
     if size != first:
         raise InputError(
-            f"{images.path / name} is {size[0]}x{size[1]}, the first image {first[0]}x{first[1]}: all images of a "
-            "scene must have one size"
+            f"{images.path / name} is {size[0]}x{size[1]}, the first image {first[0]}x{first[1]}: klt follows images "
+            "of one size; take the others out, or set tracker.kind=sfm"
         )

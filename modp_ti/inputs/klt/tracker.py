@@ -249,7 +249,7 @@ class KltTracker(Tracker):
             before = "" if images.ending is None else f" before the recording ended ({images.ending})"
             raise InputError(
                 f"{images.path}: klt could place none of the {len(names)} images{before}: they need texture, and a "
-                "camera that moves sideways and does not only turn"
+                "camera that moves sideways and does not only turn; photographs in no order need tracker.kind=sfm"
             )
         if self._odometry.loops:
             self._notes.append(f"klt closed {self._odometry.loops} loops")
@@ -264,7 +264,8 @@ class KltTracker(Tracker):
         if without:
             self._notes.append(
                 f"{len(without)} of {len(names)} images could not be placed (the first is {without[0]}): skipped; the "
-                f"camera was found again {self._odometry.recovered} times"
+                f"camera was found again {self._odometry.recovered} times; photographs in no order need "
+                "tracker.kind=sfm"
             )
         apart = self._odometry.waiting
         if apart:

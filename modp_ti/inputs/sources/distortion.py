@@ -9,13 +9,17 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
-__all__ = ["NO_DISTORTION", "Distortion", "colmap_intrinsics"]
+from modp_ti.files.errors import InputError
+
+__all__ = ["EQUIDISTANT", "NO_DISTORTION", "PLUMB_BOB", "Distortion", "colmap_intrinsics", "lens_of_model"]
 
 Points = NDArray[np.float64]
 
 TABLE_SIZE = 4096
 # Newton's method ends for a point whose error in distorted coordinates is smaller. Rounding is some 1e-16.
 CONVERGED = 1e-14
+# Names of two lens models.
+PLUMB_BOB, EQUIDISTANT = ("plumb_bob", "radial-tangential", "radtan"), ("equidistant", "equi", "fisheye")
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,26 @@ class Distortion:
 
 
 NO_DISTORTION = Distortion()
+
+
+def lens_of_model(model: str, D: Sequence[float], where: str) -> Distortion:  # as in OpenCV
+    """Return the lens of a model that ROS, Kalibr or EuRoC names, with coefficients in OpenCV's order.
+
+    Raises:
+        InputError: If the model is not supported. `where` starts its message.
+    """
+    if not np.any(D):
+        return Distortion(fisheye=True) if model in EQUIDISTANT else NO_DISTORTION
+    if model in PLUMB_BOB and len(D) in (4, 5):
+        return Distortion((D[0], D[1], *D[4:]), tangential=(D[2], D[3]))
+    if model in ("rational_polynomial", *PLUMB_BOB) and len(D) >= 8 and not np.any(D[8:]):
+        return Distortion((D[0], D[1], D[4]), (D[5], D[6], D[7]), (D[2], D[3]))
+    if model in EQUIDISTANT and len(D) == 4:
+        return Distortion((D[0], D[1], D[2], D[3]), fisheye=True)
+    raise InputError(
+        f"{where}: the lens model {model[:40]!r} of {len(D)} coefficients is not supported (plumb_bob, "
+        "rational_polynomial, equidistant): give source.intrinsics, or rectified images"
+    )
 
 
 def colmap_intrinsics(model: str, params: Sequence[float]) -> tuple[float, float, float, float, Distortion] | None:

@@ -47,15 +47,16 @@ class FrameReader:
     Args:
         images: The image source.
         source: Settings of the images.
+        masks: Masks that the tracker's file names, where `source.masks` is empty.
 
     Raises:
         InputError: If the mask folder or the vignette cannot be used.
     """
 
-    def __init__(self, images: ImageSource, source: SourceSettings) -> None:
+    def __init__(self, images: ImageSource, source: SourceSettings, masks: MaskFolder | None = None) -> None:
         self.images = images
         self.source = source
-        self._masks = None if source.masks is None else MaskFolder(source.masks)
+        self._masks = masks if source.masks is None else MaskFolder(source.masks)
         self._vignette = images.vignette
         if self._vignette is None and source.vignette is not None:
             self._vignette = read_vignette(source.vignette)

@@ -31,12 +31,14 @@ class HeifHeader:
         height: Height [px], likewise.
         orientation: EXIF orientation that is left to apply: 1 for HEIC, whose rotation the decoder applies.
         tiff: The TIFF structure of EXIF; empty without.
+        profile: ICC profile of the colours; empty without.
     """
 
     width: int
     height: int
     orientation: int
     tiff: bytes
+    profile: bytes
 
 
 def is_heif(start: bytes) -> bool:
@@ -72,7 +74,8 @@ def read_heif_header(data: bytes) -> HeifHeader | None:
         else:
             image = _heic(data)
             tiff, orientation = image.info["exif"], 1
-        return HeifHeader(*image.size, orientation, (tiff or b"").removeprefix(EXIF_START))
+        profile = image.info.get("icc_profile") or b""
+        return HeifHeader(*image.size, orientation, (tiff or b"").removeprefix(EXIF_START), profile)
     except ERRORS:
         return None
 

@@ -33,6 +33,7 @@ INFLATED_AT_A_TIME = 1 << 18
 MOST_SCANNED, SMALLEST_SCAN, FEW_SCANS = 1 << 31, 1 << 22, 12
 # A marker with a length after it, or the end. Coded bytes have 00 or a restart marker (D0 to D7) after FF.
 JPEG_MARKER = re.compile(rb"\xff([\xc0-\xcf\xd9-\xfe])")
+HEADER_BYTES = 1 << 12  # in which a JPEG 2000 image states its size
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
 MOST_JPEG_PIXELS = 2048  # per byte
 # Smallest number of bits per pixel of the PNM formats: text has a digit and a separator per value, except in bitmaps.
@@ -51,7 +52,7 @@ def why_undecodable(data: bytes) -> str | None:
     """
     read = next((reader for magic, reader in FORMATS if re.match(magic, data[:16], re.DOTALL)), None)
     if read is None:
-        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM, PGM, HEIC or AVIF)"
+        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM, PGM, JPEG 2000, HEIC or AVIF)"
     try:
         width, height, least = read(data)
     except HEADER_ERRORS:
@@ -158,6 +159,12 @@ def _heif(data: bytes) -> Claim:
     return *heif_size(data), 0
 
 
+def _jp2(data: bytes) -> Claim:
+    """Read the size of a JPEG 2000 image from the first box `ihdr`."""
+    height, width = struct.unpack_from(">II", data, data.index(b"ihdr", 0, HEADER_BYTES) + 4)
+    return width, height, 0
+
+
 def _tiff(data: bytes) -> Claim:
     """Read the size of the first image in the file. A tile may be larger than the image and is decoded as a whole."""
     found = read_tiff_directory(data)
@@ -174,5 +181,6 @@ FORMATS: tuple[tuple[bytes, Callable[[bytes], Claim]], ...] = (
     (rb"II\*\0|MM\0\*|II\+\0|MM\0\+", _tiff),
     (rb"RIFF....WEBP", _webp),
     (rb"P[1-6]\s", _pnm),
+    (rb"\0\0\0\x0cjP  ", _jp2),
     (rb"....ftyp(?:" + b"|".join(BRANDS) + rb")", _heif),
 )

@@ -2,7 +2,8 @@
 
 Decoders differ in what they do with a truncated file (older OpenCV versions fill the rest with grey), and a run should
 report it in its first second, not at frame 400. JPEG and PNG files are checked by their end markers, HEIC and AVIF
-files by the lengths of their boxes; other formats are left to the decoder.
+files by the lengths of their boxes; other formats are left to the decoder. EXIF orientation, colour profile and alpha
+channel of PNG, WebP and TIFF files are found here too.
 
 Pillow keeps everything that it reads from a header, and thousands of TIFF or EXIF tags can refer to the same bytes:
 Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `bounded` file.
@@ -11,13 +12,15 @@ Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `
 from __future__ import annotations
 
 import io
+import re
 import struct
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from PIL import ExifTags, JpegImagePlugin, TiffImagePlugin
+import numpy as np
+from PIL import ExifTags, ImageFile, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 
 from modp_ti.files import open_file
 from modp_ti.inputs.sources.heif import is_heif, read_heif_header
@@ -37,6 +40,8 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"IEND\xaeB`\x82"
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+GPANO = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular")
 # A header may read HEADER_BYTES plus half of the file. Each call counts as CALL_BYTES in addition.
 HEADER_BYTES, CALL_BYTES = 1 << 23, 1 << 7
 
@@ -54,16 +59,26 @@ class ImageHeader:
     Attributes:
         width: Width [px] of the decoded image, before any EXIF rotation; 0 if the header is damaged.
         height: Height [px], likewise.
-        complete: Whether the end of the file is there.
-        orientation: EXIF orientation of a JPEG or AVIF file, 1 to 8; 1 if it states none.
+        complete: Whether the end of the file is there; None if only the decoder finds out.
+        orientation: EXIF orientation, 1 to 8, which is left to apply; 1 if the file states none.
         bits: Bits per channel.
+        alpha: Whether a PNG, WebP or TIFF file has an alpha channel.
+        grey: Whether a PNG or TIFF file has one channel.
+        profile: ICC profile of the colours; empty without.
+        panorama: Whether GPano in a JPEG file says that the image is equirectangular.
+        is_tiff: Whether it is a TIFF file, which OpenCV turns upright by itself.
     """
 
     width: int
     height: int
-    complete: bool
+    complete: bool | None
     orientation: int = 1
     bits: int = 8
+    alpha: bool = False
+    grey: bool = False
+    profile: bytes = b""
+    panorama: bool = False
+    is_tiff: bool = False
 
 
 class _Bounded(io.BufferedIOBase):
@@ -106,7 +121,7 @@ class JpegHeader(JpegImagePlugin.JpegImageFile):
 
 
 def read_image_header(file: BinaryIO) -> ImageHeader | None:
-    """Read the header of an open JPEG, PNG, HEIC or AVIF file. Returns None for all other files.
+    """Read the header of an open JPEG, PNG, WebP, TIFF, HEIC or AVIF file. Returns None for all other files.
 
     Raises:
         InputError: If the package that reads HEIC or AVIF is missing.
@@ -115,13 +130,11 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
     if is_heif(signature):
         return _heif_header(file)
     if signature.startswith(PNG_SIGNATURE):
-        # Pillow would also unpack the texts and the colour profile that follow. The size is at a fixed offset.
-        file.seek(8)
-        chunk = file.read(17)
-        if len(chunk) < 17 or chunk[4:8] != b"IHDR":
-            return ImageHeader(0, 0, complete=False)
-        width, height = struct.unpack(">II", chunk[8:16])
-        return ImageHeader(width, height, _ends_with(file, PNG_END), bits=chunk[16])
+        return _png_header(file)
+    if signature[:4] == b"RIFF" and signature[8:] == b"WEBP":
+        return _header_by_pillow(file, WebPImagePlugin.WebPImageFile)
+    if signature[:4] in TIFF_SIGNATURES:
+        return _header_by_pillow(file, TiffImagePlugin.TiffImageFile)
     if signature[:2] != JPEG_SIGNATURE:
         return None
     file.seek(0)
@@ -131,7 +144,9 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
         file.seek(-min(2, file.seek(0, 2)), 2)
         return ImageHeader(0, 0, complete=file.read() == JPEG_END)
     # Coded data never holds FF D9 except as the end marker, so the first one after the scan's start is it.
-    return ImageHeader(*header.size, _ends_with(file, JPEG_END), _orientation(header))
+    complete = _ends_with(file, JPEG_END)
+    profile, xmp = header.info.get("icc_profile") or b"", header.info.get("xmp") or b""
+    return ImageHeader(*header.size, complete, _orientation(header), profile=profile, panorama=bool(GPANO.search(xmp)))
 
 
 def _heif_header(file: BinaryIO) -> ImageHeader:
@@ -141,7 +156,43 @@ def _heif_header(file: BinaryIO) -> ImageHeader:
     complete = end_of_boxes(file, len(data)) <= len(data)
     if header is None:
         return ImageHeader(0, 0, complete)
-    return ImageHeader(header.width, header.height, complete, header.orientation)
+    return ImageHeader(header.width, header.height, complete, header.orientation, profile=header.profile)
+
+
+def _png_header(file: BinaryIO) -> ImageHeader:
+    # The size is at a fixed offset.
+    file.seek(8)
+    chunk = file.read(17)
+    if len(chunk) < 17 or chunk[4:8] != b"IHDR":
+        return ImageHeader(0, 0, complete=False)
+    width, height = struct.unpack(">II", chunk[8:16])
+    header = ImageHeader(width, height, _ends_with(file, PNG_END), bits=chunk[16])
+    more = _header_by_pillow(file, PngImagePlugin.PngImageFile)
+    return header if more is None else replace(more, complete=header.complete, bits=header.bits)
+
+
+def _header_by_pillow(file: BinaryIO, form: type[ImageFile.ImageFile]) -> ImageHeader | None:
+    """Read the header of a PNG, WebP or TIFF file with Pillow; None if it is damaged, or has a form unknown to it."""
+    file.seek(0)
+    try:
+        image = form(bounded(file))
+        tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
+        orientation = tags.get(ExifTags.Base.Orientation, 1)
+        if not tags:
+            orientation = _exif_orientation(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))
+        size = (TiffImagePlugin.IMAGEWIDTH, TiffImagePlugin.IMAGELENGTH)  # Pillow states that of the upright image
+        return ImageHeader(
+            *([int(tags[tag]) for tag in size] if tags else image.size),
+            complete=None,
+            orientation=orientation,
+            bits=int(np.max(tags.get(TiffImagePlugin.BITSPERSAMPLE, 8))),
+            alpha=image.has_transparency_data,
+            grey=len(image.getbands()) == 1 and image.mode != "P",
+            profile=image.info.get("icc_profile") or b"",
+            is_tiff=bool(tags),
+        )
+    except (*HEADER_ERRORS, EOFError, RuntimeError, MemoryError):
+        return None
 
 
 def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlugin.ImageFileDirectory_v2:
@@ -166,7 +217,17 @@ def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlug
 def _orientation(header: JpegHeader) -> int:
     """Return the EXIF orientation that a JPEG file states, or 1."""
     try:
-        value = read_tiff_directory(_tiff(header))[ExifTags.Base.Orientation]
+        return _exif_orientation(_tiff(header))
+    except HEADER_ERRORS:
+        return 1
+
+
+def _exif_orientation(tiff: bytes) -> int:
+    """Return the orientation in the TIFF structure of EXIF, or 1."""
+    if tiff[:4] not in TIFF_SIGNATURES:
+        return 1
+    try:
+        value = read_tiff_directory(tiff)[ExifTags.Base.Orientation]
     except HEADER_ERRORS:
         return 1
     return value if isinstance(value, int) and 1 <= value <= 8 else 1

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,12 @@ from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import UnreadableImageError
 from modp_ti.files.terminal import quiet_libraries
 from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced, used_bits
+from modp_ti.inputs.sources.colour_profile import in_srgb, way_to_srgb
 from modp_ti.inputs.sources.heif import decoded_heif, is_heif
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turns_of
+from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turn_of_exif, turns_of
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 
 __all__ = ["ListedImages", "decoded", "decoded_as", "quiet_opencv"]
@@ -80,13 +81,13 @@ class ListedImages(ImageSource):
         Raises:
             UnreadableImageError: If the image is unreadable or truncated.
         """
-        turn, _ = self.turn(name), self._bits  # both add their notes when the source is opened
+        turn, _, _ = self.turn(name), self._bits, self._transparent  # they add their notes when the source is opened
         try:
             with self._open(name) as file:
                 header = read_image_header(file)
         except OSError as error:
             raise self._unreadable(name, error.strerror or "it cannot be opened") from None
-        if header is None:
+        if header is None or header.complete is None:
             height, width = self.read(name).shape[:2]
             return width, height
         if not header.complete:
@@ -106,11 +107,28 @@ class ListedImages(ImageSource):
             UnreadableImageError: If the image is unreadable or truncated.
         """
         turn, bits = self.turn(name), self._bits
-        data = self._checked(name)
-        image = decoded(data, bits)
+        data, header = self._checked(name)
+        image = decoded(data, bits, header)
         if image is None:
-            raise self._unreadable(name, "it is damaged or no image")
+            deep = decoded_as(data, -1)  # as it is stored
+            what = "it is damaged or no image" if deep is None else f"{deep.dtype} is not read: convert it to 16 bits"
+            raise self._unreadable(name, what)
         return turn.image(image)
+
+    def valid(self, name: str) -> NDArray[np.bool_] | None:
+        """Return the pixels (H, W) whose alpha is at least half, turned upright; None if there is no alpha."""
+        if name not in self._transparent:
+            return None
+        alpha = _alpha(*self._checked(name))
+        return None if alpha is None else self.turn(name).image(alpha)
+
+    def leave_out(self, names: Collection[str]) -> None:
+        """Take images out of the source, such as masks that a tracker's file names."""
+        kept = [(name, time) for name, time in zip(self._names, self._times, strict=True) if name not in names]
+        self._names, self._times, self._position, self._by_stem = [], [], {}, {}
+        for name, time in kept:
+            self._append(name, time)
+            self._by_stem.setdefault(str(PurePosixPath(name).with_suffix("")), name)
 
     def _open(self, name: str) -> BinaryIO:
         """Open an image file. Raises OSError."""
@@ -120,7 +138,7 @@ class ListedImages(ImageSource):
         """Read an image file. Raises OSError."""
         return read_bytes(self.path / name)
 
-    def _checked(self, name: str) -> bytes:
+    def _checked(self, name: str) -> tuple[bytes, ImageHeader | None]:
         """Read an image file and check that it can be decoded. Raises UnreadableImageError."""
         try:
             data = self._content(name)
@@ -129,29 +147,46 @@ class ListedImages(ImageSource):
         header = read_image_header(io.BytesIO(data))
         if not data:
             raise self._unreadable(name, "the file is empty")
-        if header is not None and not header.complete:
+        if header is not None and header.complete is False:
             raise self._unreadable(name, "the file is cut off")
         reason = why_undecodable(data)
         if reason is not None:
             raise self._unreadable(name, reason)
-        return data
+        return data, header
 
     @cached_property
     def _turns(self) -> dict[str, Turn]:
         """The turn of each image that is not kept as it is stored, by name."""
-        turns, note = turns_of(self._headers)
+        turns, note = turns_of(self.headers)
         if note is not None:
             self.add_note(f"{self.path}: {note}")
+        if any(way_to_srgb(header.profile) for header in self.headers.values()):
+            self.add_note(f"{self.path}: images of another colour profile than sRGB are converted to sRGB")
         return turns
+
+    @cached_property
+    def _transparent(self) -> frozenset[str]:
+        """The images whose alpha is a mask: those that have one, unless it is 0 everywhere in some of them."""
+        names = [name for name, header in self.headers.items() if header.alpha]
+        some = []
+        for name in names[:: max(1, len(names) // SAMPLED)]:
+            with suppress(UnreadableImageError):
+                alpha = _alpha(*self._checked(name))
+                some.append(True if alpha is None else alpha)
+        used = not some or any(map(np.any, some))
+        if not all(map(np.all, some)):
+            what = "where their alpha is below half" if used else "nowhere, as their alpha is 0 everywhere"
+            self.add_note(f"{self.path}: images with an alpha channel are masked {what}")
+        return frozenset(names if used else ())
 
     @cached_property
     def _bits(self) -> int:
         """How many bits the images of 16 bits per channel use, by some of them; 16 where there are none."""
-        deep = [name for name in self.names if name not in self._headers or self._headers[name].bits > 8]
+        deep = [name for name in self.names if name not in self.headers or self.headers[name].bits > 8]
         images: list[NDArray] = []
         for name in deep[:: max(1, len(deep) // SAMPLED)]:
             with suppress(UnreadableImageError):
-                image = decoded_deep(self._checked(name))
+                image = decoded_deep(self._checked(name)[0])
                 if image is None or image.dtype != np.uint16:
                     break
                 images.append(image)
@@ -161,8 +196,8 @@ class ListedImages(ImageSource):
         return bits
 
     @cached_property
-    def _headers(self) -> dict[str, ImageHeader]:
-        """The header of each JPEG, PNG, HEIC and AVIF file that can be read, by name. All are read at once."""
+    def headers(self) -> dict[str, ImageHeader]:
+        """The header of each file that `read_image_header` can read, by name. All are read at once."""
         headers = {}
         for name in self.names:
             with suppress(OSError), self._open(name) as file:
@@ -177,20 +212,43 @@ class ListedImages(ImageSource):
         )
 
 
-def decoded(data: bytes, bits: int = DEPTHS[-1]) -> NDArray[np.uint8] | None:
+def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = None) -> NDArray[np.uint8] | None:
     """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation (HEIC upright); None if that fails.
 
     Args:
         data: The file's content.
         bits: How many bits an image of 16 bits per channel uses.
+        header: The file's header, whose colour profile is applied; None to keep the colours as they are stored.
     """
     import cv2
 
+    profile = b"" if header is None else header.profile
     if is_heif(data[:12]):
-        return decoded_heif(data)
+        image = decoded_heif(data)
+        return None if image is None else in_srgb(image, profile)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = decoded_as(data, flags) if bits == DEPTHS[-1] else decoded_deep(data)
-    return None if image is None else np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    if image is None:
+        return None
+    rgb = np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return _as_stored(in_srgb(rgb, profile), header)
+
+
+def _as_stored(image: NDArray[Any], header: ImageHeader | None) -> NDArray[Any]:
+    """Undo what OpenCV does to the image of a TIFF file, which it turns as EXIF says."""
+    if header is None or not header.is_tiff or header.orientation == 1:
+        return image
+    return np.ascontiguousarray(turn_of_exif(header.orientation).stored(image))
+
+
+def _alpha(data: bytes, header: ImageHeader | None) -> NDArray[np.bool_] | None:
+    """Return where the alpha of an image file's content is at least half (H, W); None if it has no alpha."""
+    import cv2
+
+    image = decoded_as(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.shape[2] != 4 or image.dtype not in (np.uint8, np.uint16):
+        return None
+    return _as_stored(image[..., 3] > np.iinfo(image.dtype).max // 2, header)
 
 
 def decoded_deep(data: bytes) -> NDArray | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +32,16 @@ class Turn:
         """Return the size (width, height) of the turned image."""
         return (height, width) if self.quarters % 2 else (width, height)
 
-    def image(self, stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Turn an image (H, W, 3)."""
+    def image(self, stored: NDArray[Any]) -> NDArray[Any]:
+        """Turn an image (H, W, ...)."""
         if self == AS_STORED:
             return stored
         return np.ascontiguousarray(np.rot90(stored[:, ::-1] if self.mirrored else stored, -self.quarters))
+
+    def stored(self, turned: NDArray[Any]) -> NDArray[Any]:
+        """Undo the turn of an image (H, W, ...)."""
+        back = np.rot90(turned, self.quarters)
+        return back[:, ::-1] if self.mirrored else back
 
     def pixels(self, stored: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
         """Map pixels (N, 2) of a stored image of `width` x `height` to those of the image turned without mirroring."""

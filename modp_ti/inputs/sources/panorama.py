@@ -11,10 +11,13 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.camera_settings import PanoramaSettings
 from modp_ti.files.errors import InputError
 
-__all__ = ["Face", "Projection", "faces_of"]
+__all__ = ["Face", "Projection", "faces_of", "looks_panoramic", "projection_of"]
 
 # Largest relative difference of an image's width from twice its height.
 SHAPE_TOLERANCE = 0.01
+# How far an equirectangular image's left edge may be from its right one beyond two pixels' steps, and the largest
+# standard deviation of the rows at its poles [grey levels].
+SEAM, UNIFORM = 3.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,19 @@ def projection_of(settings: PanoramaSettings, width: int, height: int, what: str
             f"{what} is {width}x{height}: {shape} is twice as wide as high; cut the images, or remove source.panorama"
         )
     return Projection(width, height, np.radians(settings.lens_fov) if settings.projection == "dual_fisheye" else None)
+
+
+def looks_panoramic(image: NDArray[np.uint8]) -> bool:
+    """Whether an image (H, W, 3) is probably equirectangular.
+
+    Its left and right edges show the same, which is not uniform; the top and the bottom row, each around one direction,
+    are uniform.
+    """
+    values = image.astype(np.int64)
+    left, right = values[:, 0], values[:, -1]
+    steps = np.abs(values[:, 1] - left).mean() + np.abs(values[:, -2] - right).mean()
+    poles = max(values[row].std(axis=0).max() for row in (0, -1))
+    return np.abs(left - right).mean() <= steps + SEAM and poles < UNIFORM < left.std(axis=0).max()
 
 
 def faces_of(settings: PanoramaSettings, projection: Projection) -> tuple[Face, ...]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["IMAGE_SUFFIXES", "ImageSource", "require_intrinsics"]
 
 IMAGE_SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"),
+    *(".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2"),
     *(".heic", ".heif", ".hif", ".avif"),
 )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+from av.stream import Disposition
 from numpy.typing import NDArray
 
 from modp_ti.inputs.sources.image_bounds import MAX_IMAGE_PIXELS
@@ -17,13 +18,13 @@ __all__ = ["VideoDecoder"]
 # FFmpeg's names of the accepted formats: video containers, but not playlists, which refer to other files.
 CONTAINERS = (
     "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo,h264,hevc,vvc,m4v,mjpeg,asf,flv,ogg,"
-    "ivf,obu,av1,dv,gxf,mxf,nut,rm,wtv,yuv4mpegpipe,gif,apng"
+    "ivf,obu,av1,dv,gxf,mxf,nut,rm,wtv,yuv4mpegpipe,gif,apng,dhav"
 )
 LIMITS = {"max_pixels": str(MAX_IMAGE_PIXELS)}
 
 
 class VideoDecoder:
-    """Decodes the first video stream of a file, frame by frame.
+    """Decodes a video stream of a file, frame by frame: as FFmpeg does, a default one before others, then the largest.
 
     Args:
         path: The video file.
@@ -33,6 +34,7 @@ class VideoDecoder:
     Attributes:
         index: Index of the frame that was decoded last, -1 before the first.
         form: As the argument; if None, it is set when the first image is converted.
+        choice: Which stream is decoded, in words; empty if there is only one. Thumbnails do not count.
 
     Raises:
         OSError: FFmpeg does not recognise the file as a video.
@@ -44,11 +46,20 @@ class VideoDecoder:
             self._container = av.open(f"file:{path}", options=options, metadata_errors="replace")
         except DECODING_ERRORS:
             raise OSError(str(path)) from None
-        stream = next(iter(self._container.streams.video), None)
-        if stream is None or stream.codec_context is None:  # a codec unknown to FFmpeg
+        # A stream without a context is of a codec unknown to FFmpeg.
+        streams = [
+            stream
+            for stream in self._container.streams.video
+            if stream.codec_context is not None and not stream.disposition & Disposition.attached_pic
+        ]
+        if not streams:
             self._container.close()
             raise OSError(str(path))
-        self._stream = stream
+        by_rank = lambda each: (bool(each.disposition & Disposition.default), each.width * each.height)  # noqa: E731
+        self._stream = max(streams, key=by_rank)
+        sizes = ", ".join(f"{each.width}x{each.height}" for each in streams)
+        number = streams.index(self._stream) + 1
+        self.choice = f"holds {len(streams)} video streams ({sizes}): number {number} is used" if streams[1:] else ""
         self._stream.codec_context.options = LIMITS
         if in_threads:
             self._stream.thread_type = "AUTO"

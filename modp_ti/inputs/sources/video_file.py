@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.orientation import AS_STORED
-from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 from modp_ti.inputs.sources.tone_mapping import PEAK, WHITE
 from modp_ti.inputs.sources.video_container import missing_bytes, require_true_index
 
@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from modp_ti.inputs.sources.video_decoder import VideoDecoder
     from modp_ti.inputs.sources.video_picture import VideoForm
 
-__all__ = ["VIDEO_SUFFIXES", "VideoFile"]
+__all__ = ["VIDEO_SUFFIXES", "VideoFile", "is_video"]
 
 VIDEO_SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
     *(".wmv", ".flv", ".3gp", ".ogv", ".h264", ".h265", ".hevc", ".mjpg", ".mjpeg"),
+    *(".gif", ".insv", ".lrv", ".qt", ".dav", ".y4m"),
 )
 
 # Frames up to this many ahead are reached by decoding, farther ones by seeking. A seek decodes from the previous
@@ -97,6 +98,8 @@ class VideoFile(ImageSource):
 
         height, width = first.shape[:2]
         self._size = (width, height)
+        if self._front.choice:
+            self.add_note(f"{self.path} {self._front.choice}")
         for note in _form_notes(self._form, width, height, interlaced, len(shown)):
             self.add_note(f"{self.path} {note}")
         if not timed:
@@ -187,6 +190,19 @@ class VideoFile(ImageSource):
             f"{self.path}: no video that FFmpeg can read, or without a frame: convert it, for example with "
             "`ffmpeg -i in -c:v libx264 out.mp4`"
         )
+
+
+def is_video(path: Path) -> bool:
+    """Whether FFmpeg finds a video in a file, whatever its suffix. A single picture is none."""
+    from modp_ti.inputs.sources.video_decoder import VideoDecoder
+
+    try:
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            return False
+        VideoDecoder(path, in_threads=False).close()
+    except OSError:
+        return False
+    return True
 
 
 def _form_notes(form: VideoForm, width: int, height: int, interlaced: int, count: int) -> Iterator[str]:

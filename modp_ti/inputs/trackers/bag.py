@@ -97,7 +97,7 @@ def _opened(
 
 def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree) -> tuple[str, list[str]]:
     """Add the poses of the chosen topic to the transforms, and return the world's frame and remarks for the user."""
-    bag, topics = images.bag, images.bag.of_types(*POSES)
+    bag, topics = images.bag, images.bag.pose_topics
     if tracker.pose is not None and tracker.pose != "tf":
         topics = [bag.chosen(tracker.pose, POSES, "tracker.pose")]
     camera = clean(tracker.camera or images.frame_id)

@@ -39,7 +39,10 @@ def open_capture(source: SourceSettings, tracker: CaptureSettings, progress: Pro
     given = {name: found[name].T_camera_world for name in selected if name in found}
     poses = {name: T for name, T in given.items() if T is not None}
     if not poses:
-        raise InputError(f"{origin}: has no pose for any of the {len(selected)} frames that are selected")
+        raise InputError(
+            f"{origin}: has no pose for any of the {len(selected)} frames that are selected, or is missing: "
+            "tracker.kind=klt tracks the images alone"
+        )
     notes = missing_frames_note(selected, poses, capture.origin)
 
     undistorters: dict[object, Undistorter] = {}

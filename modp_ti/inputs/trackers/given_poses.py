@@ -21,6 +21,7 @@ from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out, readable_sizes
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, Undistorter
+from modp_ti.inputs.sources.masks import MaskFolder
 from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.trackers.point_cloud import read_point_file, visible_points
 
@@ -148,7 +149,11 @@ def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:
 
 
 def checked_reader(
-    images: ImageSource, source: SourceSettings, cameras: Mapping[str, Undistorter], intrinsics: str
+    images: ImageSource,
+    source: SourceSettings,
+    cameras: Mapping[str, Undistorter],
+    intrinsics: str,
+    masks: MaskFolder | None = None,
 ) -> FrameReader:
     """Create the reader of the frames and check that images, masks and vignette match the cameras.
 
@@ -159,6 +164,7 @@ def checked_reader(
         source: Settings of the images.
         cameras: Undistorter of each image that will be read, by name.
         intrinsics: Origin of the cameras, for error messages.
+        masks: Masks that the tracker's file names.
 
     Raises:
         InputError: If an image, a mask or the vignette does not match its camera.
@@ -182,7 +188,7 @@ def checked_reader(
             f"{images.path / name} is {width}x{height}, its camera in {intrinsics} is "
             f"{raw.width}x{raw.height}; {advice}"
         )
-    reader = FrameReader(images, source)
+    reader = FrameReader(images, source, masks)
     reader.require_fitting(cameras.items())
     return reader
 

@@ -18,7 +18,7 @@ from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL
 from modp_ti.inputs.multiview.features import detect_features
 from modp_ti.inputs.multiview.image_pairs import image_pairs
 from modp_ti.inputs.multiview.structure import MatchedImage, reconstructed
-from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.opening import open_source, require_pinhole
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import ReplayedTracker, Unreadable
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics
@@ -50,6 +50,8 @@ def open_sfm(
     images = open_source(source)
     reader = FrameReader(images, source)
     names = selected_frames(images, source)
+    if images.intrinsics is None:
+        require_pinhole(images, source, names[0])
     made_of = _fingerprint(images, source, tracker, names, seed)
     kept = _kept(folder) == made_of
     if not kept:

@@ -24,6 +24,8 @@ from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter
 from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.masks import MaskFolder
 from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.sources.undistortion import undistorter_beside
 from modp_ti.inputs.trackers.given_poses import (
@@ -39,7 +41,7 @@ from modp_ti.inputs.trackers.given_poses import (
 from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
 from modp_ti.inputs.trackers.stored_cameras import turn_of_camera, turned_note
 
-__all__ = ["open_transforms"]
+__all__ = ["masks_of_transforms", "open_transforms"]
 
 NAME = "transforms.json"
 
@@ -59,10 +61,10 @@ def open_transforms(
         InputError: If the file is missing or malformed, a pose is not a rigid motion, no image is found, or images do
             not match the intrinsics.
     """
-    place = source.require_path()
     images = open_source(source)
-    file = found_file(tracker.path, [place.parent / NAME, place / NAME], f"a {NAME}")
+    file = _file(source, tracker)
     data, stated = read_entries(file, "frames", "file_path", f"a {NAME}")
+    masks = masks_of_transforms(images, source, tracker)
     entries, notes = matched_entries(images, source, stated, file, file.name, "frames")
 
     face = None if images.whole is images else require_intrinsics(images).undistorter(images.scale)
@@ -83,7 +85,7 @@ def open_transforms(
         frames.append(PosedImage(name, undistorter, turn.T_turned_stored @ _pose(entry, file)))
     notes += turned_note(turns, str(file))
     notes += sizes_note(frames)
-    reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(file))
+    reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(file), masks)
 
     cloud = data.get("ply_file_path")
     cloud = cloud.replace("\\", "/") if isinstance(cloud, str) else None  # as Windows writes it
@@ -95,6 +97,37 @@ def open_transforms(
             notes.append(f"{file.name} names points that are not there ({cloud}): triangulated instead")
         frames = triangulated_views(images, frames, solving(frames, source), progress)
     return ReplayedTracker(reader, frames, notes)
+
+
+def masks_of_transforms(images: ImageSource, source: SourceSettings, tracker: TransformsSettings) -> MaskFolder | None:
+    """Return the masks that the file names with `mask_path`, relative to itself; None if it names none.
+
+    Masks and depth maps that lie among the images are taken out of these.
+
+    Raises:
+        InputError: If the file is missing or malformed.
+    """
+    file, masks, others = _file(source, tracker), {}, set()
+    for stated, entry in read_entries(file, "frames", "file_path", f"a {NAME}")[1]:
+        for key in ("mask_path", "depth_file_path"):
+            if isinstance(entry.get(key), str):
+                path = entry[key].replace("\\", "/")
+                others.add((file.parent / path).resolve())
+                name = images.whole.find(stated) if key == "mask_path" else None
+                if name is not None:
+                    masks[name] = path
+    if isinstance(images, ListedImages):
+        folder = images.path.resolve()
+        images.leave_out({name for name in images.names if folder / name in others})
+    if masks and images.whole is not images:
+        images.whole.add_note(f"{file.name}: `mask_path` is not used with source.panorama")
+        return None
+    return MaskFolder(file.parent, masks, f"mask_path of {file}") if masks else None
+
+
+def _file(source: SourceSettings, tracker: TransformsSettings) -> Path:
+    place = source.require_path()
+    return found_file(tracker.path, [place.parent / NAME, place / NAME], f"a {NAME}")
 
 
 def _pose(entry: Mapping[str, Any], file: Path) -> NDArray[np.float64]:

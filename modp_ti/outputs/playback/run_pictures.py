@@ -13,11 +13,13 @@ import numpy as np
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
+from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.trackers import open_tracker
+from modp_ti.inputs.trackers.transforms import masks_of_transforms
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 
 __all__ = ["kept_images", "pictures", "run_settings"]
@@ -125,8 +127,9 @@ def _read_again(
 
 def _through_source(config: SceneConfig, names: Sequence[str], undistorter: Undistorter) -> Generator[Picture]:
     with closing(open_source(config.without_clock().source)) as images:
-        source = config.source
-        reader, there = FrameReader(images, source), set(images.selected(source.start, source.stop, source.step))
+        source, tracker = config.source, config.tracker
+        masks = masks_of_transforms(images, source, tracker) if isinstance(tracker, TransformsSettings) else None
+        reader, there = FrameReader(images, source, masks), set(images.selected(source.start, source.stop, source.step))
         for name in names:
             if name not in there or images.size(name) != (undistorter.raw.width, undistorter.raw.height):
                 raise _changed(config)

@@ -6,11 +6,13 @@ import sys
 import types
 
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from modp_ti.commands import app as cli
 from modp_ti.config.presets import PRESETS
 from modp_ti.config.scene_file import dump_scene, load_scene
+from modp_ti.files.errors import InputError
 from modp_ti.inputs.bare_recording import recorded_scene, streamed_scene
 
 
@@ -142,6 +144,78 @@ def test_a_name_that_no_folder_can_have_is_shortened(folder):
 def test_what_cannot_be_meant_is_refused_in_one_line(session, arguments, said):
     assert said in refusal(*arguments)
     assert session == []
+
+
+POSED = {
+    "transforms.json": ("transforms", "room"),
+    "sparse/0/images.bin": ("colmap", "room"),
+    "colmap/sparse/0/images.txt": ("colmap", "room"),
+    "images/transforms.json": ("klt", "room"),
+}
+
+
+@pytest.mark.parametrize("file", POSED)
+def test_poses_that_lie_in_the_folder_are_used_and_named(folder, file):
+    """Those of reduced copies of the images do not count."""
+    for name in ("images/a.png", "images_2/a.png", file):
+        (folder / "room" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "room" / name).touch()
+    said: list[str] = []
+    config = recorded_scene(folder / "room", say=said.append)
+    assert (config.tracker.kind, config.output.name) == POSED[file]
+    assert config.source.path == folder / "room/images"
+    assert len(said) == (config.tracker.kind != "klt")
+    assert recorded_scene(folder / "room", ["tracker.kind=klt"]).tracker.kind == "klt"
+    assert recorded_scene(folder / "room", ["tracker.maps=all"]).tracker.kind == "klt"
+
+
+@pytest.mark.parametrize(("name", "kind"), [("rgbd_dataset_freiburg1_xyz", "tum"), ("mine", "klt")])
+def test_a_trajectory_is_used_where_the_camera_is_known(folder, name, kind):
+    (folder / name / "rgb").mkdir(parents=True)
+    Image.new("RGB", (640, 480)).save(folder / name / "rgb/1.0.png")
+    (folder / name / "rgb.txt").write_text("1.0 rgb/1.0.png\n")
+    (folder / name / "groundtruth.txt").touch()
+    said: list[str] = []
+    assert recorded_scene(folder / name, say=said.append).tracker.kind == kind
+    assert len(said) == 1 and "groundtruth.txt" in said[0]
+    assert recorded_scene(folder / name, ["source.intrinsics.fx=500"]).tracker.kind == "tum"
+
+
+def test_a_folder_that_holds_one_video_maps_it(folder):
+    assert recorded_scene(folder / "other").source.path == folder / "other/room.mp4"
+    (folder / "other/b.MOV").touch()
+    with pytest.raises(InputError, match=r"b\.MOV, room\.mp4"):
+        recorded_scene(folder / "other")
+
+
+def test_a_folder_of_recordings_names_them(folder):
+    for name in ("one", "two"):
+        (folder / "all" / name / "rgb").mkdir(parents=True)
+        (folder / "all" / name / "rgb.txt").touch()
+        (folder / "all" / name / "rgb/1.png").touch()
+    with pytest.raises(InputError, match="one, two"):
+        recorded_scene(folder / "all")
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("https://user:secret@host/room.mp4", "--stream"),
+        ("hall/a.png", "folder"),
+        ("room.tar.gz", "unpack"),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_what_is_no_recording_is_refused_with_the_right_command(folder, command, argument, said):
+    (folder / "room.tar.gz").touch()
+    result = CliRunner().invoke(cli.app, [command, argument])
+    assert result.exit_code == 2
+    shown = " ".join((result.stdout + result.stderr).split())
+    assert said in shown and "secret" not in shown and "Traceback" not in shown
+
+
+def test_several_recordings_are_a_batch():
+    assert "modp-ti batch" in refusal("hall/a.png", "hall/b.png")
 
 
 def test_a_folder_with_a_scene_file_is_not_taken_for_its_images(folder, session):

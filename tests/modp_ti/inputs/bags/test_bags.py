@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 
+import av
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from modp_ti.config.settings import SourceSettings
@@ -224,3 +227,78 @@ def test_a_cloud_that_leads_nowhere_is_told_and_points_are_triangulated(views, t
     assert np.median(np.abs(np.concatenate([frame.points.xyz[:, 2] for frame in tracker.frames]))) < 0.02
     with pytest.raises(InputError, match="no cloud of /scan has points"):
         opened(path, points="/scan")
+
+
+@pytest.mark.parametrize("topic", ["/goal_pose", "/initialpose", "/mavros/setpoint_position/local", "/waypoint"])
+def test_where_a_robot_should_go_is_no_pose_of_it(topic, views, tmp_path, opened, untriangulated):
+    make, images = Messages(), [each for each in recording(views) if each[0] != "/odom"]
+    goals = [(topic, START + n * STEP, make.pose_stamped(START + n * STEP, np.eye(4))) for n in range(3)]
+    path = write_bag(tmp_path / "room", "mcap", [*images, *goals])
+    assert_poses(opened(path).frames, views)
+    assert opened(path, pose=topic, camera="optical").frames  # unless the user says so
+    still = [each for each in images if each[0] not in ("/tf", "/tf_static")]
+    assert not has_poses(write_bag(tmp_path / "still", "mcap", [*still, *goals]))
+
+
+@pytest.mark.parametrize("kind", ["sensor_msgs/CompressedImage", "foxglove_msgs/CompressedVideo"])
+@pytest.mark.parametrize(("codec", "said"), [("libx264", "h264"), ("libx265", "h265")])
+def test_video_in_messages_is_decoded_from_its_first_keyframe(kind, codec, said, views, tmp_path):
+    """FFmpeg decodes the same stream. The recording begins amid a group of pictures."""
+    context = av.CodecContext.create(codec, "w")
+    context.width, context.height, context.pix_fmt = *views[0].size, "yuv420p"
+    context.time_base, context.gop_size = Fraction(1, 10), 4
+    context.options = {"bf": "0", "tune": "zerolatency"} | ({"x265-params": "log-level=none"} if said == "h265" else {})
+    packets: list[bytes] = []
+    for image in (view.image for view in (*views, *views)):
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[..., ::-1]), format="rgb24")
+        frame.pts = len(packets)
+        packets += map(bytes, context.encode(frame))
+    packets += map(bytes, context.encode(None))
+    whole = av.CodecContext.create(said.replace("h265", "hevc"), "r")
+    decoded = [frame.to_ndarray(format="rgb24") for packet in packets for frame in whole.decode(av.Packet(packet))]
+    decoded += [frame.to_ndarray(format="rgb24") for frame in whole.decode(None)]
+    make = Messages()
+    text = "std_msgs/Header header\nuint8[] data\nstring format"
+    make.store.register(get_types_from_msg(text, "foxglove_msgs/msg/CompressedVideo"))
+    messages = []
+    for n, packet in list(enumerate(packets))[1:]:
+        time, data = START + n * STEP, np.frombuffer(packet, np.uint8)
+        values = (said, data) if "Image" in kind else (data, said)
+        messages.append(("/video", time, make.make(kind, make.header(time, "optical"), *values)))
+    images = open_source(SourceSettings(path=write_bag(tmp_path / "room", "mcap", messages, store=make.store)))
+    assert len(images) == len(packets) - 4
+    for n in (0, 5, 2):
+        found = images.read(images.names[n]).astype(int)
+        assert np.abs(found - decoded[n + 4]).mean() < 1.0
+        assert images.timestamp(images.names[n]) == pytest.approx((START + (n + 4) * STEP) * 1e-9, abs=1e-6)
+    images.close()
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3"])
+def test_a_folder_that_holds_only_a_bag_is_one(form, views, tmp_path):
+    path = write_bag(tmp_path / "room", form, recording(views[:1], form))
+    (path / "metadata.yaml").unlink()
+    assert recorded_scene(path).tracker.kind == "bag"
+
+
+def test_a_bag_that_was_cut_off_names_what_mends_it(views, tmp_path):
+    path = write_bag(tmp_path / "room", "mcap", recording(views[:3]))
+    (file,) = path.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(InputError, match="mcap recover") as caught:
+        recorded_scene(file)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_camera_of_realsense_viewer_lies_one_folder_aside(views, tmp_path):
+    at = {
+        "/camera/image_raw": "/device_0/Color_0/image/data",
+        "/camera/camera_info": "/device_0/Color_0/info/camera_info",
+    }
+    messages = [(at[topic], *rest) for topic, *rest in recording(views[:1], "ros1") if topic in at]
+    wrong = Messages("ros1").info(START, 2 * views[0].K, views[0].size)
+    messages.append(("/device_0/Depth_0/info/camera_info", START, wrong))
+    images = open_source(SourceSettings(path=write_bag(tmp_path / "room.bag", "ros1", messages)))
+    assert images.intrinsics is not None
+    np.testing.assert_allclose(images.intrinsics.camera.matrix(), views[0].K)
+    images.close()

@@ -7,13 +7,16 @@ import shutil
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.captures import read_capture
+from modp_ti.inputs.opening import open_source
 from tests.captures import KITTI_OFFSET, WRITERS, View, exr_file, lzfse_stored, zipped
 
 
@@ -238,3 +241,60 @@ def test_what_macos_adds_to_an_archive_is_left_out(views, tmp_path, opened):
     file = zipped(tmp_path / "folder", tmp_path / "room.zip")
     assert recorded_scene(file).tracker.kind == "polycam"
     assert_poses(opened(file, "polycam").frames, views[:2])
+
+
+@pytest.mark.parametrize("kind", ["euroc", "kitti"])
+def test_a_sequence_without_poses_is_tracked_by_its_images(kind, views, tmp_path, opened):
+    WRITERS[kind](tmp_path / "room", views[:3])
+    for truth in ("poses.txt", "mav0/state_groundtruth_estimate0/data.csv"):
+        (tmp_path / "room" / truth).unlink(missing_ok=True)
+    images = open_source(SourceSettings(path=tmp_path / "room"))
+    assert len(images) == 3 and images.intrinsics is not None
+    np.testing.assert_allclose(images.intrinsics.camera.matrix(), views[0].K, atol=1e-6)
+    with pytest.raises(InputError, match=r"tracker\.kind=klt"):
+        opened(tmp_path / "room", kind)
+
+
+@pytest.mark.parametrize("folder", ["mocap0", "vicon0"])
+def test_poses_of_markers_are_taken_to_the_body_that_carries_them(folder, views, tmp_path):
+    """In TUM-VI's layout they lie in mocap0. The markers are turned and moved on the body."""
+    WRITERS["euroc"](tmp_path / "room", views)
+    top = tmp_path / "room/mav0"
+    (top / "state_groundtruth_estimate0").rename(top / folder)
+    T_body_markers = np.eye(4)
+    T_body_markers[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_matrix()
+    T_body_markers[:3, 3] = (0.1, 0.2, -0.3)
+    lines = (top / folder / "data.csv").read_text().splitlines()
+    rows = np.array([[float(word) for word in line.split(",")[1:8]] for line in lines[1:]])
+    turns = Rotation.from_quat(rows[:, [4, 5, 6, 3]])
+    x, y, z, w = (turns * Rotation.from_matrix(T_body_markers[:3, :3])).as_quat().T
+    there = np.column_stack([rows[:, :3] + turns.apply(T_body_markers[:3, 3]), w, x, y, z])
+    moved = [
+        f"{line.split(',')[0]}," + ",".join(map(repr, row)) for line, row in zip(lines[1:], there.tolist(), strict=True)
+    ]
+    (top / folder / "data.csv").write_text("\n".join([lines[0], *moved]) + "\n")
+    numbers = ", ".join(map(repr, T_body_markers.ravel().tolist()))
+    (top / folder / "sensor.yaml").write_text(f"%YAML:1.0\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers}]\n")
+    assert_poses(read_capture(tmp_path / "room", "euroc").frames, views)
+
+
+def test_euroc_with_five_coefficients_has_the_lens_of_opencv(views, tmp_path):
+    WRITERS["euroc"](tmp_path / "room", views[:2])
+    file = tmp_path / "room/mav0/cam0/sensor.yaml"
+    file.write_text(file.read_text().replace("[0.0, 0.0, 0.0, 0.0]", "[-0.2, 0.05, 0.001, -0.002, 0.01]"))
+    lens, rays = read_capture(tmp_path / "room", "euroc").frames[0].lens, np.array([[0.3, 0.2], [-0.4, 0.1]])
+    coefficients = np.array([-0.2, 0.05, 0.001, -0.002, 0.01])
+    expected = cv2.projectPoints(np.c_[rays, [1, 1]], np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
+    np.testing.assert_allclose(lens.distort(rays), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["arkitscenes", "kitti", "stray_scanner"])
+def test_a_capture_in_the_only_folder_of_a_folder_is_the_same(kind, views, tmp_path, opened):
+    """As in the 3dod layout of ARKitScenes: 42/42_frames, beside a mesh."""
+    WRITERS[kind](tmp_path / "42/42_frames", views[:3])
+    (tmp_path / "42/42_mesh.ply").touch()
+    assert recorded_scene(tmp_path / "42").tracker.kind == kind
+    outer, inner = opened(tmp_path / "42", kind), opened(tmp_path / "42/42_frames", kind)
+    for a, b in zip(outer.frames, inner.frames, strict=True):
+        np.testing.assert_array_equal(a.T_camera_world, b.T_camera_world)
+    outer.close()

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
@@ -100,6 +101,59 @@ def test_a_colour_stands_for_nothing_and_joins_the_masks(images: Path, tmp_path:
     write(tmp_path / "masks/a.png", half_mask())
     picture = reader(images, masks=tmp_path / "masks", **source).read("a.png", Undistorter(PINHOLE))
     np.testing.assert_array_equal(picture.mask, (rows >= 20) & (half_mask() > 0))
+
+
+def gradient() -> np.ndarray:
+    """Alpha from 0 on the left to 255 on the right."""
+    return np.tile(np.rint(np.linspace(0, 255, WIDTH)).astype(np.uint8), (HEIGHT, 1))
+
+
+def transparent(path: Path, alpha: np.ndarray, colour: int = 90) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    options = {"lossless": True, "exact": True} if path.suffix == ".webp" else {}
+    rgb = np.full((HEIGHT, WIDTH, 3), colour, np.uint8)
+    Image.fromarray(np.dstack([rgb, alpha])).save(path, **options)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp", ".tif"])
+def test_alpha_below_half_is_masked_and_joins_the_masks(tmp_path: Path, suffix: str) -> None:
+    transparent(tmp_path / f"images/a{suffix}", gradient())
+    picture = reader(tmp_path / "images").read(f"a{suffix}", Undistorter(PINHOLE))
+    np.testing.assert_array_equal(picture.mask, gradient() >= 128)
+    np.testing.assert_allclose(picture.image[gradient() == 255], 90 / 255, atol=1e-6)
+    write(tmp_path / "masks/a.png", half_mask())
+    both = reader(tmp_path / "images", masks=tmp_path / "masks").read(f"a{suffix}", Undistorter(PINHOLE))
+    np.testing.assert_array_equal(both.mask, (gradient() >= 128) & (half_mask() > 0))
+
+
+@pytest.mark.parametrize("alpha", [0, 255])
+def test_alpha_that_says_nothing_masks_nothing(tmp_path: Path, alpha: int) -> None:
+    transparent(tmp_path / "images/a.png", np.full((HEIGHT, WIDTH), alpha, np.uint8))
+    assert reader(tmp_path / "images").read("a.png", Undistorter(PINHOLE)).mask is None
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("white", [1, 3, 200])
+def test_the_brightest_value_of_the_masks_is_white(images: Path, tmp_path: Path, dtype: type, white: int) -> None:
+    write(images / "b.png", np.full((HEIGHT, WIDTH, 3), COLOUR, np.uint8))
+    write(tmp_path / "masks/a.png", np.zeros((HEIGHT, WIDTH), dtype))
+    write(tmp_path / "masks/b.png", (half_mask() > 0).astype(dtype) * dtype(white))
+    masked = reader(images, masks=tmp_path / "masks")
+    assert not masked.read("a.png", Undistorter(PINHOLE)).mask.any()
+    np.testing.assert_array_equal(masked.read("b.png", Undistorter(PINHOLE)).mask, half_mask() > 0)
+
+
+@pytest.mark.parametrize("colour", [0, 255])
+def test_a_mask_may_lie_in_its_alpha(images: Path, tmp_path: Path, colour: int) -> None:
+    transparent(tmp_path / "masks/a.png", gradient(), colour)
+    picture = reader(images, masks=tmp_path / "masks").read("a.png", Undistorter(PINHOLE))
+    np.testing.assert_array_equal(picture.mask, gradient() >= 128)
+
+
+def test_masks_that_are_all_black_are_refused_at_the_start(images: Path, tmp_path: Path) -> None:
+    write(tmp_path / "masks/a.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(InputError):
+        reader(images, masks=tmp_path / "masks").require_fitting([("a.png", Undistorter(PINHOLE))])
 
 
 def test_a_missing_or_misfitting_mask_is_named_before_anything_is_decoded(images: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import ImageFolder
@@ -37,6 +38,43 @@ def test_pixels_are_rgb_and_exact(folder, suffix):
     made = folder("a" + suffix)
     assert np.array_equal(made.read("a" + suffix), IMAGE)
     assert made.size("a" + suffix) == (30, 20)
+
+
+@pytest.mark.parametrize(("suffix", "form"), [(".jfif", "JPEG"), (".jpe", "JPEG"), (".jp2", "JPEG2000")])
+def test_rarer_suffixes_are_read(tmp_path, suffix, form):
+    Image.fromarray(np.full((20, 30, 3), (200, 90, 10), np.uint8)).save(tmp_path / f"a{suffix}", form, quality=95)
+    made = ImageFolder(tmp_path)
+    assert made.size(f"a{suffix}") == (30, 20)
+    assert np.abs(made.read(f"a{suffix}").astype(int) - (200, 90, 10)).max() <= 6
+
+
+def test_pictures_that_are_not_read_are_counted_unless_their_jpeg_is_there(folder, tmp_path):
+    (tmp_path / "a.DNG").touch()
+    assert folder("a.jpg", "b.jpg").notes == []
+    (tmp_path / "c.cr2").touch()
+    (note,) = ImageFolder(tmp_path).notes
+    assert "c.cr2" in note and "DNG" not in note
+
+
+@pytest.mark.parametrize("beside", ["depth/1.png", "1.depth.png", "masks/1.png", "left/mask/1.jpg.png"])
+def test_depth_maps_and_masks_beside_images_are_no_images(folder, tmp_path, beside):
+    deep = np.full((20, 30), 900, np.uint16) if "depth" in beside else np.full((20, 30), 255, np.uint8)
+    (tmp_path / beside).parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(tmp_path / beside), deep)
+    assert list(ImageFolder(tmp_path).names) == [beside]  # alone, they are taken for images
+    made = folder("1.jpg", "2.jpg")
+    assert list(made.names) == ["1.jpg", "2.jpg"] and len(made.notes) == 1
+
+
+def test_the_folder_of_masks_may_lie_among_the_images(folder, tmp_path):
+    folder("1.png", "valid/7.png")
+    assert list(ImageFolder(tmp_path, masks=tmp_path / "valid").names) == ["1.png"]
+
+
+def test_numbers_of_floating_point_are_named(folder, tmp_path):
+    cv2.imwrite(str(tmp_path / "a.tiff"), IMAGE.astype(np.float32) / 255)
+    with pytest.raises(InputError, match="float32"):
+        ImageFolder(tmp_path).read("a.tiff")
 
 
 def test_jpeg_is_decoded(folder):

@@ -1,4 +1,4 @@
-"""JPEG images are turned as their EXIF orientation says. OpenCV and Pillow do so too, and say what is right."""
+"""Images are turned as their EXIF orientation says. OpenCV and Pillow do so too, and say what is right."""
 
 from __future__ import annotations
 
@@ -41,6 +41,19 @@ def test_images_are_turned_once_and_a_note_says_how(tmp_path, orientation):
     else:
         (note,) = images.notes
         assert "as their EXIF orientation says" in note and "\n" not in note
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp", ".tif"])
+@pytest.mark.parametrize("orientation", [1, 2, 5, 6])
+def test_other_formats_are_turned_like_jpeg(tmp_path, suffix, orientation):
+    for name, stated in (("a", orientation), ("b", 1)):
+        write(tmp_path / f"{name}{suffix}", STORED, stated)
+    images = ImageFolder(tmp_path)
+    expected = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / f"a{suffix}")).convert("RGB"))
+    for name in images.names:  # the second one is turned like the first
+        assert images.size(name) == expected.shape[1::-1]
+        assert np.abs(images.read(name).astype(int) - expected).max() <= 40 * (suffix == ".webp")
+    assert len(images.notes) == (orientation != 1)
 
 
 def test_images_of_one_camera_that_differ_in_orientation_are_turned_like_the_first(tmp_path):

@@ -8,13 +8,15 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.camera_settings import PanoramaSettings
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.sources.panorama import Projection, faces_of, projection_of
+from modp_ti.inputs.bare_recording import recorded_scene
+from modp_ti.inputs.opening import is_panoramic, open_source, require_pinhole
+from modp_ti.inputs.sources.panorama import Projection, faces_of, looks_panoramic, projection_of
 from tests.panoramas import equirectangular_rays, fisheye_rays
 
 LENS_FOV = 200.0
@@ -53,6 +55,36 @@ def test_a_pixel_is_where_the_closed_form_sends_its_ray(projection: str) -> None
     if projection == "dual_fisheye":
         taken &= (rays[..., 2] >= 0) == (x < 64)
     np.testing.assert_allclose(found[taken], np.stack([x, y], axis=-1)[taken], atol=1e-9)
+
+
+def test_images_without_a_camera_that_see_all_round_are_found(folder: Path, tmp_path: Path) -> None:
+    first = open_source(SourceSettings(path=folder))
+    with pytest.raises(InputError, match=r"source\.panorama"):
+        require_pinhole(first, SourceSettings(path=folder), "a.png")
+    insisted = SourceSettings.model_validate({"path": folder, "panorama": {"projection": "none"}})
+    require_pinhole(first, insisted, "a.png")
+    assert recorded_scene(folder).source.panorama.projection == "equirectangular"
+    assert not recorded_scene(folder, ["source.panorama.projection=none"]).source.panorama.given
+
+
+def test_gpano_says_that_an_image_sees_all_round(tmp_path: Path) -> None:
+    """Of noise, which does not look so."""
+    noise = Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 128, 3), dtype=np.uint8))
+    xmp = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
+    noise.save(tmp_path / "said.jpg", xmp=xmp)
+    noise.save(tmp_path / "unsaid.jpg")
+    images = open_source(SourceSettings(path=tmp_path))
+    assert [is_panoramic(images, name) for name in ("said.jpg", "unsaid.jpg")] == [True, False]
+
+
+@pytest.mark.parametrize("angle", range(0, 360, 40))
+def test_a_pinhole_image_of_twice_its_height_is_none(angle: int) -> None:
+    """Also one with a black border."""
+    whole = painted(equirectangular_rays(256))
+    view = np.roll(whole, angle, axis=1)[64:192, :256]
+    assert not looks_panoramic(view)
+    assert not looks_panoramic(cv2.copyMakeBorder(view, 4, 4, 8, 8, cv2.BORDER_CONSTANT))
+    assert looks_panoramic(np.roll(whole, angle, axis=1))
 
 
 def test_directions_lie_where_a_viewer_of_the_panorama_expects_them() -> None:

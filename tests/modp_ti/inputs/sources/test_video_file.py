@@ -16,8 +16,12 @@ import av
 import cv2
 import numpy as np
 import pytest
+from av.stream import Disposition
 
+from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.bare_recording import is_recording
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import VideoFile
 
 FRAMES, FPS = 40, 12.5
@@ -90,6 +94,46 @@ def test_frames_are_named_counted_and_timed_by_the_container(video):
     assert made.size("room_000003") == (64, 48)
     np.testing.assert_allclose([made.timestamp(n) for n in made.names], np.arange(FRAMES) / FPS, atol=1e-3)
     assert made.notes == [] and made.intrinsics is None
+
+
+@pytest.mark.parametrize("thumbnail", [False, True])
+def test_the_best_stream_is_taken_wherever_it_stands(tmp_path, thumbnail):
+    """A small preview comes first; a thumbnail does not count as a stream."""
+    file = tmp_path / "room.mp4"
+    with av.open(str(file), "w") as output:
+        streams = []
+        for codec, (width, height) in (("mjpeg", (320, 240)), ("mpeg4", (32, 24)), ("mpeg4", (64, 48))):
+            if codec == "mjpeg" and not thumbnail:
+                continue
+            stream = output.add_stream(codec, rate=Fraction(FPS))
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            stream.disposition = Disposition.attached_pic if codec == "mjpeg" else Disposition.default
+            streams.append(stream)
+        for number, image in enumerate(IMAGES[:5]):
+            for stream in streams:
+                if number == 0 or stream.codec_context.name != "mjpeg":
+                    scaled = cv2.resize(image, (stream.width, stream.height))
+                    output.mux(stream.encode(av.VideoFrame.from_ndarray(scaled, format="rgb24")))
+        for stream in streams:
+            output.mux(stream.encode(None))
+    made = VideoFile(file)
+    assert (len(made), made.frame_size) == (5, (64, 48))
+    assert len(made.notes) == 1
+
+
+@pytest.mark.parametrize("name", ["room", "room.LRV", "room.clip"])
+def test_a_video_is_known_by_its_content(mp4, name):
+    named = mp4.rename(mp4.with_name(name))
+    assert is_recording(named)
+    assert open_source(SourceSettings(path=named)).frame_size == (64, 48)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("scene", b"source: {path: a}"), ("a.bin", bytes(99)), ("x.pdf", b"%PDF-1.4")]
+)
+def test_other_files_are_no_videos(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    assert not is_recording(tmp_path / name)
 
 
 def test_every_order_of_reading_gives_the_frames_of_the_file(video):

@@ -342,3 +342,39 @@ def test_the_faces_of_a_panorama_lie_at_its_pose(tmp_path):
         np.testing.assert_allclose(frame.T_camera_world[:3, :3].T @ frame.T_camera_world[:3, 3], T[:3, :3].T @ T[:3, 3])
         np.testing.assert_allclose(frame.T_camera_world[2, :3], [np.sin(turned), 0, np.cos(turned)] @ T[:3, :3])
         assert (frame.views, frame.held_out) == (3, place // 3 != 1)
+
+
+@pytest.mark.parametrize("place", ["masks", "images"])
+def test_masks_that_the_file_names_are_read_as_those_of_a_folder_and_are_no_images(with_cloud, place):
+    """One frame has none. Depth maps that it names are no images either."""
+    root = with_cloud.folder.parent
+    width, height = with_cloud.size
+    mask = np.zeros((height, width), np.uint8)
+    mask[height // 3 :] = 255
+    for folder in (place, "same"):
+        (root / folder).mkdir(exist_ok=True)
+    for name in with_cloud.names:
+        stem = name.rpartition(".")[0]
+        cv2.imwrite(str(root / place / f"{stem}_valid.png"), mask)
+        cv2.imwrite(str(root / place / f"{stem}_far.png"), mask)
+        cv2.imwrite(str(root / "same" / name), mask)
+
+    def named(data) -> None:
+        for frame in data["frames"][1:]:
+            stem = frame["file_path"].rpartition("/")[2].rpartition(".")[0]
+            frame |= {"mask_path": f"./{place}/{stem}_valid.png", "depth_file_path": f"{place}\\{stem}_far.png"}
+
+    by_folder = list(opened(with_cloud, masks=root / "same"))
+    edited(with_cloud, named)
+    if place == "images":
+        (root / "images" / f"{with_cloud.names[0].rpartition('.')[0]}_valid.png").unlink()
+        (root / "images" / f"{with_cloud.names[0].rpartition('.')[0]}_far.png").unlink()
+    tracker = opened(with_cloud)
+    assert tracker.notes == []
+    first, *frames = tracker
+    assert first.mask is None
+    for frame, expected in zip(frames, by_folder[1:], strict=True):
+        np.testing.assert_array_equal(frame.mask, expected.mask)
+        np.testing.assert_array_equal(frame.points.pixels, expected.points.pixels)
+    edited(with_cloud, lambda data: data["frames"][1].update(mask_path="masks/gone.png"))
+    assert "gone.png" in failure(with_cloud)
