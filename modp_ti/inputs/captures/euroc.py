@@ -77,7 +77,7 @@ def _top(tree: FileTree) -> str | None:
 def _sensor(tree: FileTree, name: str) -> dict[str, Any]:
     """Read the camera's YAML. Some have OpenCV's first line and tags, which are not those of YAML."""
     with readable(tree.path / name, " (source.path)"):
-        text = tree.read(name).decode("utf-8-sig")
+        text = tree.read_text(name)
     lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
     try:
         large = len(text) > LONGEST_SENSOR or text.count("[") + text.count("{") > MOST_LISTS

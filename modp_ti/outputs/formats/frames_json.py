@@ -13,11 +13,14 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files import read_json
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.distortion import Distortion
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.intrinsics import Intrinsics, require_plausible
 from modp_ti.inputs.sources.undistortion import Undistorter
 
 __all__ = ["FramesRecord", "read_frames", "write_frames"]
+
+# The parts of a lens that are always written.
+LENS = ("numerator", "denominator", "tangential", "fisheye")
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,9 @@ def write_frames(
         "held_out": sorted(held_out),
     }
     if undistorter is not None:
-        record["stored_camera"] = asdict(undistorter.raw) | {"distortion": asdict(undistorter.distortion)}
+        lens = asdict(undistorter.distortion)
+        lens = {name: value for name, value in lens.items() if name in LENS or value != asdict(NO_DISTORTION)[name]}
+        record["stored_camera"] = asdict(undistorter.raw) | {"distortion": lens}
     text = ",\n ".join(f'"{name}": {json.dumps(value)}' for name, value in record.items())
     replace_text(path, f"{{{text}}}\n")
 
@@ -92,5 +97,7 @@ def _stored_camera(data: Mapping[str, Any], path: Path) -> Intrinsics:
     p1, p2 = map(float, lens["tangential"])
     fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
     camera = PinholeCamera(fx, fy, cx, cy, int(data["width"]), int(data["height"]))
-    distortion = Distortion(numerator, denominator, (p1, p2), bool(lens["fisheye"]))
+    more = {name: value for name, value in lens.items() if name not in LENS}
+    prism = tuple(map(float, more.pop("prism", NO_DISTORTION.prism)))
+    distortion = Distortion(numerator, denominator, (p1, p2), bool(lens["fisheye"]), prism, **more)
     return Intrinsics(*require_plausible(camera, distortion, f"{path}: stored_camera"))
