@@ -180,6 +180,7 @@ class _Session:
                 return
             initialise(self.config.device, self.config.mapper_threads, self.config.seed)  # frees the smaller one
         self.mapper = build_mapper(self.config, camera.resized(width, height), self.conductor.pace)
+        self.mapper.frames.origin = self.tracker.origin
         began = time.perf_counter()
         with self.line.working("compiling kernels (the first time on this machine takes longest)"):
             self.mapper.pipeline.compile()

@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import far_origin
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import FEW, InputError, UnreadableImageError
@@ -103,6 +104,12 @@ class ReplayedTracker(Tracker):
     @property
     def undistorter(self) -> Undistorter | None:
         return self.frames[self._part.start].undistorter if self._part else None
+
+    @property
+    def origin(self) -> NDArray[np.float64] | None:
+        """That of the first frame of the whole recording, so that its parts have one origin."""
+        first = self.frames[0] if self.frames else None
+        return None if first is None else far_origin(first.T_camera_world, first.points)
 
     @property
     def largest(self) -> tuple[int, int]:

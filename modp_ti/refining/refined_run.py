@@ -91,8 +91,9 @@ def write_refined(
     results = Results(config.model_copy(update={"export": export}), _delivered(run))
     earlier = "refined" if metrics["refined"] is not None else "online"
     with results.writing_figures():
-        write_splats(results.folder / "splats.ply", refined.gaussians)
-        check_splats(results.folder / "splats.ply", refined.gaussians)
+        splats = results.folder / "splats.ply", refined.gaussians, run.record.origin
+        write_splats(*splats)
+        check_splats(*splats)
         exposures = refined.exposures_of(len(run))
         if refined.estimated:
             write_exposures(
