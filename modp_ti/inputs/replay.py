@@ -17,6 +17,7 @@ from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 
 __all__ = [
+    "ALL_HELD_OUT",
     "PosedImage",
     "ReplayedTracker",
     "Unreadable",
@@ -25,6 +26,9 @@ __all__ = [
     "readable_sizes",
     "tracked_frame",
 ]
+
+ALL_HELD_OUT = "all frames are held out, so that nothing is mapped: select more, or set source.holdout: null"
+"""Message on a recording of held-out frames alone."""
 
 
 @dataclass(frozen=True)
