@@ -90,6 +90,7 @@ def run(
     address: Address = None,
     fast: Fast = False,
     best: Best = False,
+    force: Annotated[bool, typer.Option("--force", help="map even if the poses do not fit the images")] = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -105,7 +106,8 @@ def run(
             "go on with (--resume OUT)"
         )
     with outcome(as_json) as result:
-        overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
+        options = {"view.enabled=true": view, "force=true": force}
+        overrides = [*(option for option, given in options.items() if given), *(set_ or []), *(more or [])]
         if onto is not None:
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
         if parts is not None:

@@ -31,6 +31,8 @@ from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
+from modp_ti.inputs.inspection.first_look import require_fitting
+from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
@@ -137,6 +139,9 @@ class _Session:
         self.earlier = open_earlier_map(self.config, self.line)
         tracker = self.replayed or open_tracker(self.config, self.line.prepare)
         self.held.callback(tracker.close)
+        if resumed is None and isinstance(tracker, ReplayedTracker) and not self.config.force:
+            with self.line.working("checking the poses"):
+                require_fitting(tracker)
         self.tracker = self.earlier.join(tracker)
         self.conductor = open_conductor(self.config, self.tracker, self.held)
         if self.config.is_realtime:  # the kernels are loaded while the tracker opens

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -85,6 +86,23 @@ class ReplayedTracker(Tracker):
             raise InputError(f"source.part ends at {end}, and the tracker has {len(self.frames)} frames: lower it")
         self._part = range(first, end)
         return self
+
+    def sampled(self, apart: int, each: int, blocks: int) -> Iterator[tuple[int, TrackedFrame]]:
+        """Yield place and frame of some images of the tracker's part, but of damaged ones: of rigs the first view.
+
+        Args:
+            apart: Images from one to the next of a block, fewer in a short recording.
+            each: Images of a block.
+            blocks: Number of blocks, which are spread evenly.
+        """
+        views = self._reader.source.panorama.count
+        count = len(self._part) // views
+        apart = min(apart, max(count // (blocks * each), 1))
+        for first in np.linspace(0, max(count - 1 - apart * (each - 1), 0), blocks).astype(int).tolist():
+            for image in range(first, min(first + apart * each, count), apart):
+                place = self._part[image * views]
+                with suppress(UnreadableImageError):
+                    yield place, replace(tracked_frame(self._reader, image, self.frames[place], place), views=1)
 
     def __len__(self) -> int:
         return len(self._part)

@@ -62,7 +62,12 @@ def two_views(
     pairs = np.repeat(np.arange(len(pixels_a), dtype=np.uint32)[:, None], 2, axis=1)
     found = estimated(
         pycolmap.estimate_calibrated_two_view_geometry,
-        lens.camera, np.ascontiguousarray(pixels_a), lens.camera, np.ascontiguousarray(pixels_b), pairs, options
+        lens.camera,
+        np.ascontiguousarray(pixels_a),
+        lens.camera,
+        np.ascontiguousarray(pixels_b),
+        pairs,
+        options,
     )
     kinds = pycolmap.TwoViewGeometryConfiguration
     if found is None or found.config not in (kinds.CALIBRATED, kinds.PLANAR) or found.cam2_from_cam1 is None:

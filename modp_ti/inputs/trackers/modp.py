@@ -18,7 +18,7 @@ from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers.given_poses import found_file, matched_entries, posed_images, read_entries
-from modp_ti.inputs.trackers.point_cloud import projected_points
+from modp_ti.inputs.trackers.point_cloud import projected_points, read_npy_points
 
 __all__ = ["open_modp"]
 
@@ -26,15 +26,6 @@ POSES = "trajectory.json"
 # File names that the release uses with ORB-SLAM3 as its tracker.
 POSES_ORB = "trajectory_orb.json"
 CLOUDS = {POSES: "point_cloud", POSES_ORB: "orb_point_clouds"}
-
-
-# The header that np.save writes. Its length is stored in two or four bytes.
-NPY_START = 4096
-NPY_HEADER = re.compile(
-    rb"\x93NUMPY[\1-\3]\0(?:..|....)\{\s*'descr':\s*'[<>|=]?[a-zA-Z]\d{1,3}',\s*'fortran_order':\s*(?:True|False),"
-    rb"\s*'shape':\s*\((?:\d{1,12},? ?){0,4}\),?\s*\}\s*\n",
-    re.DOTALL,
-)
 
 
 def open_modp(source: SourceSettings, tracker: ModpSettings) -> ReplayedTracker:
@@ -113,18 +104,7 @@ def _read_cloud(path: Path) -> NDArray[np.float64]:
             if not file.read(1):
                 return np.zeros((0, 3))
         return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
-    try:
-        with open_file(path) as file:
-            start = file.read(NPY_START)
-        if NPY_HEADER.match(start) is None:  # np.load also accepts archives and pickles, and evaluates the header
-            raise ValueError
-        xyz = np.load(path, allow_pickle=False, mmap_mode="r")  # mapping checks the shape against the file's size
-    except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TypeError):
-        raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
-    if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
-        raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
-    with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
-        xyz = np.array(xyz[:, :3], dtype=np.float64)
+    xyz = read_npy_points(path)
     bad = np.flatnonzero(~(np.abs(xyz) <= LARGEST).all(axis=1))
     if len(bad):
         raise InputError(f"{path}: point {bad[0]} holds NaN or infinite numbers, or such beyond {LARGEST:g}")
