@@ -91,7 +91,8 @@ def psnr_of_frames(scores: Sequence[FrameScore], frames: Sequence[FrameNote] = (
         if held_out.any():
             axes.plot(x[held_out], y[held_out], "o", ms=3.2, color=OF_STAGE[stage], label=f"{stage}, held out")
     _label(axes, "frame", "PSNR [dB]")
-    axes.legend(ncols=4, loc="lower right", bbox_to_anchor=(1, 1))
+    if axes.has_data():
+        axes.legend(ncols=4, loc="lower right", bbox_to_anchor=(1, 1))
     return figure
 
 
