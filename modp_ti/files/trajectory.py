@@ -17,7 +17,7 @@ __all__ = ["FARTHEST", "checked_pose", "poses_of_quaternions", "read_tum_rows", 
 FARTHEST = 1e12
 """Largest valid coordinate [scene units]. Squared coordinates must fit the map's float32."""
 
-MATRICES = dict.fromkeys((12, 16), "; a matrix in each line is tracker.kind: matrices")
+MATRICES: dict[int, str] = dict.fromkeys((12, 16), "; a matrix in each line is tracker.kind: matrices")
 
 # Largest deviation of a quaternion's length from 1. Rounding in text files stays below it.
 MAX_LENGTH_ERROR = 1e-2

@@ -60,9 +60,8 @@ def measure_geometry(survey: Survey, further: Callable[[int], Sequence[NDArray[n
 
     def moved(shift: int) -> Sequence[NDArray[np.float64]]:
         places = np.arange(len(poses)) + shift * survey.frames[0].views
-        return [poses[i] for i in np.clip(places, 0, len(poses) - 1)]
+        return [poses[i] for i in np.clip(places, 0, len(poses) - 1)] if further is None else further(shift)
 
-    moved = further or moved
     epipolar = {c: epipolar_score(survey.pairs, cameras, moved(c.shift), c) for c in CONVENTIONS}
     medians = {c: float(np.median(e)) if len(e) else float("inf") for c, e in survey.reprojection.items()}
     count = len(survey.reprojection[STATED])

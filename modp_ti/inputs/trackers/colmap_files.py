@@ -136,7 +136,7 @@ def _images_of_text(file: Path) -> Iterator[tuple[list[str], str]]:
             yield image, ""
         try:
             _require_quaternion(file, [float(word) for word in words[1:5]])
-            int(words[0]), [float(word) for word in words[5:8]], int(words[8]), words[9]
+            _ = int(words[0]), [float(word) for word in words[5:8]], int(words[8]), words[9]
         except (ValueError, IndexError):
             raise InputError(
                 f"{file}:{number}: no line of an image (id qw qx qy qz tx ty tz camera name); the file is damaged"

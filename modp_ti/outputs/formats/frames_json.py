@@ -110,6 +110,6 @@ def _stored_camera(data: Mapping[str, Any], path: Path) -> Intrinsics:
     fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
     camera = PinholeCamera(fx, fy, cx, cy, int(data["width"]), int(data["height"]))
     more = {name: value for name, value in lens.items() if name not in LENS}
-    prism = tuple(map(float, more.pop("prism", NO_DISTORTION.prism)))
-    distortion = Distortion(numerator, denominator, (p1, p2), bool(lens["fisheye"]), prism, **more)
+    s1, s2, s3, s4 = map(float, more.pop("prism", NO_DISTORTION.prism))
+    distortion = Distortion(numerator, denominator, (p1, p2), bool(lens["fisheye"]), (s1, s2, s3, s4), **more)
     return Intrinsics(*require_plausible(camera, distortion, f"{path}: stored_camera"))

@@ -172,7 +172,7 @@ def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
             flat = unwrapped(mesh)
         places = painted_from(run)
         mesh = painted(flat, ((*p, renderer.view(*p).colour) for p in line.through("painting", places, len(places))))
-    if target.suffix.lower() == ".ply":  # which has double coordinates
+    elif target.suffix.lower() == ".ply" and run.record.origin.any():  # its coordinates are double
         mesh.translate(run.record.origin)
     write_mesh(target, mesh)
 
