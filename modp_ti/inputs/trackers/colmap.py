@@ -89,8 +89,8 @@ def open_colmap(
     reader = checked_reader(images, source, cameras, str(folder))
 
     positions = {i: np.asarray(point.xyz, dtype=np.float64) for i, point in model.points3D.items()}
-    sound = (np.abs(np.array(list(positions.values())).reshape(-1, 3)) <= FARTHEST).all(axis=1)
-    lost = {i for i, kept in zip(positions, sound, strict=True) if not kept}
+    farthest = np.abs(np.array(list(positions.values())).reshape(-1, 3)).max(axis=1)
+    lost = {i for i, far in zip(positions, farthest.tolist(), strict=True) if not far <= FARTHEST}
     if lost:
         notes.append(f"{len(lost)} of {len(positions)} points of {folder} are NaN or infinite: left out")
     frames = []

@@ -160,7 +160,7 @@ def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
 
 
 def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:
-    """Return at most MAX_POINTS points (N, 3) of the run's COLMAP model, beside its splats. None of a file of splats."""
+    """Return at most MAX_POINTS points (N, 3) of the run's COLMAP model near its splats. None of a file of splats."""
     if not run.folder.is_dir():
         return np.zeros((0, 3))
     points = read_colmap_model(run.folder / "colmap").points3D
