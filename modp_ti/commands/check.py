@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -69,9 +71,13 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
     from modp_ti.inputs.trackers import open_tracker
     from modp_ti.outputs.progress import ProgressLine
 
-    line = ProgressLine(console)
-    tracker = open_tracker(config.without_clock(), line.prepare)
-    try:
+    line, config = ProgressLine(console), config.without_clock()
+    with ExitStack() as held:
+        if not (config.output / "sfm").is_dir():  # the tracker `sfm` leaves its model there
+            output = Path(held.enter_context(TemporaryDirectory(prefix="modp-ti-check-")))
+            config = config.model_copy(update={"output": output})
+        tracker = open_tracker(config, line.prepare)
+        held.callback(tracker.close)
         frames = iter(tracker)
         first = next(frames, None)
         if first is None:
@@ -90,8 +96,6 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
             *judge_scale(seen.frames, scale, config.mapping.keyframes.min_points),
         ]
         return Report(seen.frames, geometry, scale, _lens(tracker), list(tracker.notes), findings)
-    finally:
-        tracker.close()
 
 
 def _lens(tracker: Tracker) -> str:
@@ -104,6 +108,8 @@ def _lens(tracker: Tracker) -> str:
     if d.is_identity:
         return f"{size}, no distortion"
     words = [f"{'fisheye' if d.fisheye else 'radial'} " + " ".join(f"{k:.4g}" for k in d.numerator)]
+    if d.fov:
+        words = [f"FOV {d.fov:.4g}"]
     if any(d.denominator):
         words.append("over " + " ".join(f"{k:.4g}" for k in d.denominator))
     if any(d.tangential):

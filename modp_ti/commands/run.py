@@ -90,6 +90,7 @@ def run(
     address: Address = None,
     fast: Fast = False,
     best: Best = False,
+    force: Annotated[bool, typer.Option("--force", help="map even if the poses do not fit the images")] = False,
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -107,7 +108,8 @@ def run(
     with outcome(as_json) as result:
         if scene is not None and any("=" not in word for word in more or []):
             raise InputError("one recording at a time: `modp-ti batch` maps several; of pictures, name their folder")
-        overrides = [*(["view.enabled=true"] if view else []), *(set_ or []), *(more or [])]
+        options = {"view.enabled=true": view, "force=true": force}
+        overrides = [*(option for option, given in options.items() if given), *(set_ or []), *(more or [])]
         if onto is not None:
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
         if parts is not None:

@@ -245,6 +245,9 @@ class SceneConfig(StrictModel):
         description="map the recording in so many parts, each a process of its own, and merge their maps "
         "(docs/scale.md). Empty: as one",
     )
+    force: bool = Field(
+        default=False, description="map even where given poses cannot be those of the images (`modp-ti check`)"
+    )
     device: Literal["cpu", "cuda", "vulkan", "metal", "auto"] = Field(
         default="auto", description="`auto`: the GPU by CUDA, by Metal (macOS) or by Vulkan, otherwise the CPU"
     )

@@ -17,6 +17,7 @@ from modp_ti.engine.second_visit import SecondVisit
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import PRIVATE
 from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.replay import ALL_HELD_OUT
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.parts.merged_parts import MergedParts
 from pipelines.pace import CompletePace, Pace
@@ -70,13 +71,15 @@ def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Co
         held: Closes the recording when the run ends.
 
     Raises:
-        InputError: If the session cannot be recorded.
+        InputError: If the session cannot be recorded, or all frames are held out.
     """
     if isinstance(tracker, RecordedSession):
         return ReplayedRun(config.mapping, tracker)
     if not config.is_realtime:
         frames, every, views = tracker.frame_count, config.source.holdout, config.source.panorama.count
         held_out = 0 if frames is None or every is None else -(-frames // (every * views)) * views
+        if frames and frames == held_out:
+            raise InputError(ALL_HELD_OUT)
         return Conductor(CompletePace(config.mapping, None if frames is None else frames - held_out))
     recorder = None
     if config.export.session:

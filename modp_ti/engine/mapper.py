@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import far_origin, shifted, shifted_poses
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
@@ -105,6 +106,7 @@ class Mapper:
             )
         if self.frames.index and frame.index <= self.frames.index[-1]:
             raise ValueError(f"{frame.name} has index {frame.index}, the frame before it {self.frames.index[-1]}")
+        frame = self._near(frame)
         try:
             report = None if frame.held_out else self.pipeline.process(frame)
         except BlockError:
@@ -142,6 +144,7 @@ class Mapper:
                 f"the tracker corrects frame {correction.index[-1]} after frame {self.frames.index[-1]}, "
                 "before it has come"
             )
+        correction = shifted(correction, -self.frames.from_origin)
         report = self.pipeline.correct(correction, more)
         self.frames.correct(correction, report.around, report.moved)
 
@@ -202,7 +205,8 @@ class Mapper:
         Raises:
             KeyError, TypeError, ValueError: If the state does not fit this mapper.
         """
-        self.pipeline.restore(state, again)
+        self.frames.origin = frames.origin
+        self.pipeline.restore(state, map(self._near, again))
         if list(self.pipeline.trajectory) != frames.index:
             raise ValueError("the frames differ from those with tracked poses")
         self.frames = frames
@@ -238,10 +242,16 @@ class Mapper:
         return kept
 
     def _noted(self, frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
-        """Yield the frames, and keep their metadata."""
-        for frame in frames:
+        """Yield the frames near the map's origin, and keep their metadata."""
+        for frame in map(self._near, frames):
             yield frame
             self._note(frame)
+
+    def _near(self, frame: TrackedFrame) -> TrackedFrame:
+        """Return a frame in coordinates from the map's origin, which the first one decides."""
+        if self.frames.origin is None:
+            self.frames.origin = far_origin(frame.T_camera_world, frame.points)
+        return shifted(frame, -self.frames.origin)
 
     def _note(self, frame: TrackedFrame) -> None:
         """Keep the metadata of a frame that was mapped, and its points as far as the memory budget allows."""
@@ -249,7 +259,11 @@ class Mapper:
         self.pipeline.count_beside(self.frames.points.nbytes)
 
     def trajectory(self) -> list[NDArray[np.float64]]:
-        """Return the refined T_camera_world (4, 4) of every frame so far."""
+        """Return the refined T_camera_world (4, 4) of every frame so far, in the world of the frames."""
+        return [shifted_poses(T, self.frames.from_origin) for T in self._trajectory()]
+
+    def _trajectory(self) -> list[NDArray[np.float64]]:
+        """The refined poses in coordinates from the map's origin."""
         store = self.pipeline.keyframes
         return [store.corrected(i, T) for i, T in self.pipeline.trajectory.items()]
 
@@ -263,7 +277,7 @@ class Mapper:
 
         Args:
             camera: The camera, at most as large as the mapper's images.
-            T_camera_world: (4, 4) pose, None for the refined pose of the last frame.
+            T_camera_world: (4, 4) pose in the world of the frames, None for the refined pose of the last frame.
             background: RGB colour behind the map.
 
         Returns:
@@ -276,15 +290,17 @@ class Mapper:
             if not self.frames.index:
                 raise ValueError("there is no frame yet whose place to look from: give T_camera_world")
             last = self.frames.index[-1]
-            T_camera_world = self.pipeline.keyframes.corrected(last, self.pipeline.trajectory[last])
-        return self.pipeline.renderer.render(camera, T_camera_world, self.pipeline.near, background)
+            T_near = self.pipeline.keyframes.corrected(last, self.pipeline.trajectory[last])
+        else:
+            T_near = shifted_poses(T_camera_world, -self.frames.from_origin)
+        return self.pipeline.renderer.render(camera, T_near, self.pipeline.near, background)
 
     def version(self) -> MapVersion:
-        """Return a copy of the current map on the host."""
+        """Return a copy of the current map on the host, in coordinates from `frames.origin`."""
         store = self.pipeline.keyframes
         return MapVersion(
             self.pipeline.all_gaussians(),
-            self.trajectory(),
+            self._trajectory(),
             [store.exposure_at(i) for i in self.frames.index],
             self.pipeline.renderer.view_renders,
         )
@@ -306,7 +322,7 @@ class Mapper:
         if path.suffix == ".ply":
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_splats(path, self.pipeline.all_gaussians())
+                write_splats(path, self.pipeline.all_gaussians(), self.frames.from_origin)
             except OSError as error:
                 raise InputError(f"{path}: cannot be written: {error.strerror}") from None
             return path

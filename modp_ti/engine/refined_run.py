@@ -117,8 +117,9 @@ def _refined(run: FinishedRun, config: SceneConfig, metrics: dict[str, Any], lin
     )
     results = Results(config, _delivered(run))
     with results.writing_figures():
-        write_splats(results.folder / "splats.ply", version.gaussians)
-        check_splats(results.folder / "splats.ply", version.gaussians)
+        splats = results.folder / "splats.ply", version.gaussians, run.record.origin
+        write_splats(*splats)
+        check_splats(*splats)
         if estimated:
             times = run.timestamps.tolist()
             write_exposures(results.folder / "exposure.json", range(len(run)), times, version.exposures, estimated)

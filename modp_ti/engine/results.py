@@ -86,7 +86,7 @@ class Results:
     def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> None:
         """Write the map. Raises InputError if `splats.ply` is not read back as it was written."""
         write_map(self.folder, version, self.frames, self._names, keyframes, near, self.undistorter)
-        check_splats(self.folder / "splats.ply", version.gaussians)
+        check_splats(self.folder / "splats.ply", version.gaussians, self.frames.from_origin)
 
     def elsewhere(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> str:
         """Write the map to a new temporary folder, which stays; return the part of an error message that says so."""

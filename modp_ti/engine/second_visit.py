@@ -86,7 +86,9 @@ class SecondVisit(EarlierMap):
         initialise(config.device, config.mapper_threads, config.seed)  # frees what the locator has taken
         first = next(event for event in taken if isinstance(event, TrackedFrame))
         shift = shift_after(self._earlier.end, first.timestamp)
-        placement = Placement(self._alignment.S_map_tracker, len(run), shift, prefix_for(run.names))
+        S_world_tracker = self._alignment.S_map_tracker.copy()
+        S_world_tracker[:3, 3] += run.record.origin
+        placement = Placement(S_world_tracker, len(run), shift, prefix_for(run.names))
         return JoinedTracker(self._earlier, tracker, placement, taken, events)
 
     @property
@@ -137,6 +139,7 @@ class SecondVisit(EarlierMap):
             record.scene_depth,
             masks=self._masks,
         )
+        mapper.frames.origin = record.origin
         try:
             mapper.go_on_with(finished)
         except ValueError as error:

@@ -35,6 +35,8 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import run_folder
 from modp_ti.files.urls import without_secrets
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
+from modp_ti.inputs.inspection.first_look import require_fitting
+from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
@@ -151,6 +153,9 @@ class _Session:
         recovery = Recovery(self.config, tracker)
         self.held.callback(recovery.remove)
         recovery.write()
+        if resumed is None and isinstance(tracker, ReplayedTracker) and not self.config.force:
+            with self.line.working("checking the poses"):
+                require_fitting(tracker)
         self.tracker = self.earlier.join(tracker)
         self.conductor = open_conductor(self.config, self.tracker, self.held)
         if self.config.is_realtime:  # the kernels are loaded while the tracker opens
@@ -196,6 +201,7 @@ class _Session:
                 return
             initialise(self.config.device, self.config.mapper_threads, self.config.seed)  # frees the smaller one
         self.mapper = build_mapper(self.config, camera.resized(width, height), self.conductor.pace)
+        self.mapper.frames.origin = self.tracker.origin
         began = time.perf_counter()
         with self.line.working("compiling kernels (the first time on this machine takes longest)"):
             self.mapper.pipeline.compile()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from modp_ti.files import LARGEST, limited_lines, open_file, readable
 from modp_ti.files.errors import InputError
 from modp_ti.files.limits import most_unpacked
+from modp_ti.files.reading import text_encoding
 
 __all__ = ["read_csv_blocks"]
 
@@ -38,9 +39,10 @@ def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[in
             is not a finite number; with the file, if it is truncated or cannot be read.
     """
     with readable(path), open_file(path) as stored:
+        encoding = text_encoding(stored.peek(2))
         unpacked = _Unpacked(path, stored) if path.suffix == ".gz" else stored
         try:
-            with io.TextIOWrapper(unpacked, encoding="utf-8") as file:
+            with io.TextIOWrapper(unpacked, encoding=encoding) as file:
                 yield from _blocks(path, limited_lines(file), columns)
         except (EOFError, zlib.error, gzip.BadGzipFile):
             raise InputError(f"{path}: the gzip file is cut off or damaged; copy it again") from None
@@ -63,7 +65,7 @@ class _Unpacked(gzip.GzipFile):
 
 
 def _blocks(path: Path, file: Iterator[str], columns: Mapping[str, str]) -> Iterator[tuple[int, NDArray]]:
-    header = [name.strip() for name in next(file, "").lstrip("\ufeff").strip().split(",")]
+    header = [name.strip() for name in next(file, "").strip().split(",")]
     missing = [name for name in columns if name not in header]
     if missing:
         raise InputError(f"{path}:1: the header has no column {', '.join(missing)}")

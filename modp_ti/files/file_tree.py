@@ -12,7 +12,7 @@ from typing import Any
 from modp_ti.files.errors import InputError
 from modp_ti.files.json_text import parse_json
 from modp_ti.files.limits import BoundedZip
-from modp_ti.files.reading import is_file, open_file, read_bytes, readable
+from modp_ti.files.reading import is_file, open_file, read_bytes, readable, text_encoding
 
 __all__ = ["Archive", "FileTree", "Folder", "open_tree"]
 
@@ -44,10 +44,15 @@ class FileTree(ABC):
             OSError: If it is missing, damaged or too large.
         """
 
+    def read_text(self, name: str) -> str:
+        """Read a whole file as text. Raises OSError as `read`, and UnicodeDecodeError if it is none."""
+        data = self.read(name)
+        return data.decode(text_encoding(data))
+
     def read_json(self, name: str) -> Any:
         """Read a JSON file. Raises InputError if it is missing or not valid."""
         with readable(self.path / name, SETTING):
-            text = self.read(name).decode("utf-8-sig")
+            text = self.read_text(name)
         return parse_json(text, str(self.path / name))
 
     def close(self) -> None:  # noqa: B027 - a folder holds nothing open

@@ -32,7 +32,7 @@ def read_json(path: Path, setting: str) -> Any:
         InputError: If the file cannot be read as text or is not valid JSON.
     """
     with readable(path, f" ({setting})"):
-        text = read_text(path, "utf-8-sig")
+        text = read_text(path)
     return parse_json(text, str(path))
 
 

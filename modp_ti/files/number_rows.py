@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +26,7 @@ class NumberRows:
         path: The file.
         values: (N, columns).
         lines: (N,) line of each row in the file, from 1.
-        left_out: Number of rows that were skipped because they contain NaN or Inf.
+        left_out: Number of rows that were skipped because they contain NaN or Inf, or are lost.
     """
 
     path: Path
@@ -48,6 +50,8 @@ def read_number_rows(
     more: bool = False,
     few: float = 0.0,
     least: int = 1,
+    lost: Callable[[list[float]], bool] | None = None,
+    others: Mapping[int, str] = MappingProxyType({}),
 ) -> NumberRows:
     """Read a text table whose rows have `columns` finite numbers each.
 
@@ -59,6 +63,8 @@ def read_number_rows(
         more: Accept and ignore further columns.
         few: Largest share of the rows that may contain NaN or Inf; these rows are skipped.
         least: Least number of rows, 0 or 1.
+        lost: Whether a row of finite numbers is skipped as one with NaN is.
+        others: What rows with another number of columns are, for error messages.
 
     Raises:
         InputError: With file and line, if a row has another number of columns, text, too many rows contain NaN or Inf,
@@ -71,20 +77,22 @@ def read_number_rows(
         if not words:
             continue
         if len(words) < columns or (len(words) > columns and not more):
-            raise InputError(f"{path}:{number}: holds {len(words)} columns instead of {columns}: {meaning}")
+            kind = others.get(len(words), "")
+            raise InputError(f"{path}:{number}: holds {len(words)} columns instead of {columns}: {meaning}{kind}")
         try:
             row = [float(word) for word in words[:columns]]
         except ValueError:
             raise InputError(f"{path}:{number}: not a row of numbers: {meaning}") from None
-        if not all(map(math.isfinite, row)):
+        if not all(map(math.isfinite, row)) or (lost is not None and lost(row)):
             bad.append(number)
             continue
         if max(map(abs, row)) > LARGEST:
             raise InputError(f"{path}:{number}: holds a number beyond {LARGEST:g}; the file is damaged")
         values.extend(row)
         lines.append(number)
+    zeros = "" if lost is None else ", or a quaternion of zeros"
     if len(bad) > few * (len(lines) + len(bad)):
-        raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers; take the line out")
+        raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers{zeros}; take the line out")
     if len(lines) < least:
         raise InputError(f"{path}: holds no row of {meaning} ({setting})")
     rows = np.frombuffer(values).reshape(-1, columns)

@@ -5,6 +5,7 @@ Failures raise OSError with a readable `strerror`. Readers report it through `re
 
 from __future__ import annotations
 
+import codecs
 import errno
 import io
 import os
@@ -13,7 +14,6 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 from modp_ti.files.errors import InputError
 
@@ -30,6 +30,7 @@ __all__ = [
     "read_text",
     "readable",
     "reading",
+    "text_encoding",
     "text_lines",
 ]
 
@@ -100,7 +101,7 @@ def reading(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
         raise InputError(f"{path}: is damaged, or of a form that is not known ({reason}){hint}") from error
 
 
-def open_file(path: str | os.PathLike[str]) -> BinaryIO:
+def open_file(path: str | os.PathLike[str]) -> io.BufferedReader:
     """Open a regular file for reading.
 
     Raises:
@@ -133,29 +134,34 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         return file.read(size)
 
 
-def read_text(path: str | os.PathLike[str], encoding: str = "utf-8") -> str:
-    """Read a whole file as text.
+def text_encoding(start: bytes) -> str:
+    """Return the encoding of a text by its first bytes: UTF-8 unless a byte-order mark says UTF-16."""
+    return "utf-16" if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Read a whole file as text, in UTF-8 or UTF-16; a byte-order mark is skipped.
 
     Raises:
         OSError: As for `read_bytes`.
         UnicodeDecodeError: If the content does not decode.
     """
-    return read_bytes(path).decode(encoding)
+    data = read_bytes(path)
+    return data.decode(text_encoding(data))
 
 
-def text_lines(path: str | os.PathLike[str], encoding: str = "utf-8-sig", longest: int = MAX_LINE) -> Iterator[str]:
-    """Iterate over the lines of a text file, with their line ends.
+def text_lines(path: str | os.PathLike[str], longest: int = MAX_LINE) -> Iterator[str]:
+    """Iterate over the lines of a text file as of `read_text`, with their line ends.
 
     Args:
         path: The file.
-        encoding: Its encoding; the default also skips a byte-order mark.
         longest: Longest line in characters.
 
     Raises:
         OSError: As for `open_file`, and for a line that is too long.
         UnicodeDecodeError: If the content does not decode.
     """
-    with open_file(path) as file, io.TextIOWrapper(file, encoding=encoding) as text:
+    with open_file(path) as file, io.TextIOWrapper(file, encoding=text_encoding(file.peek(2))) as text:
         yield from limited_lines(text, longest)
 
 

@@ -17,6 +17,8 @@ __all__ = ["FARTHEST", "checked_pose", "poses_of_quaternions", "read_tum_rows", 
 FARTHEST = 1e12
 """Largest valid coordinate [scene units]. Squared coordinates must fit the map's float32."""
 
+MATRICES: dict[int, str] = dict.fromkeys((12, 16), "; a matrix in each line is tracker.kind: matrices")
+
 # Largest deviation of a quaternion's length from 1. Rounding in text files stays below it.
 MAX_LENGTH_ERROR = 1e-2
 # Largest deviation of R^T R from the identity. Rounding in text files stays below it.
@@ -24,8 +26,16 @@ MAX_ROTATION_DEFECT = 1e-2
 
 
 def read_tum_rows(path: Path, setting: str = "tracker.path", few: float = 0.0, least: int = 1) -> NumberRows:
-    """Read the lines `time tx ty tz qx qy qz qw` of a TUM trajectory, camera to world; see `read_number_rows`."""
-    return read_number_rows(path, 8, "time tx ty tz qx qy qz qw", setting, few=few, least=least)
+    """Read the lines `time tx ty tz qx qy qz qw` of a TUM trajectory, camera to world; see `read_number_rows`.
+
+    Trackers that are lost write NaN or a quaternion of zeros.
+    """
+    meaning = "time tx ty tz qx qy qz qw"
+    return read_number_rows(path, 8, meaning, setting, few=few, least=least, lost=_is_lost, others=MATRICES)
+
+
+def _is_lost(row: list[float]) -> bool:
+    return not any(row[4:8])
 
 
 def tum_poses(rows: NumberRows) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import NO_ORIGIN
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
@@ -29,6 +30,8 @@ class DeliveredFrames:
         held_out: Whether each frame is only for evaluation.
         trajectory: Tracked pose of each frame, shared with the map.
         points: Points and the frames that observed them.
+        origin: Where the origin of the poses and points here lies in the world of the tracker (3,), not zero where that
+            is far away; None before the first frame.
         corrections: Number of pose corrections received, and of those that moved the map.
     """
 
@@ -39,10 +42,16 @@ class DeliveredFrames:
     held_out: list[bool] = field(default_factory=list)
     trajectory: Trajectory = field(default_factory=Trajectory)
     points: TrackedPoints = field(default_factory=TrackedPoints)
+    origin: NDArray[np.float64] | None = None
     corrections: dict[str, int] = field(default_factory=lambda: {"received": 0, "moved": 0})
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @property
+    def from_origin(self) -> NDArray[np.float64]:
+        """What is added to places here for those in the world of the tracker (3,)."""
+        return NO_ORIGIN if self.origin is None else self.origin
 
     @property
     def T_tracked(self) -> list[NDArray[np.float64]]:  # noqa: N802  # a transform is named by its ends

@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import UnreadableImageError
@@ -99,6 +102,11 @@ class Tracker(ABC):
     def largest(self) -> tuple[int, int]:
         """Largest width and height of the delivered images, as far as they are known; 0 otherwise."""
         return 0, 0
+
+    @property
+    def origin(self) -> NDArray[np.float64] | None:
+        """Origin of a map of a world that is far away (3,), as `far_origin`; None to let the first frame decide."""
+        return None
 
     @property
     def further_maps(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
@@ -10,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import far_origin
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import FEW, InputError, UnreadableImageError
@@ -17,6 +19,7 @@ from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 
 __all__ = [
+    "ALL_HELD_OUT",
     "PosedImage",
     "ReplayedTracker",
     "Unreadable",
@@ -26,6 +29,9 @@ __all__ = [
     "readable_sizes",
     "tracked_frame",
 ]
+
+ALL_HELD_OUT = "all frames are held out, so that nothing is mapped: select more, or set source.holdout: null"
+"""Message on a recording of held-out frames alone."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,23 @@ class ReplayedTracker(Tracker):
         self._part = range(first, end)
         return self
 
+    def sampled(self, apart: int, each: int, blocks: int) -> Iterator[tuple[int, TrackedFrame]]:
+        """Yield place and frame of some images of the tracker's part, but of damaged ones: of rigs the first view.
+
+        Args:
+            apart: Images from one to the next of a block, fewer in a short recording.
+            each: Images of a block.
+            blocks: Number of blocks, which are spread evenly.
+        """
+        views = self._reader.source.panorama.count
+        count = len(self._part) // views
+        apart = min(apart, max(count // (blocks * each), 1))
+        for first in np.linspace(0, max(count - 1 - apart * (each - 1), 0), blocks).astype(int).tolist():
+            for image in range(first, min(first + apart * each, count), apart):
+                place = self._part[image * views]
+                with suppress(UnreadableImageError):
+                    yield place, replace(tracked_frame(self._reader, image, self.frames[place], place), views=1)
+
     def __len__(self) -> int:
         return len(self._part)
 
@@ -107,6 +130,12 @@ class ReplayedTracker(Tracker):
     @property
     def undistorter(self) -> Undistorter | None:
         return self.frames[self._part.start].undistorter if self._part else None
+
+    @property
+    def origin(self) -> NDArray[np.float64] | None:
+        """That of the first frame of the whole recording, so that its parts have one origin."""
+        first = self.frames[0] if self.frames else None
+        return None if first is None else far_origin(first.T_camera_world, first.points)
 
     @property
     def largest(self) -> tuple[int, int]:

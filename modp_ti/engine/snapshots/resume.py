@@ -27,6 +27,7 @@ __all__ = ["continued", "fetch_snapshot", "load_resumed", "replay"]
 # Settings that may change on resuming: the map does not depend on them, but for the device, in the last digits.
 FREE = (
     "output",
+    "force",
     "device",
     "threads",
     "snapshot_every",

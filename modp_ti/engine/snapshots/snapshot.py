@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import NO_ORIGIN
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
@@ -180,6 +181,7 @@ class Snapshot:
             held_out=rows["held_out"].tolist(),
             trajectory=trajectory,
             corrections={name: int(state.numbers["corrections"][name]) for name in ("received", "moved")},
+            origin=np.array(state.numbers.get("origin", NO_ORIGIN), dtype=np.float64).reshape(3),
         )
         frames.points.restore(points, frames.held_out)
         if {len(part) for part in (frames.name, frames.timestamp, frames.camera)} != {len(frames)}:
@@ -235,6 +237,8 @@ def frames_state(frames: DeliveredFrames) -> MapState:
         "held_out": np.array(frames.held_out, dtype=bool),
     }
     numbers = {"name": frames.name, "corrections": frames.corrections}
+    if frames.from_origin.any():
+        numbers["origin"] = frames.from_origin.tolist()
     return MapState.of({"frames": rows, "points": frames.points.state()}, numbers)
 
 

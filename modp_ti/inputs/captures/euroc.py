@@ -82,7 +82,7 @@ def _top(tree: FileTree) -> str | None:
 def _sensor(tree: FileTree, name: str) -> dict[str, Any]:
     """Read the camera's YAML. Some have OpenCV's first line and tags, which are not those of YAML."""
     with readable(tree.path / name, " (source.path)"):
-        text = tree.read(name).decode("utf-8-sig")
+        text = tree.read_text(name)
     plain = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
     data = parse_yaml(plain.replace("!!opencv-matrix", ""), str(tree.path / name), {})
     if not isinstance(data, dict):

@@ -62,7 +62,7 @@ def read_stray_scanner(tree: FileTree) -> Capture:
 def _table(tree: FileTree, name: str) -> tuple[list[str], list[list[str]], list[int]]:
     """Read a table: the names of its columns, and the words of each row with its line."""
     with readable(tree.path / name, " (source.path)"):
-        lines = list(limited_lines(io.StringIO(tree.read(name).decode("utf-8-sig"))))
+        lines = list(limited_lines(io.StringIO(tree.read_text(name))))
     words = [[word.strip() for word in line.split(",")] for line in lines]
     numbers = [n for n, row in enumerate(words) if n and any(row)]
     return (words[0] if words else []), [words[n] for n in numbers], [n + 1 for n in numbers]
@@ -81,7 +81,7 @@ def _numbers(row: list[str], places: list[int], where: str) -> list[float]:
 def _matrix(tree: FileTree) -> list[float]:
     """Return fx, fy, cx and cy of the file that holds one matrix for all frames."""
     with readable(tree.path / MATRIX, " (source.path)"):
-        text = tree.read(MATRIX).decode("utf-8-sig").replace(",", " ").split()
+        text = tree.read_text(MATRIX).replace(",", " ").split()
     try:
         values = [float(word) for word in text]
     except ValueError:

@@ -23,7 +23,7 @@ def read_lines(tree: FileTree, name: str) -> list[tuple[int, str]]:
         InputError: If it cannot be read.
     """
     with readable(tree.path / name, " (source.path)"):
-        text = io.StringIO(tree.read(name).decode("utf-8-sig"))
+        text = io.StringIO(tree.read_text(name))
         numbered = enumerate((line.partition("#")[0].strip() for line in limited_lines(text)), 1)
         return [(number, line) for number, line in numbered if line]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import inverse_se3
+from fields.geometry.se3 import inverse_se3, matrix_from_quaternion, quaternion_from_matrix
 
 __all__ = ["CONVENTIONS", "STATED", "Convention"]
 
@@ -27,6 +27,8 @@ class Convention:
         opengl: The camera axes are OpenGL's (y up, z back).
         body: The camera axes are those of a body in ROS (x forward, y left, z up).
         intrinsics: Factor that corrects the focal lengths and the principal point.
+        wxyz: The quaternions' components are w x y z, and were read as x y z w.
+        shift: The pose of a frame is that of the frame so many places further on.
         focal: Additional factor that corrects the focal lengths.
         fault: What is wrong with the input if this interpretation fits.
         mend: How to correct it.
@@ -36,6 +38,8 @@ class Convention:
     inverse: bool = False
     opengl: bool = False
     body: bool = False
+    wxyz: bool = False
+    shift: int = 0
     intrinsics: float = 1.0
     focal: float = 1.0
     fault: str = ""
@@ -44,6 +48,10 @@ class Convention:
     def pose(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """The correct T_camera_world (4, 4) under this interpretation, up to a rotation of the world."""
         T = inverse_se3(T_camera_world) if self.inverse else T_camera_world
+        if self.wxyz:
+            centre, read = inverse_se3(T)[:3, 3], quaternion_from_matrix(T[:3, :3].T)
+            R = matrix_from_quaternion(np.roll(read, -1))
+            return np.vstack([np.c_[R.T, -R.T @ centre], [0.0, 0.0, 0.0, 1.0]])
         if self.body:
             return BODY @ T
         return OPENGL @ T if self.opengl else T
@@ -82,6 +90,24 @@ CONVENTIONS = (
         fault="the poses have the axes of a body in ROS (x forward, z up) where those of a camera are expected",
         mend="give the poses of the camera's optical frame (of a bag: set tracker.camera), or turn every pose from "
         "body to optical axes",
+    ),
+    Convention(
+        "quaternions w x y z",
+        wxyz=True,
+        fault="the quaternions are in the order w x y z where x y z w is expected",
+        mend="write their w last: time tx ty tz qx qy qz qw",
+    ),
+    Convention(
+        "poses one image late",
+        shift=1,
+        fault="each image has the pose of the image before: its number or line is one too high",
+        mend="count the images of poses and names alike, from 0 (programs that extract frames often count from 1)",
+    ),
+    Convention(
+        "poses one image early",
+        shift=-1,
+        fault="each image has the pose of the image after: its number or line is one too low",
+        mend="count the images of poses and names alike, from 0",
     ),
     Convention(
         "intrinsics of half the size",

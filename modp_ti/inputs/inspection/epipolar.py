@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.inspection.conventions import Convention
+from modp_ti.inputs.multiview.estimators import estimated
 from modp_ti.inputs.multiview.features import Features, essential_matrix, match_anywhere
 
 __all__ = ["EpipolarScore", "MatchedPair", "epipolar_score", "matched_pair"]
@@ -76,7 +77,9 @@ def matched_pair(a: int, features_a: Features, b: int, features_b: Features) -> 
     pixels_a, pixels_b = features_a.pixels[pairs[:, 0]], features_b.pixels[pairs[:, 1]]
     pixel = max(features_a.pixel, features_b.pixel)
     cv2.setRNGSeed(0)
-    _, inlier = cv2.findFundamentalMat(pixels_a, pixels_b, cv2.USAC_MAGSAC, RANSAC_BAND * pixel, 0.999, 5000)
+    band = RANSAC_BAND * pixel
+    found = estimated(cv2.findFundamentalMat, pixels_a, pixels_b, cv2.USAC_MAGSAC, band, 0.999, 5000)
+    inlier = None if found is None else found[1]
     if inlier is None or inlier.sum() < LEAST_MATCHES:
         return None
     kept = inlier.ravel() > 0

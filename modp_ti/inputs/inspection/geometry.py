@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, STATED, Convention
 from modp_ti.inputs.inspection.epipolar import EpipolarScore, epipolar_score
 from modp_ti.inputs.inspection.finding import Finding, note, unusable, warning
 from modp_ti.inputs.inspection.survey import Survey
 
-__all__ = ["Geometry", "judge_geometry", "measure_geometry"]
+__all__ = ["LEAST_MATCHES", "Geometry", "best_convention", "judge_geometry", "measure_geometry"]
 
 # With fewer matches or points, nothing is concluded.
 LEAST_MATCHES = 100
@@ -46,11 +47,22 @@ class Geometry:
     diagonal: float
 
 
-def measure_geometry(survey: Survey) -> Geometry:
-    """Measure the agreement under each convention. The survey must have at least one frame."""
+def measure_geometry(survey: Survey, further: Callable[[int], Sequence[NDArray[np.float64]]] | None = None) -> Geometry:
+    """Measure the agreement under each convention. The survey must have at least one frame.
+
+    Args:
+        survey: The measurements.
+        further: Returns T_camera_world (4, 4) of the frames so many places after those of the survey; None if it has
+            all frames.
+    """
     cameras = [frame.camera for frame in survey.frames]
     poses = [frame.T_camera_world for frame in survey.frames]
-    epipolar = {c: epipolar_score(survey.pairs, cameras, poses, c) for c in CONVENTIONS}
+
+    def moved(shift: int) -> Sequence[NDArray[np.float64]]:
+        places = np.arange(len(poses)) + shift * survey.frames[0].views
+        return [poses[i] for i in np.clip(places, 0, len(poses) - 1)] if further is None else further(shift)
+
+    epipolar = {c: epipolar_score(survey.pairs, cameras, moved(c.shift), c) for c in CONVENTIONS}
     medians = {c: float(np.median(e)) if len(e) else float("inf") for c, e in survey.reprojection.items()}
     count = len(survey.reprojection[STATED])
     if medians[STATED] < COMPUTED:
@@ -73,13 +85,19 @@ def judge_geometry(geometry: Geometry) -> Iterator[Finding]:
         )
 
 
+def best_convention(geometry: Geometry) -> Convention:
+    """Return the convention that the matched features fit far better than that stated, or the stated one."""
+    stated, best = geometry.epipolar[STATED], min(CONVENTIONS, key=lambda c: geometry.epipolar[c].error)
+    score = geometry.epipolar[best]
+    better = score.error < BETTER_ERROR * stated.error and score.share >= stated.share + BETTER_SHARE
+    return best if better and score.share >= DOUBTFUL else STATED
+
+
 def _by_features(geometry: Geometry) -> Iterator[Finding]:
-    stated = geometry.epipolar[STATED]
-    best = min(CONVENTIONS, key=lambda c: geometry.epipolar[c].error)
+    stated, best = geometry.epipolar[STATED], best_convention(geometry)
     score = geometry.epipolar[best]
     numbers = f"{stated.share:.0%} of {stated.matches:,} matched features fit, median error {stated.error:.2f} px"
-    better = score.error < BETTER_ERROR * stated.error and score.share >= stated.share + BETTER_SHARE
-    if best is not STATED and better and score.share >= DOUBTFUL:
+    if best is not STATED:
         text = f"{best.fault}: as stated {numbers}; so read {score.share:.0%}, {score.error:.2f} px"
         yield unusable(_code(best), text, best.mend)
         return

@@ -11,6 +11,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres
 from modp_ti.inputs.inspection.finding import Finding, note, unusable, warning
 from modp_ti.inputs.inspection.survey import FrameRecord
+from modp_ti.inputs.replay import ALL_HELD_OUT
 
 __all__ = ["Scale", "judge_scale", "measure_scale"]
 
@@ -64,7 +65,9 @@ def judge_scale(frames: Sequence[FrameRecord], scale: Scale, min_points: int) ->
     """
     mapped = [frame for frame in frames if not frame.held_out]
     poor = [frame for frame in mapped if frame.points < min_points]
-    if len(poor) == len(mapped):
+    if not mapped:
+        yield unusable("held_out", ALL_HELD_OUT)
+    elif len(poor) == len(mapped):
         yield unusable(
             "points",
             f"no frame has {min_points} tracked points: none can become a keyframe",

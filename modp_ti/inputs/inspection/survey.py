@@ -75,20 +75,23 @@ class Survey:
     reprojection: dict[Convention, NDArray[np.float32]] = field(default_factory=dict)
 
 
-def survey(frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[int], None]) -> Survey:
+def survey(
+    frames: Iterable[TrackedFrame], total: int | None, seen: Callable[[int], None], places: int = PLACES
+) -> Survey:
     """Measure every frame in one pass.
 
     Args:
         frames: The frames.
         total: Number of frames; None if unknown.
         seen: Called after each frame with the number of frames so far.
+        places: Number of frames whose features are matched with those further on.
     """
     result = Survey()
     errors: dict[Convention, list[NDArray[np.float32]]] = {c: [] for c in CONVENTIONS}
     features: dict[int, Features] = {}
-    anchors = range(0, PLACES * LIVE_SPACING, LIVE_SPACING)
+    anchors = range(0, places * LIVE_SPACING, LIVE_SPACING)
     if total is not None:
-        anchors = set(np.linspace(0, max(total - 1 - GAPS[-1], 0), PLACES).astype(int).tolist())
+        anchors = set(np.linspace(0, max(total - 1 - GAPS[-1], 0), places).astype(int).tolist())
     before: dict[int, NDArray[np.float32]] = {}  # by view
     for place, frame in enumerate(frames):
         view, gaps = place % frame.views, [gap * frame.views for gap in GAPS]
@@ -139,6 +142,8 @@ def _record(
 
 def _reprojection_errors(frame: TrackedFrame, convention: Convention) -> NDArray[np.float32]:
     """Reprojection errors (N,) [px] of a frame's points under a convention; infinite for points behind the camera."""
+    if convention.shift:  # the points are not those of that image
+        return np.full(len(frame.points), np.inf, dtype=np.float32)
     T, camera = convention.pose(frame.T_camera_world), convention.camera(frame.camera)
     p = frame.points.xyz @ T[:3, :3].T + T[:3, 3]
     errors = np.full(len(p), np.inf, dtype=np.float32)

@@ -12,6 +12,7 @@ from modp_ti.inputs.klt.place_recognition import PlaceIndex
 from modp_ti.inputs.klt.recognition import Recognition, agreeing, recognised
 from modp_ti.inputs.klt.relocalisation import described_keyframe, world_points
 from modp_ti.inputs.klt.tracking import Tracking
+from modp_ti.inputs.multiview.estimators import estimated
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
 __all__ = ["MapJoining", "inverse_similarity", "joint_similarity"]
@@ -99,7 +100,7 @@ def joint_similarity(
     options.random_seed = seed
     there = np.concatenate([pair[0][good] for pair, good in zip(matched, both, strict=True)])
     here = np.concatenate([pair[1][good] for pair, good in zip(matched, both, strict=True)])
-    together = pycolmap.estimate_sim3d_robust(here, there, options)
+    together = estimated(pycolmap.estimate_sim3d_robust, here, there, options)
     if together is not None:
         # The declared type leaves out the dictionary around the transform.
         matrix = together["tgt_from_src"].matrix()  # pyright: ignore[reportIndexIssue]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.landmark_map import triangulated
 from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.multiview.estimators import estimated
 
 __all__ = ["TwoViews", "two_views"]
 
@@ -59,11 +60,17 @@ def two_views(
     options.ransac.random_seed = seed
     options.ransac.max_num_trials = 2000
     pairs = np.repeat(np.arange(len(pixels_a), dtype=np.uint32)[:, None], 2, axis=1)
-    found = pycolmap.estimate_calibrated_two_view_geometry(
-        lens.camera, np.ascontiguousarray(pixels_a), lens.camera, np.ascontiguousarray(pixels_b), pairs, options
+    found = estimated(
+        pycolmap.estimate_calibrated_two_view_geometry,
+        lens.camera,
+        np.ascontiguousarray(pixels_a),
+        lens.camera,
+        np.ascontiguousarray(pixels_b),
+        pairs,
+        options,
     )
     kinds = pycolmap.TwoViewGeometryConfiguration
-    if found.config not in (kinds.CALIBRATED, kinds.PLANAR) or found.cam2_from_cam1 is None:
+    if found is None or found.config not in (kinds.CALIBRATED, kinds.PLANAR) or found.cam2_from_cam1 is None:
         return None
     T = np.eye(4)
     T[:3] = found.cam2_from_cam1.matrix()

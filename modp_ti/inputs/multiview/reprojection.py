@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, orthonormalised
+from modp_ti.inputs.multiview.estimators import estimated
 
 __all__ = [
     "Observations",
@@ -174,7 +175,7 @@ def pose_from_points(
     options.ransac.max_num_trials = 2000
     options.ransac.min_inlier_ratio = 0.05
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=2000, height=2000, params=[1000.0, 0.0, 0.0])
-    found = pycolmap.estimate_absolute_pose(1000.0 * rays, xyz, camera, options)
+    found = estimated(pycolmap.estimate_absolute_pose, 1000.0 * rays, xyz, camera, options)
     if found is None:
         return None
     T = np.eye(4)

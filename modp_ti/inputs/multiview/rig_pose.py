@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, orthonormalised
+from modp_ti.inputs.multiview.estimators import estimated
 
 __all__ = ["refine_rig_pose", "relative_rig_pose", "rig_errors", "rig_pose_from_points"]
 
@@ -105,8 +106,9 @@ def rig_pose_from_points(
 
     if len(xyz) < 6:
         return None
-    found = pycolmap.estimate_generalized_absolute_pose(
-        FOCAL * rays, xyz, camera.tolist(), _sensors(mounts), _cameras(mounts), _ransac(max_error, seed)
+    found = estimated(
+        pycolmap.estimate_generalized_absolute_pose,
+        *(FOCAL * rays, xyz, camera.tolist(), _sensors(mounts), _cameras(mounts), _ransac(max_error, seed)),
     )
     return None if found is None else _finite(found["rig_from_world"])
 
@@ -138,7 +140,8 @@ def relative_rig_pose(
 
     if len(rays_a) < 12:
         return None
-    found = pycolmap.estimate_generalized_relative_pose(
+    found = estimated(
+        pycolmap.estimate_generalized_relative_pose,
         FOCAL * rays_a,
         FOCAL * rays_b,
         camera_a.tolist(),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from modp_ti.inputs.multiview.estimators import estimated
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.sources.intrinsics import Intrinsics
@@ -75,11 +76,11 @@ def reconstructed(
         every_known = all(image.known for image in images)
         progress("placing the images", 0, len(images))
         if mapper == "global":
-            models = _placed_together(database, folder, every_known, seed)
+            models = estimated(_placed_together, database, folder, every_known, seed)
         else:
-            models = _placed_in_turn(database, folder, every_known, seed, len(images), progress)
+            models = estimated(_placed_in_turn, database, folder, every_known, seed, len(images), progress)
         progress("placing the images", len(images), len(images))
-        best = max(models.values(), key=pycolmap.Reconstruction.num_reg_images, default=None)
+        best = max((models or {}).values(), key=pycolmap.Reconstruction.num_reg_images, default=None)
         if best is None or best.num_reg_images() < FEWEST_IMAGES:
             return None
         for image in best.images.values():

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import far_centre, shifted_poses
 from modp_ti.inputs.multiview.feature_tracks import feature_tracks
 from modp_ti.inputs.multiview.features import MAX_FEATURES, Features, detect_features, essential_matrix, match_features
 from modp_ti.inputs.multiview.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
@@ -124,7 +125,7 @@ class _Sequence:
         progress: Called during the computation.
 
     Attributes:
-        poses: (F, 4, 4) the given T_camera_world.
+        poses: (F, 4, 4) the given T_camera_world, of a world that begins near the cameras.
         follows: Whether corners are tracked from frame to frame, instead of matching SIFT features.
     """
 
@@ -133,7 +134,9 @@ class _Sequence:
     ) -> None:
         self._images, self._frames, self._solves, self._progress = images, frames, solves, progress
         self._focal = np.array([frame.undistorter.raw.focal for frame in frames])
-        self.poses = np.stack([frame.T_camera_world for frame in frames])
+        poses = np.stack([frame.T_camera_world for frame in frames])
+        self._origin = far_centre(poses)
+        self.poses = shifted_poses(poses, -self._origin)
         self.follows = len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
 
     def seen(self, band: float) -> Observations:
@@ -187,7 +190,8 @@ class _Sequence:
             camera = frame.undistorter.camera
             pixels = mine.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
             points = points_inside(xyz[mine.point], pixels, mine.point, frame.undistorter, T)
-            result.append(replace(frame, T_camera_world=T, points=points))
+            points = replace(points, xyz=points.xyz + self._origin)
+            result.append(replace(frame, T_camera_world=shifted_poses(T, self._origin), points=points))
         return result
 
     def _tell(self, what: str, done: int, total: int) -> None:

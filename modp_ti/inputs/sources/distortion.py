@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["EQUIDISTANT", "NO_DISTORTION", "PLUMB_BOB", "Distortion", "colmap_intrinsics", "lens_of_model"]
+__all__ = [
+    "COEFFICIENTS",
+    "EQUIDISTANT",
+    "NO_DISTORTION",
+    "PLUMB_BOB",
+    "Distortion",
+    "colmap_intrinsics",
+    "colmap_lens",
+    "lens_of_model",
+]
 
 Points = NDArray[np.float64]
 
@@ -30,25 +39,34 @@ class Distortion:
 
         perspective  (1 + n1 r^2 + n2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
         fisheye      theta (1 + n1 theta^2 + n2 theta^4 + ...) / r,   theta = atan(r)
+        fov          atan(2 r tan(fov / 2)) / (r fov)
 
     and the tangential part (p1, p2) adds (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y). The conventions
-    are those of OpenCV.
+    are those of OpenCV. A thin prism (s1, s2, s3, s4) adds (s1 r^2 + s2 r^4, s3 r^2 + s4 r^4). Of a fisheye lens, the
+    tangential part and the prism are of (x, y) theta / r, or of the radially distorted (x, y) with `radial_first`.
 
     Attributes:
         numerator: Coefficients n1, n2, ...
         denominator: Coefficients d1, d2, ... Not used for fisheye lenses.
         tangential: Coefficients (p1, p2).
         fisheye: Whether the radial part is the fisheye model.
+        prism: Coefficients (s1, s2, s3, s4) of a thin prism.
+        radial_first: What the tangential part and the prism of a fisheye lens are of.
+        fov: Angle of the FOV model [rad]; 0 for the other models.
     """
 
     numerator: tuple[float, ...] = ()
     denominator: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
     fisheye: bool = False
+    prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    radial_first: bool = False
+    fov: float = 0.0
 
     @property
     def is_identity(self) -> bool:
-        return not (self.fisheye or any(self.numerator) or any(self.denominator) or any(self.tangential))
+        coefficients = (*self.numerator, *self.denominator, *self.tangential, *self.prism)
+        return not (self.fisheye or self.fov or any(coefficients))
 
     def distort(self, points: Points) -> Points:
         """Map ideal coordinates (..., 2) to distorted ones (..., 2)."""
@@ -56,19 +74,29 @@ class Distortion:
         r2 = x * x + y * y
         factor = self._radial_factor(np.sqrt(r2))
         p1, p2 = self.tangential
-        return np.stack(
-            [
-                x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=-1,
-        )
+        radial = x * factor, y * factor
+        if self.fisheye:
+            shrunk = factor if self.radial_first else Distortion(fisheye=True)._radial_factor(np.sqrt(r2))
+            x, y = x * shrunk, y * shrunk
+            r2 = x * x + y * y
+        distorted = [
+            radial[0] + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            radial[1] + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ]
+        if any(self.prism):
+            s1, s2, s3, s4 = self.prism
+            distorted = [distorted[0] + (s1 + s2 * r2) * r2, distorted[1] + (s3 + s4 * r2) * r2]
+        return np.stack(distorted, axis=-1)
 
     def _radial_factor(self, r: NDArray[np.floating]) -> NDArray[np.floating]:
         if self.fisheye:
             theta = np.arctan(r)
             ratio = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-12)
             return ratio * polynomial.polyval(theta * theta, (1.0, *self.numerator))
+        if self.fov:
+            return np.divide(
+                np.arctan(2.0 * r * np.tan(0.5 * self.fov)), r * self.fov, out=np.ones_like(r), where=r > 1e-12
+            )
         r2 = r * r
         return polynomial.polyval(r2, (1.0, *self.numerator)) / polynomial.polyval(r2, (1.0, *self.denominator))
 
@@ -128,6 +156,16 @@ class Distortion:
 
 NO_DISTORTION = Distortion()
 
+COEFFICIENTS = {
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",),
+    "RADIAL_FISHEYE": ("k1", "k2"),
+    "THIN_PRISM_FISHEYE": ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+    "FOV": ("omega",),
+}
+"""Names of the coefficients of some of COLMAP's camera models, in its order."""
+
 
 def lens_of_model(model: str, D: Sequence[float], where: str) -> Distortion:  # as in OpenCV
     """Return the lens of a model that ROS, Kalibr or EuRoC names, with coefficients in OpenCV's order.
@@ -164,16 +202,27 @@ def colmap_intrinsics(model: str, params: Sequence[float]) -> tuple[float, float
         p.insert(0, p[0])
     if len(p) < 4:
         return None
-    fx, fy, cx, cy, *k = p
+    lens = colmap_lens(model, p[4:])
+    return None if lens is None else (p[0], p[1], p[2], p[3], lens)
+
+
+def colmap_lens(model: str, k: Sequence[float]) -> Distortion | None:
+    """Convert the coefficients of a COLMAP camera, which follow fx, fy, cx, cy; None if the model is not supported."""
     if model in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        distortion = Distortion(numerator=tuple(k))
-    elif model == "OPENCV":
-        distortion = Distortion(numerator=tuple(k[:2]), tangential=(k[2], k[3]))
-    elif model == "FULL_OPENCV":
+        return Distortion(numerator=tuple(k))
+    if model == "OPENCV":
+        return Distortion(numerator=tuple(k[:2]), tangential=(k[2], k[3]))
+    if model == "FULL_OPENCV":
         k1, k2, p1, p2, k3, k4, k5, k6 = k
-        distortion = Distortion((k1, k2, k3), (k4, k5, k6), (p1, p2))
-    elif model in ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"):
-        distortion = Distortion(numerator=tuple(k), fisheye=True)
-    else:
-        return None
-    return fx, fy, cx, cy, distortion
+        return Distortion((k1, k2, k3), (k4, k5, k6), (p1, p2))
+    if model in ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"):
+        return Distortion(numerator=tuple(k), fisheye=True)
+    if model == "FOV":
+        return Distortion(fov=k[0])
+    if model == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, sx1, sy1 = k
+        return Distortion((k1, k2, k3, k4), (), (p1, p2), fisheye=True, prism=(sx1, 0.0, sy1, 0.0))
+    if model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        prism = k[8], k[9], k[10], k[11]
+        return Distortion(tuple(k[:6]), (), (k[7], k[6]), fisheye=True, prism=prism, radial_first=True)
+    return None

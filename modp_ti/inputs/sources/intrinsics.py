@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
@@ -91,6 +93,7 @@ def require_plausible(camera: PinholeCamera, lens: Distortion, what: str) -> tup
         raise InputError(f"{what}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are none")
     if not all(abs(value) <= MAX_PIXELS_OF_FOCUS for value in (camera.fx, camera.fy, camera.cx, camera.cy)):
         raise InputError(f"{what}: fx, fy, cx or cy is no number of pixels that a camera has")
-    if not all(abs(value) <= MAX_COEFFICIENT for value in (*lens.numerator, *lens.denominator, *lens.tangential)):
+    coefficients = (*lens.numerator, *lens.denominator, *lens.tangential, *lens.prism)
+    if not all(abs(value) <= MAX_COEFFICIENT for value in coefficients) or not 0.0 <= lens.fov < np.pi:
         raise InputError(f"{what}: the lens's coefficients are none that a lens has")
     return camera, lens

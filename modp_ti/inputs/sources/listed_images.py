@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Iterable, Iterator, Sequence
+import unicodedata
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -61,15 +62,34 @@ class ListedImages(ImageSource):
         Leading folders may be missing in this source (`./train/0001.png` matches `0001.png` if the source is the folder
         `train`), and the name may lack its suffix.
         """
-        parts = PurePosixPath(name.replace("\\", "/")).parts
-        for first in range(len(parts)):
-            tail = "/".join(parts[first:])
+        for tail in _tails(name):
             if tail in self._position:
                 return tail
             # Only a name without an image suffix may match any suffix: `a.png` is not `a.jpg`.
             if not tail.lower().endswith(IMAGE_SUFFIXES) and tail in self._by_stem:
                 return self._by_stem[tail]
         return None
+
+    def find_all(self, names: Sequence[str]) -> tuple[list[str | None], str | None]:
+        """Find the images that all file names of a tracker refer to.
+
+        Names without an image are then compared without regard to case, Unicode's forms and at last image suffixes,
+        where only one image and one name are alike so.
+        """
+        found = [self.find(name) for name in names]
+        free = set(self.names) - set(found)
+        first = None
+        for likeness in (_folded, lambda name: _folded(str(PurePosixPath(name).with_suffix("")))):
+            alike, asked = _grouped(free, likeness), _grouped(names, likeness)
+            for number, name in enumerate(names):
+                for tail in _tails(name) if found[number] is None else ():
+                    one = alike.get(likeness(tail), [])
+                    if len(one) == 1 and len(asked[likeness(name)]) == 1:
+                        found[number] = one[0]
+                        first = first or f"{name} is {one[0]}"
+                        break
+            free -= set(found)
+        return found, first and f"its names are written in another way than those in {self.path}: {first}"
 
     def with_stem(self, stem: str) -> str | None:
         """Return the image whose path without suffix is `stem`, or None."""
@@ -210,6 +230,23 @@ class ListedImages(ImageSource):
         return UnreadableImageError(
             f"{self.path / name}: unreadable image: {reason}; replace it or take it out of the folder"
         )
+
+
+def _tails(name: str) -> list[str]:
+    """Return a path, and what is left of it without its first folder, the first two, ..."""
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    return ["/".join(parts[first:]) for first in range(len(parts))]
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _grouped(names: Iterable[str], key: Callable[[str], str]) -> dict[str, list[str]]:
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(key(name), []).append(name)
+    return groups
 
 
 def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = None) -> NDArray[np.uint8] | None:

@@ -107,6 +107,9 @@ class PacedSource(ImageSource):
     def find(self, name: str) -> str | None:
         return self._images.find(name)
 
+    def find_all(self, names: Sequence[str]) -> tuple[list[str | None], str | None]:
+        return self._images.find_all(names)
+
     def size(self, name: str) -> tuple[int, int]:
         return self._images.size(name)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
@@ -122,6 +123,22 @@ class ImageSource(ABC):
         tail = path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
         return tail if tail in self._position else None
 
+    def find_all(self, names: Sequence[str]) -> tuple[list[str | None], str | None]:
+        """Find the images that all file names of a tracker refer to.
+
+        Programs that extract frames count them from 1, this source from 0. Names that are one off only then show it
+        where the last one lies beyond the end; all of them are then shifted.
+
+        Returns:
+            The image of each name, None where there is none; and a remark if they are not named as here.
+        """
+        found = [self.find(name) for name in names]
+        if None in found and any(found):
+            shifted = [self.find(_one_less(name)) for name in names]
+            if None not in shifted:
+                return shifted, f"its names count from 1, those of {self.path.name} from 0: {names[0]} is {shifted[0]}"
+        return found, None
+
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
         """Return the names at positions start, start + step, ... before stop.
 
@@ -196,6 +213,11 @@ class ImageSource(ABC):
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing open
         """Release open resources, such as a camera or a file."""
+
+
+def _one_less(name: str) -> str:
+    """Return a name with the number at its end lowered by one."""
+    return re.sub(r"[0-9]+(?=[^0-9]*$)", lambda n: f"{int(n[0]) - 1:0{len(n[0])}d}", name)
 
 
 def require_intrinsics(images: ImageSource) -> Intrinsics:

@@ -51,7 +51,7 @@ def _opened(config: SceneConfig, progress: Progress | None) -> Tracker:
         case kinds.ColmapSettings() as tracker:
             from modp_ti.inputs.trackers.colmap import open_colmap
 
-            return open_colmap(source, tracker)
+            return open_colmap(source, tracker, progress)
         case kinds.TransformsSettings() as tracker:
             from modp_ti.inputs.trackers.transforms import open_transforms
 

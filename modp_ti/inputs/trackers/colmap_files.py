@@ -8,8 +8,10 @@ file rules that out.
 from __future__ import annotations
 
 import math
+import shutil
 import struct
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ from modp_ti.files.errors import InputError
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-__all__ = ["read_colmap_model"]
+__all__ = ["image_count", "read_colmap_model"]
 
 # Number of parameters of each camera model, by COLMAP's model id.
 CAMERA_PARAMS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
@@ -27,26 +29,61 @@ CAMERA_PARAMS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 
 STEMS = ("cameras", "images", "points3D")
 # Longest line of a text model [characters]. All observations of an image are in one line.
 MAX_TEXT_LINE = 1 << 24
+# Written for coordinates that are not finite, which pycolmap does not read. It lies beyond FARTHEST.
+NOWHERE = "1e300"
 
 
-def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
+def read_colmap_model(folder: Path, posed_alone: bool = False) -> pycolmap.Reconstruction:
     """Read the binary or text model in a folder.
+
+    Text is read as programs other than COLMAP write it too: with a byte-order mark, without the lines of images that
+    observe nothing, with blanks in names. NaN becomes a coordinate beyond `FARTHEST`.
+
+    Args:
+        folder: The folder.
+        posed_alone: Whether the model may lack `points3D`. It then has no point.
 
     Raises:
         InputError: If the model is incomplete or damaged.
     """
-    from modp_ti.files.quiet_pycolmap import pycolmap
-
     lacking = {s: {stem for stem in STEMS if not (folder / f"{stem}{s}").exists()} for s in (".bin", ".txt")}
-    if not lacking[".bin"]:
-        _require_whole_binary_model(folder)
-    elif not lacking[".txt"]:
-        _require_text_model(folder)
-    else:
+    there = [s for s in lacking if not lacking[s]]
+    if posed_alone:
+        there += [s for s in lacking if lacking[s] == {"points3D"}]
+    if not there:
         missing = sorted(lacking[".bin"] & lacking[".txt"])
         raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
+    if there[0] == ".bin":
+        _require_whole_binary_model(folder)
+        if not lacking[".bin"]:
+            return _read(folder, folder)
+    with tempfile.TemporaryDirectory(prefix="modp-ti-colmap-") as plain:
+        if there[0] == ".txt":
+            return _read(folder, Path(plain), _write_plain_text(folder, Path(plain)))
+        for file in folder.glob("*.bin"):
+            shutil.copyfile(file, Path(plain) / file.name)
+        (Path(plain) / "points3D.bin").write_bytes(bytes(8))
+        return _read(folder, Path(plain))
+
+
+def image_count(folder: Path) -> int:
+    """Return the number of images of a model, 0 if there is none that can be read."""
     try:
-        model = pycolmap.Reconstruction(str(folder))
+        if (folder / "images.bin").exists():
+            return _Cursor(folder / "images.bin").read("<Q")[0]
+        return sum(1 for _ in _images_of_text(folder / "images.txt"))
+    except InputError:
+        return 0
+
+
+def _read(folder: Path, plain: Path, names: Mapping[int, str] | None = None) -> pycolmap.Reconstruction:
+    """Read the model in `plain`, which is that of `folder`, and give its images these names."""
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    try:
+        model = pycolmap.Reconstruction(str(plain))
+        for number, name in (names or {}).items():
+            model.images[number].name = name
         for image in model.images.values():
             image.name.encode()  # fails if the name in the file is not UTF-8
     except Exception as error:  # from C++: ValueError, IndexError, MemoryError or RuntimeError
@@ -55,18 +92,75 @@ def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def _require_text_model(folder: Path) -> None:
-    """Raise InputError if a .txt file of the model is not text or an image's quaternion is invalid."""
-    for file in filter(Path.exists, (folder / f"{stem}.txt" for stem in RECORDS)):
-        lines = input_lines(file, "; export the COLMAP model again", MAX_TEXT_LINE)
-        for line in lines:
-            words = line.split(maxsplit=5)
-            if file.stem == "images" and words and not words[0].startswith("#"):
-                try:
-                    _require_quaternion(file, [float(word) for word in words[1:5]])
-                except ValueError as error:
-                    raise InputError(f"{file}: {error!s:.80}; the file is damaged") from None
-                next(lines, None)  # the image's observations
+def _write_plain_text(folder: Path, plain: Path) -> dict[int, str]:
+    """Write a text model as pycolmap reads it, and return the names of its images, which are numbers there."""
+    names: dict[int, str] = {}
+    observing = False
+    with (plain / "images.txt").open("w", encoding="utf-8") as file:
+        for words, observed in _images_of_text(folder / "images.txt"):
+            names[int(words[0])] = words[9]
+            observing |= bool(observed)
+            file.write(f"{' '.join(words[:9])} {words[0]}\n{observed}\n")
+    with (plain / "points3D.txt").open("w", encoding="utf-8") as file:
+        points = folder / "points3D.txt"
+        for number, line in _lines(points) if points.exists() else ():
+            words = line.split(maxsplit=8)
+            try:
+                xyz = [word if math.isfinite(float(word)) else NOWHERE for word in words[1:4]]
+                track = words[8:] if observing else []
+                file.write(" ".join([words[0], *xyz, words[4], words[5], words[6], words[7], *track]) + "\n")
+            except (ValueError, IndexError):
+                raise InputError(
+                    f"{points}:{number}: no line of a point (id x y z r g b error); export the model again"
+                ) from None
+    for stem in ("cameras", "rigs", "frames"):
+        if (folder / f"{stem}.txt").exists():
+            text = "\n".join(line for _, line in _lines(folder / f"{stem}.txt"))
+            (plain / f"{stem}.txt").write_text(text + "\n", encoding="utf-8")
+    return names
+
+
+def _images_of_text(file: Path) -> Iterator[tuple[list[str], str]]:
+    """Yield the ten words of each image in images.txt, the last of them its name, and the line of its observations.
+
+    A line of observations holds triples of numbers. It may be missing, and blank lines may stand anywhere.
+    """
+    image: list[str] | None = None
+    for number, line in _lines(file):
+        words = line.split(maxsplit=9)
+        if image is not None and _are_observations(line):
+            yield image, line
+            image = None
+            continue
+        if image is not None:
+            yield image, ""
+        try:
+            _require_quaternion(file, [float(word) for word in words[1:5]])
+            _ = int(words[0]), [float(word) for word in words[5:8]], int(words[8]), words[9]
+        except (ValueError, IndexError):
+            raise InputError(
+                f"{file}:{number}: no line of an image (id qw qx qy qz tx ty tz camera name); the file is damaged"
+            ) from None
+        image = words
+    if image is not None:
+        yield image, ""
+
+
+def _are_observations(line: str) -> bool:
+    """Whether a line holds triples of numbers and not an image, whose tenth word is the start of a name."""
+    words = line.split()
+    try:
+        [float(word) for word in words[:10]]
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
+
+
+def _lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Yield number and content of the lines of a text file that are neither blank nor comments."""
+    for number, line in enumerate(input_lines(file, "; export the COLMAP model again", MAX_TEXT_LINE), 1):
+        if (line := line.strip()) and not line.startswith("#"):
+            yield number, line
 
 
 def _require_quaternion(file: Path, q: Sequence[float]) -> None:

@@ -6,7 +6,8 @@ The camera comes from the source, the points from another file or from triangula
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from itertools import takewhile
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,6 +27,7 @@ from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.trackers.point_cloud import read_point_file, visible_points
 
 __all__ = [
+    "PANORAMAS",
     "checked_reader",
     "found_file",
     "matched_entries",
@@ -42,6 +44,9 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+
+PANORAMAS = "its images see all round: set source.panorama: {projection: equirectangular}"
+"""End of a message on a camera model of panoramas, which needs no intrinsics."""
 
 
 def selected_frames(images: ImageSource, source: SourceSettings) -> Sequence[str]:
@@ -95,30 +100,57 @@ def matched_entries(
     Raises:
         InputError: If two entries have the same image, or none has a selected one.
     """
-    found: dict[str, tuple[str, T]] = {}  # label and content of the entry by image
-    absent = []
-    for number, (stated, content) in enumerate(entries):
-        label = f"{number} ({stated})"
-        name = images.whole.find(stated)
-        if name is None:
-            absent.append(stated)
-        elif name in found:
-            raise InputError(f"{origin}: {what} {found[name][0]} and {label} are both the image {name}")
-        else:
-            found[name] = label, content
-    if not found:
+    listed = list(entries)
+    names, remark = images.whole.find_all([stated for stated, _ in listed])
+    wanted = _entries_of_images(images, [stated for stated, _ in listed], names, origin, what)
+    absent = [stated for number, (stated, _) in enumerate(listed) if number not in wanted.values()]
+    if not wanted:
         raise InputError(
             f"{origin}: none of its {len(absent)} {what} is in {images.path}: the first is {absent[0]}, there is "
-            f"{images.whole.names[0]}; check source.path"
+            f"{images.whole.names[0]}; check source.path, or name the images as {Path(shown).name} does"
         )
     selected = selected_frames(images, source)
-    matched = {name: found[name][1] for name in selected if name in found}
+    matched = {name: listed[wanted[name]][1] for name in selected if name in wanted}
     if not matched:
         raise InputError(
             f"{origin}: has no pose for any of the {len(selected)} frames that source.start/stop/step select"
         )
-    notes = [f"{len(absent)} {what} of {shown} are not in {images.path}: skipped"] if absent else []
+    notes = [f"{shown}: {remark}"] if remark else []
+    notes += [f"{len(absent)} {what} of {shown} are not in {images.path}: skipped"] if absent else []
     return matched, [*notes, *missing_frames_note(selected, matched, shown)]
+
+
+def _entries_of_images(
+    images: ImageSource, stated: Sequence[str], names: Sequence[str | None], origin: Path, what: str
+) -> dict[str, int]:
+    """Return the number of the entry of each image.
+
+    Where several have the same image by the ends of their names, as of the folders of two cameras, it is those whose
+    folders are also those of the images.
+    """
+    numbers: dict[str, list[int]] = {}
+    for number, name in enumerate(names):
+        if name is not None:
+            numbers.setdefault(name, []).append(number)
+    if all(len(same) == 1 for same in numbers.values()):
+        return {name: same[0] for name, same in numbers.items()}
+    fits = [0 if name is None else _common_end(stated[n], images.path / name) for n, name in enumerate(names)]
+    best = max(fits)
+    for name, same in numbers.items():
+        same[:] = [number for number in same if fits[number] == best] if len(same) > 1 else same
+        if len(same) > 1 or not same:
+            pair = [n for n, other in enumerate(names) if other == name][:2]
+            raise InputError(
+                f"{origin}: {what} {' and '.join(f'{n} ({stated[n]})' for n in pair)} are both the image {name}; give "
+                "source.path the folder from which their names start, or the folder of one of them by its name"
+            )
+    return {name: same[0] for name, same in numbers.items() if fits[same[0]] == best}
+
+
+def _common_end(stated: str, file: Path) -> int:
+    """Return how many of the last parts of two paths are the same."""
+    pairs = zip(reversed(PurePosixPath(stated.replace("\\", "/")).parts), reversed(file.absolute().parts), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def found_file(given: Path | None, guesses: Sequence[Path], what: str) -> Path:

@@ -109,7 +109,8 @@ def _read_matrices(file: Path) -> NumberRows:
     meaning = "a 3x4 or 4x4 matrix, camera to world, row by row"
     lines = input_lines(file, " (tracker.path)")
     words = next(filter(None, (line.partition("#")[0].replace(",", " ").split() for line in lines)), [])
-    return read_number_rows(file, 16 if len(words) == 16 else 12, meaning)
+    others = {8: "; a time, a position and a quaternion are tracker.kind: tum"}
+    return read_number_rows(file, 16 if len(words) == 16 else 12, meaning, others=others)
 
 
 def _numbers(words: list[str], count: int, where: str) -> list[float]:

@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ModpSettings
-from modp_ti.files import LARGEST, open_file, read_bytes, readable
+from modp_ti.files import LARGEST, open_file, readable
 from modp_ti.files.errors import InputError
-from modp_ti.files.limits import array_of
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers.given_poses import found_file, matched_entries, posed_images, read_entries
-from modp_ti.inputs.trackers.point_cloud import projected_points
+from modp_ti.inputs.trackers.point_cloud import projected_points, read_npy_points
 
 __all__ = ["open_modp"]
 
@@ -105,14 +104,7 @@ def _read_cloud(path: Path) -> NDArray[np.float64]:
             if not file.read(1):
                 return np.zeros((0, 3))
         return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
-    try:
-        xyz = array_of(read_bytes(path))
-    except (OSError, ValueError):
-        raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
-    if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
-        raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
-    with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
-        xyz = np.array(xyz[:, :3], dtype=np.float64)
+    xyz = read_npy_points(path)
     bad = np.flatnonzero(~(np.abs(xyz) <= LARGEST).all(axis=1))
     if len(bad):
         raise InputError(f"{path}: point {bad[0]} holds NaN or infinite numbers, or such beyond {LARGEST:g}")

@@ -1,4 +1,4 @@
-"""Points without observations: reading from PLY or text files, and a visibility test per camera."""
+"""Points without observations: reading from files, and a visibility test per camera."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.files import limited_lines, open_file, read_bytes, readable
 from modp_ti.files.errors import InputError
+from modp_ti.files.limits import array_of
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.ply import parse_ply_header
 from modp_ti.files.trajectory import FARTHEST
@@ -20,6 +21,9 @@ from modp_ti.inputs.sources import Undistorter
 
 __all__ = ["projected_points", "read_ply_points", "read_point_file", "visible_points"]
 
+# Longest header of a PCD file [bytes].
+PCD_START = 4096
+
 # Visibility is decided per square cell, whose size is this share of the image's longer side. In a cell, points up to
 # this factor of the nearest depth are visible; those farther away count as hidden.
 CELL = 1 / 60
@@ -27,16 +31,24 @@ HIDDEN_BEHIND = 1.15
 
 
 def read_point_file(path: Path) -> NDArray[np.float64]:
-    """Read positions (N, 3) from a PLY file, or from text whose lines begin with `x y z`.
+    """Read positions (N, 3) from a PLY, PCD or NPY file, or from text whose lines begin with `x y z`.
+
+    Positions that are not finite or lie beyond `FARTHEST` are dropped.
 
     Raises:
-        InputError: If the file is neither or has no points. For text, the message names the line.
+        InputError: If the file is none of these or has no points. For text, the message names the line.
     """
     with readable(path, " (tracker.points)"), open_file(path) as file:
-        is_ply = file.read(3) == b"ply"
-    if not is_ply:
-        return read_number_rows(path, 3, "x y z", "tracker.points", more=True).values
-    xyz = read_ply_points(path)
+        start = file.read(PCD_START)
+    if start.startswith(b"ply"):
+        xyz = read_ply_points(path)
+    elif start.startswith(b"\x93NUMPY"):
+        xyz = read_npy_points(path)
+    elif b"\nDATA " in start:
+        xyz = _read_pcd(path)
+    else:
+        xyz = read_number_rows(path, 3, "x y z", "tracker.points", more=True, few=1.0).values
+    xyz = xyz[(np.abs(xyz) <= FARTHEST).all(axis=1)]
     if len(xyz) == 0:
         raise InputError(f"{path}: holds no point (tracker.points); leave the key out to have points triangulated")
     return xyz
@@ -77,6 +89,47 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
     except (ValueError, OSError):  # OSError: a line is too long
         raise InputError(f"{path}: the PLY file is damaged or cut off") from None
     return xyz[(np.abs(xyz) <= FARTHEST).all(axis=1)]
+
+
+def read_npy_points(path: Path) -> NDArray[np.float64]:
+    """Read the first three columns (N, 3) of an array that np.save has written.
+
+    Raises:
+        InputError: If the file is damaged, or its array is none of points.
+    """
+    try:
+        xyz = array_of(read_bytes(path))
+    except (OSError, ValueError):
+        raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
+    if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
+        raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
+    with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
+        xyz = np.array(xyz[:, :3], dtype=np.float64)
+    return xyz
+
+
+def _read_pcd(path: Path) -> NDArray[np.float64]:
+    """Read the positions (N, 3) of a PCD file, ASCII or binary."""
+    data = read_bytes(path)
+    form, _, content = data.partition(b"\nDATA ")[2].partition(b"\n")
+    lines = [line.split() for line in data[: data.find(b"\nDATA ")].decode("ascii", "replace").splitlines()]
+    header = {words[0]: words[1:] for words in lines if words}
+    if form.strip() == b"binary_compressed":
+        raise InputError(f"{path}: a compressed PCD file: save it as binary or ASCII (pcl_convert_pcd_ascii_binary)")
+    try:
+        names, count = header["FIELDS"], int(header["POINTS"][0])
+        repeats = [int(n) for n in header.get("COUNT", ["1"] * len(names))]
+        if form.strip() == b"ascii":
+            places = [sum(repeats[: names.index(axis)]) for axis in "xyz"]
+            rows = [line.split() for line in content.decode("ascii").splitlines() if line.strip()]
+            return np.array([[float(row[place]) for place in places] for row in rows[:count]]).reshape(count, 3)
+        kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+        fields = zip(names, kinds, repeats, strict=True)
+        record = np.dtype([(f"{name} {n}", kind, (many,)) for n, (name, kind, many) in enumerate(fields)])
+        table = np.frombuffer(content, record, count)
+        return np.stack([table[f"{axis} {names.index(axis)}"][:, 0] for axis in "xyz"], axis=1).astype(np.float64)
+    except (KeyError, ValueError, IndexError, TypeError):
+        raise InputError(f"{path}: the PCD file is damaged or cut off") from None
 
 
 def projected_points(

@@ -59,7 +59,7 @@ def open_sfm(
             _reconstruct(reader, names, tracker, staged / folder.name, seed, progress or _silent)
             replace_text(staged / folder.name / MADE_OF, made_of)
     images.close()
-    opened = open_colmap(source, ColmapSettings(path=folder), upright=True)
+    opened = open_colmap(source, ColmapSettings(path=folder), progress, upright=True)
     if kept:
         opened.notes.append(f"structure from motion: {folder} is of these images and settings, and is used again")
     return opened

@@ -20,6 +20,9 @@ from modp_ti.inputs.trackers.given_poses import missing_frames_note, selected_fr
 
 __all__ = ["TimedPoses", "read_trajectory_file", "require_rising", "rows_at_frames"]
 
+# Units of times that are not seconds. Nanoseconds may have been taken for such from NANOSECONDS_FROM on.
+UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "microseconds since 1970": 1e3}
+
 # Times from here on are nanoseconds: in seconds they would be 3 million years.
 NANOSECONDS_FROM = 1e14
 
@@ -113,7 +116,7 @@ def rows_at_frames(
     """
     names = selected_frames(images, source)
     of_frames = np.array([images.whole.timestamp(name) for name in names])
-    shifted = times + tracker.time_offset
+    shifted, remark = _seconds(images, of_frames, path, times, tracker)
     pairs = associate(of_frames, shifted, tracker.max_difference)
     if len(pairs) == 0:
         raise InputError(
@@ -122,4 +125,37 @@ def rows_at_frames(
             f"{of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
         )
     rows = {names[int(frame)]: int(pose) for frame, pose in pairs}
-    return rows, missing_frames_note(names, rows, path.name)
+    notes = [f"the times of {path.name} {remark}"] if remark else []
+    return rows, [*notes, *missing_frames_note(names, rows, path.name)]
+
+
+def _seconds(
+    images: ImageSource,
+    of_frames: NDArray[np.float64],
+    path: Path,
+    times: NDArray[np.float64],
+    tracker: TimedPosesSettings,
+) -> tuple[NDArray[np.float64], str]:
+    """Return the times of the poses on the images' clock [s], and a remark if the file does not state seconds.
+
+    Numbers of frames and other units are recognised where far more images have a pose then.
+    """
+
+    def count(seconds: NDArray[np.float64]) -> int:
+        return len(associate(of_frames, seconds + tracker.time_offset, tracker.max_difference))
+
+    least = 0.5 * min(len(of_frames), len(times))
+    readings = {"": times}
+    if count(times) < least:
+        readings |= {f"are {unit}": times * factor for unit, factor in UNITS.items()}
+        own = np.array([images.whole.timestamp(name) for name in images.whole.names])
+        first = int(times[-1] == len(own) and times[0] > 0)
+        if times[0] >= 0 and times[-1] - first < len(own) and not (times % 1).any():
+            readings[f"count frames from {first}"] = own[times.astype(np.int64) - first]
+    counts = {remark: count(seconds) for remark, seconds in readings.items()}
+    second, best = sorted(counts, key=lambda remark: counts[remark])[-2:] if len(counts) > 1 else ("", "")
+    if counts[best] <= max(2 * counts[""], least):
+        best = ""
+    elif 2 * counts[second] > counts[best]:
+        raise InputError(f"{path}: its times either {best} or {second}: write them in seconds")
+    return readings[best] + tracker.time_offset, best

@@ -23,12 +23,14 @@ from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter
+from modp_ti.inputs.sources.distortion import COEFFICIENTS, colmap_lens
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.masks import MaskFolder
 from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.sources.undistortion import undistorter_beside
 from modp_ti.inputs.trackers.given_poses import (
+    PANORAMAS,
     checked_reader,
     found_file,
     matched_entries,
@@ -187,7 +189,13 @@ def _intrinsics(
         model = "OPENCV_FISHEYE"
     if model in FISHEYE_MODELS:
         return require_plausible(camera, Distortion((k1, k2, k3, k4), fisheye=True), what)
+    if model in COEFFICIENTS:
+        lens = colmap_lens(model, [number(key) or 0.0 for key in COEFFICIENTS[model]])
+        assert lens is not None, "COEFFICIENTS names supported models"
+        return require_plausible(camera, lens, what)
+    if model == "EQUIRECTANGULAR":
+        raise InputError(f"{file}: {PANORAMAS}")
     if model not in PERSPECTIVE_MODELS:
-        supported = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
+        supported = ", ".join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS, *COEFFICIENTS))
         raise InputError(f"{file}: camera model {model} is not supported ({supported}); undistort the images first")
     return require_plausible(camera, Distortion((k1, k2, k3, k4), tangential=(p1, p2)), what)

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import NO_ORIGIN
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.atomic import write_picture
@@ -38,6 +39,7 @@ def write_colmap(
     cameras: Sequence[PinholeCamera],
     poses: Sequence[NDArray[np.float64]],
     points: TrackedPoints,
+    origin: NDArray[np.float64] = NO_ORIGIN,
 ) -> None:
     """Write a COLMAP model (`cameras.bin`, `images.bin`, `points3D.bin`) to a new folder.
 
@@ -50,6 +52,7 @@ def write_colmap(
         cameras: PINHOLE camera of each undistorted image.
         poses: T_camera_world (4, 4) of each image.
         points: Tracked points with the pixels of each frame.
+        origin: Where the origin of `points` lies in the world of the poses (3,).
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -77,7 +80,7 @@ def write_colmap(
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T_camera_world[:3]))
         for place, row in enumerate(seen.tolist()):
             tracks[row].add_element(number, place)
-    for xyz, track, colour in zip(points.xyz, tracks, points.colours, strict=True):
+    for xyz, track, colour in zip(points.xyz + origin, tracks, points.colours, strict=True):
         model.add_point3D(xyz, track, colour)
     model.update_point_3d_errors()
     folder.mkdir(parents=True)

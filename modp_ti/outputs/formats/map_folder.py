@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from fields.frames.origin import shifted_poses
 from fields.map.keyframes import KeyframeStore
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.undistortion import Undistorter
@@ -45,12 +46,14 @@ def write_map(
         undistorter: Undistorter of the first frame's image, None if it is not known.
     """
     selected = {keyframe.index for keyframe in keyframes.selected}
-    write_splats(folder / "splats.ply", version.gaussians)
-    write_trajectory(folder / "trajectory.txt", frames.timestamp, version.trajectory)
-    write_colmap(folder / "colmap", names, frames.camera, version.trajectory, frames.points)
+    origin = frames.from_origin
+    poses = [shifted_poses(T, origin) for T in version.trajectory]
+    write_splats(folder / "splats.ply", version.gaussians, origin)
+    write_trajectory(folder / "trajectory.txt", frames.timestamp, poses)
+    write_colmap(folder / "colmap", names, frames.camera, poses, frames.points, origin)
     lines = [line for line, index in enumerate(frames.index) if index in selected]
     held_out = [line for line, held in enumerate(frames.held_out) if held]
-    write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out, undistorter)
+    write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out, undistorter, origin)
     if any(exposure is not None for exposure in version.exposures):
         estimated = {keyframe.index for keyframe in keyframes if keyframe.exposure is not None}
         write_exposures(folder / "exposure.json", frames.index, frames.timestamp, version.exposures, estimated)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import NO_ORIGIN
 from fields.map.gaussians import SH_C0
 from modp_ti.files.atomic import written_aside
 from modp_ti.outputs.formats.open3d_io import open3d
@@ -20,19 +21,22 @@ __all__ = ["write_points"]
 LEAST_OPACITY = 0.5
 
 
-def write_points(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> int:
+def write_points(
+    path: str | os.PathLike[str], state: Mapping[str, NDArray], origin: NDArray[np.float64] = NO_ORIGIN
+) -> int:
     """Write the centres of the opaque Gaussians with their constant colours as binary PLY.
 
     Args:
         path: The file.
         state: Gaussians by name, as from `GaussianField.to_numpy`.
+        origin: Where their origin lies in the world (3,), which the points are written in.
 
     Returns:
         Number of points.
     """
     o3d = open3d()
     solid = opacities(state) >= LEAST_OPACITY
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(state["position"][solid].astype(np.float64)))
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(state["position"][solid].astype(np.float64) + origin))
     colours = np.clip(0.5 + SH_C0 * state["sh"][solid, 0].astype(np.float64), 0.0, 1.0)
     cloud.colors = o3d.utility.Vector3dVector(colours)
     with written_aside(Path(path)) as partial:

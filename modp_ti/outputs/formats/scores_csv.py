@@ -42,7 +42,7 @@ def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
     """
     file = Path(path)
     try:
-        rows = list(csv.reader(text_lines(file, "utf-8")))
+        rows = list(csv.reader(text_lines(file)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{file}: cannot be read as scores: {reason}") from None

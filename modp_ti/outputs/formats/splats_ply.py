@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import NO_ORIGIN
 from fields.runtime.heap import give_back_pages
 from modp_ti.files import read_bytes
 from modp_ti.files.atomic import replacing
@@ -35,7 +36,9 @@ def _names(sh_count: int) -> list[str]:
     ]  # fmt: skip
 
 
-def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> None:
+def write_splats(
+    path: str | os.PathLike[str], state: dict[str, NDArray], origin: NDArray[np.float64] = NO_ORIGIN
+) -> None:
     """Write Gaussians as a 3DGS PLY file. The file appears whole or not at all.
 
     Opacities are logits, scales are logarithms, quaternions have w first, and `f_rest` holds all of red first. All
@@ -44,6 +47,7 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
     Args:
         path: The file.
         state: Gaussians by name, as from `GaussianField.to_numpy`.
+        origin: Where their origin lies in the world (3,), which a comment says if it is not zero.
 
     Raises:
         OSError: If the file cannot be written.
@@ -52,33 +56,38 @@ def write_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> Non
         modp_ti.write_splats("splats.ply", mapper.pipeline.gaussians.to_numpy())
     """
     with replacing(path) as file:
-        for piece in _pieces(state):
+        for piece in _pieces(state, origin):
             file.write(piece)
 
 
-def check_splats(path: str | os.PathLike[str], state: dict[str, NDArray]) -> None:
+def check_splats(
+    path: str | os.PathLike[str], state: dict[str, NDArray], origin: NDArray[np.float64] = NO_ORIGIN
+) -> None:
     """Check that a file reads back, byte for byte, as `write_splats` has written it.
 
     Args:
         path: The file.
         state: The Gaussians that were written.
+        origin: Their origin.
 
     Raises:
         InputError: If it does not, or cannot be read.
     """
     try:
         with open_file(path) as file:
-            same = all(file.read(len(piece)) == piece for piece in _pieces(state)) and not file.read(1)
+            same = all(file.read(len(piece)) == piece for piece in _pieces(state, origin)) and not file.read(1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read back: {error.strerror}") from None
     if not same:
         raise InputError(f"{path}: is not read back as it was written; check the disk, or choose another output folder")
 
 
-def _pieces(state: dict[str, NDArray]) -> Iterator[bytes]:
+def _pieces(state: dict[str, NDArray], origin: NDArray[np.float64]) -> Iterator[bytes]:
     """Yield the content of the file, a part of the rows at a time."""
     n, sh_count, _ = state["sh"].shape
     header = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}", f"element vertex {n}"]
+    if origin.any():
+        header.insert(3, f"comment origin {' '.join(map(repr, origin.tolist()))}")
     header += [f"property float {name}" for name in _names(sh_count)]
     yield ("\n".join([*header, "end_header"]) + "\n").encode("ascii")
     for first in range(0, n, ROWS_EACH):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from fields.frames.origin import shifted_poses
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import IntrinsicsSettings
@@ -34,7 +35,7 @@ class Location:
 
     Attributes:
         name: Name of the picture.
-        T_camera_world: Pose (4, 4) in the map, OpenCV axes; None if it was not found.
+        T_camera_world: Pose (4, 4) in the world of the run's poses, OpenCV axes; None if it was not found.
         reason: Why it was not found; empty otherwise.
         inliers: Number of features that the picture and the render of the map from this pose show at the same place.
         likeness: Correlation of the picture and this render, from -1 to 1.
@@ -128,7 +129,7 @@ class Locator:
             return Location(name, reason=found, note=chosen.note)
         return Location(
             name,
-            found.T_camera_world,
+            shifted_poses(found.T_camera_world, self._run.record.origin),
             "",
             found.inliers,
             found.likeness,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.pixel_metric import pixel_jacobian
+from modp_ti.inputs.multiview.estimators import estimated
 
 __all__ = ["Resection", "pose_covariance", "reprojection_errors", "resect"]
 
@@ -72,7 +73,7 @@ def resect(
     found_by = pycolmap.Camera(
         model=model, width=camera.width, height=camera.height, params=[*focal, camera.cx, camera.cy]
     )
-    found = pycolmap.estimate_and_refine_absolute_pose(pixels, xyz, found_by, options, refinement)
+    found = estimated(pycolmap.estimate_and_refine_absolute_pose, pixels, xyz, found_by, options, refinement)
     if found is None:
         return None
     T = np.eye(4)

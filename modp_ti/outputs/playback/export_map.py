@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from fields.frames.origin import shifted_poses
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files, refuse_foreign
 from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
@@ -111,7 +112,7 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     try:
         if format == "points":
             with line.working("writing points"):
-                write_points(target, run.gaussians)
+                write_points(target, run.gaussians, run.record.origin)
         elif format == "mesh":
             _mesh(run, target, options, line)
         elif format == "splat":
@@ -185,6 +186,8 @@ def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
             flat = unwrapped(mesh)
         places = painted_from(run)
         mesh = painted(flat, ((*p, renderer.view(*p).colour) for p in line.through("painting", places, len(places))))
+    elif target.suffix.lower() == ".ply" and run.record.origin.any():  # its coordinates are double
+        mesh.translate(run.record.origin)
     write_mesh(target, mesh)
 
 
@@ -213,5 +216,6 @@ def _dataset(run: FinishedRun, target: Path, format: str, line: ProgressLine) ->
         if format == "colmap":
             rename_images(run.folder / "colmap", folder / "sparse" / "0", names)
         else:
-            write_points(folder / "points.ply", run.gaussians)
-            write_transforms(folder, names, run.cameras, list(run.poses), run.record.held_out, "points.ply")
+            write_points(folder / "points.ply", run.gaussians, run.record.origin)
+            poses = list(shifted_poses(run.poses, run.record.origin))
+            write_transforms(folder, names, run.cameras, poses, run.record.held_out, "points.ply")

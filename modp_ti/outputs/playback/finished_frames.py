@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fields.frames.origin import shifted
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
 from modp_ti.outputs.playback.finished_run import FinishedRun
@@ -17,7 +18,7 @@ __all__ = ["FinishedFrames", "frames_of"]
 
 
 class FinishedFrames:
-    """The frames of a finished run, which can be iterated over repeatedly. Images are read one by one.
+    """The frames of a finished run in its world, which can be iterated over repeatedly. Images are read one by one.
 
     The ids of the points are negative, so that they never are those of another tracker.
 
@@ -58,11 +59,11 @@ class FinishedFrames:
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         for frame in frames_of(self._run, range(len(self._run)), self._preparing):
-            yield replace(frame, points=self._points[frame.index])
+            yield replace(shifted(frame, self._run.record.origin), points=self._points[frame.index])
 
 
 def frames_of(run: FinishedRun, places: Sequence[int], preparing: Preparing | None = None) -> Generator[TrackedFrame]:
-    """Yield frames of a finished run with their refined poses, without points.
+    """Yield frames of a finished run with their refined poses in coordinates from the map's origin, without points.
 
     Args:
         run: The finished run.

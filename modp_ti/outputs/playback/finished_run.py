@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import shifted_poses
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import reading
@@ -33,9 +34,9 @@ class FinishedRun:
         folder: The run's output folder.
         names: Image names in the COLMAP model.
         timestamps: (N,) time stamps [s].
-        poses: (N, 4, 4) refined T_camera_world.
+        poses: (N, 4, 4) refined T_camera_world, in coordinates from `record.origin`, as the Gaussians are.
         cameras: Camera of each frame.
-        record: Near plane, scene depth, keyframes and held-out frames.
+        record: Near plane, scene depth, keyframes, held-out frames and origin.
     """
 
     folder: Path
@@ -109,7 +110,8 @@ def open_run(folder: Path) -> FinishedRun:
         names, cameras = _read_model(folder / "colmap")
         if len(names) != len(poses) or not names:
             raise InputError(f"{folder}: trajectory.txt has {len(poses)} frames, colmap/ {len(names)}: not of one run")
-        return FinishedRun(folder, names, timestamps, poses, cameras, read_frames(folder / "frames.json", len(poses)))
+        record = read_frames(folder / "frames.json", len(poses))
+        return FinishedRun(folder, names, timestamps, shifted_poses(poses, -record.origin), cameras, record)
 
 
 def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import shifted_poses
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.exposure import read_exposures
@@ -88,6 +89,7 @@ def plan_flight(
             times, poses = run.timestamps[run.way], run.poses[run.way]
         elif Path(path).expanduser().is_file():
             times, poses = read_trajectory(Path(path).expanduser())
+            poses = shifted_poses(poses, -run.record.origin)
         else:
             raise InputError(f"--path {path}: no such file, and none of {', '.join(PATHS)}")
     if len(poses) == 0:

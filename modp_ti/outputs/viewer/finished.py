@@ -163,9 +163,9 @@ def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
 
 
 def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:
-    """Return the points (N, 3) of the run's COLMAP model, at most MAX_POINTS of them. None of a file of splats."""
+    """Return at most MAX_POINTS points (N, 3) of the run's COLMAP model near its splats. None of a file of splats."""
     if not run.folder.is_dir():
         return np.zeros((0, 3))
     points = read_colmap_model(run.folder / "colmap").points3D
-    xyz = np.array([points[number].xyz for number in sorted(points)]).reshape(-1, 3)
+    xyz = np.array([points[number].xyz for number in sorted(points)]).reshape(-1, 3) - run.record.origin
     return xyz if len(xyz) <= MAX_POINTS else xyz[np.arange(MAX_POINTS) * len(xyz) // MAX_POINTS]

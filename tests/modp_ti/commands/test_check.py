@@ -116,6 +116,41 @@ def test_poses_of_another_recording_fit_under_no_convention(plane_scene, tmp_pat
     assert (code, codes(data)["poses_do_not_fit"]) == (2, "unusable")
 
 
+def test_a_run_refuses_poses_of_another_recording_unless_it_is_forced(plane_scene, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+    other = np.random.default_rng(5)
+
+    def turned(T: np.ndarray) -> np.ndarray:
+        by = np.eye(4)
+        by[:3, :3] = cv2.Rodrigues(other.normal(0, 0.1, 3))[0]
+        return by @ T
+
+    planted(model, tmp_path / "fault", turned)
+    scene = scene_file(tmp_path, plane_scene.folder, tmp_path / "fault", scale=0.25)
+    few = ["--set", "refine.steps=0", "--set", "mapping.optimise.steps=1", "--set", "device=cpu", "--json"]
+    refused = CliRunner().invoke(app, ["run", str(scene), *few])
+    assert refused.exit_code == 2 and not (tmp_path / "out" / "splats.ply").exists()
+    assert CliRunner().invoke(app, ["run", str(scene), *few, "--force"]).exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_recording_of_held_out_frames_alone_is_unusable(command: str, plane_scene, tmp_path: Path) -> None:
+    model = plane_scene.write_colmap(np.c_[np.random.default_rng(2).uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+    scene = scene_file(tmp_path, plane_scene.folder, model, stop=1, holdout=8)
+    assert CliRunner().invoke(app, [command, str(scene), "--set", "device=cpu"]).exit_code == 2
+
+
+def test_checking_a_reconstruction_leaves_nothing_behind(plane_scene, tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(
+        f"source: {{path: {plane_scene.folder}}}\ntracker: {{kind: sfm}}\noutput: {tmp_path / 'out'}\n"
+    )
+    checked(tmp_path / "scene.yaml")
+    assert [path.name for path in tmp_path.iterdir() if path.name not in (plane_scene.folder.name, "sparse")] == [
+        "scene.yaml"
+    ]
+
+
 def test_points_of_another_world_are_told_from_wrong_poses(plane_scene, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])

@@ -12,15 +12,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from fields.frames.origin import shifted_poses
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.outputs.formats.keyframe_masks import read_masks
 from modp_ti.outputs.formats.scores_csv import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
+from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from modp_ti.outputs.playback.finished_run import open_run
 from tests.modp_ti.engine.snapshots.test_resume import position, stop_midway
 from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, write_run
@@ -29,8 +32,11 @@ from tests.room import Room, RoomRecording, walk, write_colmap
 
 pytestmark = pytest.mark.slow
 
+# Where the first visit's map lies in its world, and the second tracker's room in its: both are georeferenced.
+ORIGIN, AWAY_FROM_ORIGIN = np.array([452_000.0, 5_411_000.0, 430.0]), np.eye(4)
+AWAY_FROM_ORIGIN[:3, 3] = -ORIGIN[::-1]
 # Similarity from the room to the world of the second tracker.
-S_TRACKER_ROOM = np.diag([0.37, 0.37, 0.37, 1.0]) @ exp_se3([0.4, -2.0, 1.0, 0.9, -1.7, 0.6])
+S_TRACKER_ROOM = AWAY_FROM_ORIGIN @ np.diag([0.37, 0.37, 0.37, 1.0]) @ exp_se3([0.4, -2.0, 1.0, 0.9, -1.7, 0.6])
 # Along the same path, and on to where the first visit has not been.
 FRAMES, STEP = 11, 0.17
 FIRST = 7
@@ -53,12 +59,24 @@ def first(made_once: Callable[[str, Callable[[Path], None]], Path], room: Room) 
 
     def fill(folder: Path) -> None:
         poses = write_run(room, folder / "out")
+        moved_to(ORIGIN, folder / "out")
         (folder / "out" / "colmap" / "images").mkdir()
         for number, T in enumerate(poses):
             _, png = cv2.imencode(".png", room.image(CAMERA, T)[..., ::-1])
             (folder / "out" / "colmap" / "images" / f"{number:04d}").write_bytes(png.tobytes())
 
     return made_once("a first visit", fill) / "out"
+
+
+def moved_to(origin: NDArray[np.float64], run: Path) -> None:
+    """Move the world of a finished run, as that of a georeferenced recording."""
+    times, poses = read_trajectory(run / "trajectory.txt")
+    write_trajectory(run / "trajectory.txt", times, shifted_poses(poses, origin))
+    model = pycolmap.Reconstruction(str(run / "colmap"))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), origin))
+    model.write_binary(str(run / "colmap"))
+    record = json.loads((run / "frames.json").read_text())
+    (run / "frames.json").write_text(json.dumps({**record, "origin": origin.tolist()}))
 
 
 def second_scene(room: Room, folder: Path) -> Path:
@@ -100,6 +118,7 @@ def second(first: Path, made_once: Callable[[str, Callable[[Path], None]], Path]
 def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, second: Path) -> None:
     out = open_run(second)
     assert len(out) == FIRST + FRAMES
+    np.testing.assert_array_equal(out.record.origin, ORIGIN)
     away = np.linalg.norm(centres(out.poses[FIRST:]) - centres(np.array(walk(FRAMES, step=STEP))), axis=1)
     assert away.mean() < AWAY
     metrics = json.loads((second / "metrics.json").read_text())

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 import pytest
 
 from modp_ti.engine.snapshots import load_resumed
@@ -49,6 +50,9 @@ def in_peace(tmp_path_factory: pytest.TempPathFactory, room: Room) -> Path:
 
     folder = tmp_path_factory.mktemp("peace")
     RoomRecording(room, pinhole(64, 48), walk(14)).write(folder, gains=np.exp(0.3 * np.sin(np.arange(14))))
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))  # georeferenced: its origin must be kept too
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([452_000.0, 5_411_000.0, 430.0])))
+    model.write_binary(str(folder / "sparse" / "0"))
     return finished_run(folder, SCENE, "device: CPU")
 
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import exp_se3
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, STATED, Convention
-from modp_ti.inputs.inspection.epipolar import MatchedPair, epipolar_score
+from modp_ti.inputs.inspection.epipolar import MatchedPair, epipolar_score, matched_pair
 from modp_ti.inputs.inspection.finding import Severity, verdict
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
 from modp_ti.inputs.inspection.survey import survey
+from modp_ti.inputs.multiview.features import Features
 
 CAMERA = PinholeCamera(300.0, 305.0, 161.0, 118.0, 320, 240)
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -45,6 +50,12 @@ def wrongly(convention: Convention, T: np.ndarray) -> np.ndarray:
     """The pose that has to be read after the convention to be T."""
     T = OPENGL @ T if convention.opengl else T
     T = BODY @ T if convention.body else T
+    if convention.wxyz:
+        x, y, z, w = Rotation.from_matrix(T[:3, :3].T).as_quat()
+        centre = np.linalg.inv(T)[:3, 3]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_quat([w, x, y, z]).as_matrix(), centre
+        T = np.linalg.inv(T)
     return np.linalg.inv(T) if convention.inverse else T
 
 
@@ -53,12 +64,16 @@ def wrong_camera(c: Convention) -> PinholeCamera:
     return PinholeCamera(CAMERA.fx / f, CAMERA.fy / f, CAMERA.cx / k, CAMERA.cy / k, 320, 240)
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS, ids=lambda c: c.name)
+# Poses of other images are told by the images alone.
+OF_ONE_IMAGE = [convention for convention in CONVENTIONS if not convention.shift]
+
+
+@pytest.mark.parametrize("convention", OF_ONE_IMAGE, ids=lambda c: c.name)
 def test_exact_matches_fit_the_convention_that_the_numbers_are_of_and_no_other(convention: Convention) -> None:
     T = poses()
     pairs = [MatchedPair(a, a + 2, pixels(T[a], 0), pixels(T[a + 2], 0), 1.0) for a in range(4)]
     given = [wrongly(convention, each) for each in T]
-    scores = {c: epipolar_score(pairs, [wrong_camera(convention)] * 6, given, c) for c in CONVENTIONS}
+    scores = {c: epipolar_score(pairs, [wrong_camera(convention)] * 6, given, c) for c in OF_ONE_IMAGE}
     assert scores[convention].share == 1.0
     assert scores[convention].error < 1e-6
     assert scores[convention].matches == 4 * 400
@@ -87,7 +102,7 @@ def test_points_behind_the_cameras_do_not_fit() -> None:
     assert score.share < 0.05
 
 
-def frames(convention: Convention, noise: float) -> list[TrackedFrame]:
+def frames(convention: Convention, noise: float, count: int = 6) -> list[TrackedFrame]:
     """Frames without any detail, whose points alone can tell."""
     blank = np.full((240, 320, 3), 0.5, dtype=np.float32)
     return [
@@ -100,11 +115,11 @@ def frames(convention: Convention, noise: float) -> list[TrackedFrame]:
             wrongly(convention, T),
             SparsePoints(world(), pixels(T, noise), np.arange(400)),
         )
-        for i, T in enumerate(poses())
+        for i, T in enumerate(poses(count))
     ]
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS, ids=lambda c: c.name)
+@pytest.mark.parametrize("convention", OF_ONE_IMAGE, ids=lambda c: c.name)
 def test_where_no_feature_matches_the_points_decide(convention: Convention) -> None:
     geometry = measure_geometry(survey(frames(convention, 0.5), None, lambda _: None))
     assert geometry.epipolar[STATED].matches == 0
@@ -116,6 +131,31 @@ def test_where_no_feature_matches_the_points_decide(convention: Convention) -> N
     (found,) = findings
     assert (found.code, found.severity) == (convention.name.lower().replace(" ", "_"), Severity.UNUSABLE)
     assert verdict(findings) == ("unusable", 2)
+
+
+@pytest.mark.parametrize("shift", [1, -1])
+def test_poses_of_the_next_image_are_told_from_others(shift: int) -> None:
+    rng = np.random.default_rng(6)
+    T = [exp_se3(rng.normal(0, 0.15, 6)) @ each for each in poses(9)]
+    pairs = [MatchedPair(a, a + 2, pixels(T[a], 0), pixels(T[a + 2], 0), 1.0) for a in range(1, 6)]
+    given = [T[min(max(i - shift, 0), 8)] for i in range(9)]
+    seen = survey(
+        [replace(f, T_camera_world=G) for f, G in zip(frames(STATED, 0.5, 9), given, strict=True)], 9, lambda _: None
+    )
+    seen.pairs = pairs
+    (found,) = judge_geometry(measure_geometry(seen))
+    assert found.severity is Severity.UNUSABLE
+    assert found.code == {1: "poses_one_image_late", -1: "poses_one_image_early"}[shift]
+
+
+def test_a_pair_for_which_the_estimator_fails_has_no_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise cv2.error("no model")
+
+    monkeypatch.setattr(cv2, "findFundamentalMat", fails)
+    rng = np.random.default_rng(0)
+    found = Features(rng.uniform(0, 200, (80, 2)), rng.integers(0, 255, (80, 128), dtype=np.uint8), 1.0)
+    assert matched_pair(0, found, 1, found) is None
 
 
 def test_pixels_that_were_computed_from_the_poses_prove_nothing() -> None:

@@ -21,6 +21,12 @@ MODELS = {
     "RADIAL_FISHEYE": [300, 318, 242, -0.03, 0.004],
     "SIMPLE_FISHEYE": [300, 318, 242],
     "FISHEYE": [300, 310, 318, 242],
+    "FOV": [300, 310, 318, 242, 0.9],
+    "THIN_PRISM_FISHEYE": [300, 310, 318, 242, -0.02, 0.01, 0.0007, -0.0004, -0.004, 0.0006, 0.001, -0.002],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [
+        *(300, 310, 318, 242, 0.02, -0.03, 0.01, -0.004, 0.001, -0.0003),
+        *(0.0008, -0.0005, -0.0007, 0.0002, -0.0004, 0.0001),
+    ],
 }
 
 
@@ -55,7 +61,7 @@ def test_inverse_gives_the_point_back(model):
 
 
 def test_camera_models_that_are_no_pinhole_are_not_taken_for_one():
-    for model in ("FOV", "THIN_PRISM_FISHEYE", "EUCM", "EQUIRECTANGULAR"):
+    for model in ("SIMPLE_DIVISION", "EUCM", "EQUIRECTANGULAR"):
         assert colmap_intrinsics(model, [1.0] * 16) is None
 
 

@@ -183,15 +183,15 @@ def test_missing_model_and_missing_files_are_named(plane_scene, tmp_path):
     assert "no such folder (tracker.path)" in failure(plane_scene, tmp_path / "gone")
     assert "holds no COLMAP model" in failure(plane_scene, plane_scene.folder)
     folder = plane_scene.write_colmap(plane_points())
-    (folder / "points3D.bin").unlink()
-    assert "lacks points3D" in failure(plane_scene)
+    (folder / "images.bin").unlink()
+    assert "lacks images" in failure(plane_scene)
 
 
 def test_unusable_camera_model_is_named_with_the_remedy(plane_scene):
     folder = plane_scene.write_colmap(plane_points(), text=True)
-    (folder / "cameras.txt").write_text("1 FOV 320 240 300 300 160 120 0.9\n")
+    (folder / "cameras.txt").write_text("1 EUCM 320 240 300 300 160 120 0.5 1.0\n")
     message = failure(plane_scene)
-    assert "camera model FOV is not supported" in message and "image_undistorter" in message
+    assert "camera model EUCM is not supported" in message and "image_undistorter" in message
 
 
 def test_impossible_intrinsics_are_named(plane_scene):
@@ -217,7 +217,139 @@ def test_text_model_that_was_cut_off_is_named(plane_scene, kind, part):
     lines = file.read_text().splitlines(keepends=True)
     file.write_text("".join(lines[: int(part * len(lines))]))
     message = failure(plane_scene)
-    assert "not a readable COLMAP model" in message or "points3D is incomplete" in message
+    assert any(part in message for part in ("not a readable COLMAP model", "points3D is incomplete", "holds no image"))
+
+
+def _lines(folder, stem):
+    return [line for line in (folder / f"{stem}.txt").read_text().splitlines() if not line.startswith("#")]
+
+
+def _plain(folder):
+    """Leave the three files that every COLMAP wrote, and return the lines of images and of their observations."""
+    for stem in ("rigs", "frames"):
+        (folder / f"{stem}.txt").unlink()
+    lines = _lines(folder, "images")
+    return lines[::2], lines[1::2]
+
+
+def _write(folder, stem, lines, end="\n", encoding="utf-8"):
+    (folder / f"{stem}.txt").write_text("\n".join(lines) + end, encoding=encoding)
+
+
+TEXT_FORMS = {
+    "as COLMAP": lambda images, seen: [line for pair in zip(images, seen, strict=True) for line in pair],
+    "comments and blank lines": lambda images, seen: [
+        "# a comment",
+        "",
+        *(line for image, observed in zip(images, seen, strict=True) for line in (image, observed, "")),
+    ],
+}
+
+
+@pytest.mark.parametrize("form", TEXT_FORMS)
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_text_model_is_read_in_any_form(plane_scene, form, encoding):
+    folder = plane_scene.write_colmap(plane_points(), text=True)
+    expected = opened(plane_scene).frames
+    _write(folder, "images", TEXT_FORMS[form](*_plain(folder)), encoding=encoding)
+    for stem in ("cameras", "points3D"):
+        _write(folder, stem, _lines(folder, stem), encoding=encoding)
+    for a, b in zip(expected, opened(plane_scene).frames, strict=True):
+        np.testing.assert_allclose(a.T_camera_world, b.T_camera_world, atol=1e-12)
+        np.testing.assert_array_equal(a.points.xyz, b.points.xyz)
+
+
+def test_names_of_a_text_model_run_to_the_end_of_the_line(plane_scene):
+    folder = plane_scene.write_colmap(plane_points(), text=True)
+    images, seen = _plain(folder)
+    _write(folder, "images", TEXT_FORMS["as COLMAP"]([line.replace("view", "my  7 view") for line in images], seen))
+    for file in list(plane_scene.folder.iterdir()):
+        file.rename(file.with_name(f"my  7 {file.name}"))
+    assert len(opened(plane_scene).frames) == 7
+
+
+@pytest.mark.parametrize("end", ["\n", ""])
+@pytest.mark.parametrize("blank", [True, False])
+def test_images_that_observe_nothing_get_the_points_that_project_into_them(plane_scene, blank, end):
+    xyz = plane_points()
+    folder = plane_scene.write_colmap(xyz, text=True)
+    images, _ = _plain(folder)
+    lines = [line for image in images for line in ([image, ""] if blank else [image])]
+    _write(folder, "images", lines[:-1] if blank else lines, end)
+    tracker = opened(plane_scene)
+    assert len(tracker.frames) == 7 and tracker.notes
+    for frame in tracker.frames:
+        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+        np.testing.assert_allclose(frame.undistorter.camera.project(p), frame.points.pixels, atol=1e-9)
+        assert len(frame.points) > 30
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_points_are_triangulated_where_the_model_has_none(plane_scene, text):
+    folder = plane_scene.write_colmap(plane_points(), text=text)
+    model = pycolmap.Reconstruction(str(folder))
+    for number in list(model.points3D):
+        model.delete_point3D(number)
+    (model.write_text if text else model.write_binary)(str(folder))
+    with_file = opened(plane_scene)
+    (folder / f"points3D.{'txt' if text else 'bin'}").unlink()
+    for tracker in (with_file, opened(plane_scene)):
+        assert tracker.notes
+        for frame in tracker.frames:
+            assert len(frame.points) > 30
+            assert np.median(np.abs(frame.points.xyz[:, 2])) < 0.02, "the points lie on the plane"
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_points_with_nan_are_left_out_with_a_note(plane_scene, text):
+    folder = plane_scene.write_colmap(plane_points(), text=True)
+    lines = _lines(folder, "points3D")
+    words = lines[3].split()
+    if text:
+        _write(folder, "points3D", [*lines[:3], " ".join([words[0], "nan", *words[2:]]), *lines[4:]])
+    else:
+        model = pycolmap.Reconstruction(str(folder))
+        model.points3D[int(words[0])].xyz = [0.0, np.inf, 0.0]
+        for file in folder.iterdir():
+            file.unlink()
+        model.write_binary(str(folder))
+    tracker = opened(plane_scene)
+    assert any(note.startswith("1 of 60 points") for note in tracker.notes)
+    assert all(int(words[0]) not in frame.points.ids for frame in tracker.frames)
+
+
+def test_the_model_of_most_images_is_used_with_a_note(plane_scene):
+    folder = plane_scene.write_colmap(plane_points())
+    whole = pycolmap.Reconstruction(str(folder))
+    folder.rename(folder.with_name("1"))
+    folder.mkdir()
+    for number in sorted(whole.frames)[3:]:
+        whole.deregister_frame(number)
+    whole.write_binary(str(folder))
+    tracker = opened(plane_scene)
+    assert len(tracker.frames) == 7
+    assert any("several models" in note for note in tracker.notes)
+    assert len(opened(plane_scene, folder).frames) == 3, "a model that is named is meant"
+
+
+def test_of_two_cameras_the_folder_that_is_given_is_meant(plane_scene):
+    folder = plane_scene.write_colmap(plane_points(), text=True)
+    images, seen = _plain(folder)
+    both = []
+    for number, (line, observed) in enumerate(zip(images, seen, strict=True)):
+        words = line.split()
+        away = [str(number + 100), *words[1:5], "9", "9", "9", words[8]]
+        both += [" ".join([*away, f"right/{words[9]}"]), "", " ".join([*words[:9], f"left/{words[9]}"]), observed]
+    _write(folder, "images", both)
+    points = [" ".join(line.split()[:8]) for line in _lines(folder, "points3D")]
+    _write(folder, "points3D", points)
+    left = plane_scene.folder.rename(plane_scene.folder.with_name("left"))
+    tracker = open_colmap(SourceSettings(path=left), ColmapSettings(path=folder))
+    for frame, T in zip(tracker.frames, plane_scene.T_camera_world, strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, T, atol=1e-9)
+    other = left.rename(left.with_name("middle"))
+    with pytest.raises(InputError, match=r"are both the image view.*source\.path"):
+        open_colmap(SourceSettings(path=other), ColmapSettings(path=folder))
 
 
 def test_model_of_noise_is_refused_without_allocating_for_it(plane_scene):
@@ -259,12 +391,13 @@ def test_model_of_a_videos_frames_gives_the_frames_that_it_gives_for_images(plan
     for name in plane_scene.names:
         writer.write(cv2.imread(str(plane_scene.folder / name)))
     writer.release()
-    renamed = replace(plane_scene, names=[f"room_{i:06d}.png" for i in range(len(plane_scene.names))])
-    renamed.write_colmap(points)
-    tracker = open_colmap(SourceSettings(path=video), ColmapSettings())
-    assert tracker.notes == []
-    for frame, other in zip(tracker, expected, strict=True):
-        assert np.array_equal(frame.image, other.image)
-        np.testing.assert_allclose(frame.T_camera_world, other.T_camera_world)
-        assert np.array_equal(frame.points.pixels, other.points.pixels)
-    tracker.close()
+    for first in (0, 1):  # programs that extract frames count from either
+        renamed = replace(plane_scene, names=[f"room_{i + first:06d}.png" for i in range(len(plane_scene.names))])
+        renamed.write_colmap(points)
+        tracker = open_colmap(SourceSettings(path=video), ColmapSettings())
+        assert len(tracker.notes) == first
+        for frame, other in zip(tracker, expected, strict=True):
+            assert np.array_equal(frame.image, other.image)
+            np.testing.assert_allclose(frame.T_camera_world, other.T_camera_world)
+            assert np.array_equal(frame.points.pixels, other.points.pixels)
+        tracker.close()

@@ -14,6 +14,7 @@ from fields.geometry.se3 import exp_se3
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.distortion import COEFFICIENTS, colmap_lens
 from modp_ti.inputs.trackers import Tracker
 from modp_ti.inputs.trackers.transforms import open_transforms
 
@@ -140,8 +141,13 @@ def test_lens_keys_are_read(with_cloud):
     assert opened(with_cloud).frames[0].undistorter.distortion.fisheye
     with_cloud.write_transforms(ply_file_path="points.ply", is_fisheye=True, **k)
     assert opened(with_cloud).frames[0].undistorter.distortion.fisheye
+    more = {"k5": 0.01, "k6": -0.02, "omega": 0.9, "sx1": 0.001, "k0": 0.003, "p0": 0.001, "s3": -0.001}
+    for model, names in COEFFICIENTS.items():
+        with_cloud.write_transforms(ply_file_path="points.ply", camera_model=model, **k, **more)
+        values = [(k | more).get(name, 0.0) for name in names]
+        assert opened(with_cloud).frames[0].undistorter.distortion == colmap_lens(model, values)
     with_cloud.write_transforms(ply_file_path="points.ply", camera_model="EQUIRECTANGULAR")
-    assert "EQUIRECTANGULAR is not supported" in failure(with_cloud)
+    assert "source.panorama" in failure(with_cloud)
 
 
 @pytest.mark.parametrize(

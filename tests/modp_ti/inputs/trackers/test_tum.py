@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers import Tracker
+from modp_ti.inputs.trackers.point_cloud import read_point_file
 
 
 @pytest.fixture
@@ -84,7 +86,7 @@ def test_frames_of_a_place_keep_the_same_points_where_there_are_too_many(posed):
         ("0.1 1 2 three 0 0 0 1", ["trajectory.txt:4", "not a row of numbers"]),
         ("0.1 nan 2 3 0 0 0 1", ["trajectory.txt:4", "NaN"]),
         ("0.1 1 2 inf 0 0 0 1", ["trajectory.txt:4", "infinite"]),
-        ("0.1 1 2 3 0 0 0 0", ["trajectory.txt:4", "length 0 instead of 1"]),
+        ("0.1 1 2 3 0 0 0 0", ["trajectory.txt:4", "a quaternion of zeros"]),
         ("0.1 1 2 3 0.5 0.5 0.5 0.7", ["trajectory.txt:4", "length 1.114 instead of 1"]),
         ("0.01 1 2 3 0 0 0 1", ["trajectory.txt:4", "time 0.010000 does not lie after 0.033333"]),
         ("0.033333 1 2 3 0 0 0 1", ["trajectory.txt:4", "doubles"]),
@@ -103,7 +105,7 @@ def test_wrong_line_is_named(posed, line, parts):
     [
         ("# nothing\n", ["points.txt: holds no row of x y z (tracker.points)"]),
         ("1 2\n", ["points.txt:1: holds 2 columns instead of 3"]),
-        ("1 2 3\n1 nan 3\n", ["points.txt:2", "NaN"]),
+        ("1 2 3\n1 2\n", ["points.txt:2", "holds 2 columns"]),
         ("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\n", ["points.txt: not a PLY file"]),
         (
             "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\n"
@@ -120,11 +122,80 @@ def test_point_file_that_is_none_is_named(posed, text, parts):
         assert part in message
 
 
+@pytest.mark.parametrize(
+    ("times", "fps"),
+    [
+        ([0, 1, 2, 3, 4, 5, 6], 30),
+        ([1, 2, 3, 4, 5, 6, 7], 30),
+        ([0, 1, 2, 3, 4, 5, 6], 1),
+        ([1000 * i / 30 for i in range(7)], 30),
+        ([round(1000 * i / 30) for i in range(7)], 30),
+        ([1e9 * i / 30 for i in range(7)], 30),
+    ],
+    ids=["frames from 0", "frames from 1", "seconds", "ms", "whole ms", "ns"],
+)
+def test_times_that_are_no_seconds_are_recognised_and_said(posed, times, fps):
+    lines = [f"{time} {line.split(' ', 1)[1]}" for time, line in zip(times, posed.tum_lines(), strict=True)]
+    posed.write("trajectory.txt", lines)
+    tracker = posed.open("tum", {"fps": fps}, points=posed.root / "points.txt")
+    posed.assert_frames(tracker, range(7))
+    assert len(tracker.notes) == (0 if fps == 1 else 1)
+
+
+def test_matrices_are_named_as_such(posed):
+    posed.write("trajectory.txt", ["1 0 0 0 0 1 0 0 0 0 1 0"])
+    assert "tracker.kind: matrices" in posed.failure("tum")
+
+
+def test_lines_of_a_lost_tracker_are_left_out(posed):
+    lines = posed.tum_lines()
+    lost = ["0.001 0 0 0 0 0 0 0", *lines, "9 nan 0 0 0 0 0 1", *(f"{10 + i} 0 0 0 0 0 0 1" for i in range(20))]
+    posed.write("trajectory.txt", lost)
+    tracker = posed.open("tum", points=posed.root / "points.txt")
+    posed.assert_frames(tracker, range(7))
+    assert any(note.startswith("2 of") for note in tracker.notes)
+
+
+def _pcd(xyz: np.ndarray, form: str) -> bytes:
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x y z normal\nSIZE 4 4 4 4 4\nTYPE U F F F F\nCOUNT 1 1 1 1 3\n"
+    head += f"WIDTH {len(xyz)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(xyz)}\nDATA {form}\n"
+    if form == "ascii":
+        return (head + "".join(f"255 {x!r} {y!r} {z!r} 0 0 1\n" for x, y, z in xyz.tolist())).encode()
+    table = np.zeros(len(xyz), [("rgb", "<u4"), ("xyz", "<f4", 3), ("normal", "<f4", 3)])
+    table["xyz"] = xyz
+    return head.encode() + table.tobytes()
+
+
+@pytest.mark.parametrize("form", ["pcd ascii", "pcd binary", "npy", "text"])
+def test_points_of_other_programs_are_read_and_those_with_nan_left_out(posed, form):
+    xyz = np.vstack([posed.xyz[:3], [[np.nan] * 3], posed.xyz[3:]])
+    file = posed.root / "cloud"
+    if form == "npy":
+        with file.open("wb") as stream:
+            np.save(stream, xyz)
+    elif form == "text":
+        np.savetxt(file, xyz)
+    else:
+        file.write_bytes(_pcd(xyz, form.split()[1]))
+    np.testing.assert_allclose(read_point_file(file), posed.xyz, atol=1e-6)
+
+
+def test_a_pcd_that_is_cut_off_or_compressed_is_named(posed):
+    whole = _pcd(posed.xyz, "binary")
+    for data, said in (
+        (whole[:-9], "cut off"),
+        (whole.replace(b"DATA binary", b"DATA binary_compressed"), "compressed"),
+    ):
+        (posed.root / "cloud.pcd").write_bytes(data)
+        with pytest.raises(InputError, match=said):
+            read_point_file(posed.root / "cloud.pcd")
+
+
 def test_what_is_missing_is_named_with_the_key_that_gives_it(posed):
     assert "no such file (tracker.points)" in posed.failure("tum", points=posed.root / "gone.ply")
     assert "no such file (tracker.path)" in posed.failure("tum", path=posed.root / "gone.txt")
     assert "give source.intrinsics" in posed.failure("tum", {"intrinsics": {}})
-    (posed.root / "trajectory.txt").write_bytes(b"\xff\xfe\x00\x01")
+    (posed.root / "trajectory.txt").write_bytes(b"\x80\x81\x00\x01")
     assert "trajectory.txt: cannot be read as text" in posed.failure("tum")
     (posed.root / "trajectory.txt").unlink()
     assert "set tracker.path to a trajectory in TUM's format" in posed.failure("tum")
