@@ -73,7 +73,7 @@ def named_scene(
     """
     suffix = path.suffix.lower()
     if re.match("[A-Za-z][A-Za-z0-9+]+:/", str(path)) and not exists(path):
-        raise InputError("a URL is mapped as a stream: modp-ti run --stream URL; or load the file down first")
+        raise InputError("a URL is mapped as a stream: modp-ti run --stream URL; or download the file")
     if is_file(path) and suffix in (*IMAGE_SUFFIXES, *NOT_READ) and suffix not in VIDEO_SUFFIXES:
         raise InputError(f"{path}: is one picture: name the folder of all pictures")
     if suffix in PACKED:

@@ -65,7 +65,10 @@ def is_bag(path: Path) -> bool:
     """Whether the path is a file with a bag's suffix, or a folder that ROS 2 has recorded, or that holds only a bag."""
     if path.is_dir():
         files = _files(path)
-        return bool(files) and (is_file(path / "metadata.yaml") or [*path.iterdir()] == files)
+        if is_file(path / "metadata.yaml"):
+            return bool(files)
+        whole = {re.sub("_[0-9]+$", "", file.stem) if file.suffix != ".bag" else file.stem for file in files}
+        return len(whole) == 1 and set(files) == set(path.iterdir())
     return path.suffix in SUFFIXES
 
 

@@ -162,7 +162,7 @@ class BagImages(ImageSource):
             for place, message in self.bag.messages(self.topic):
                 if images or begins_video(message):
                     stream.write(message.data.tobytes())
-                    images.append(_Image(seconds(message.header.stamp), place))
+                    images.append(_Image(seconds(message.header.stamp) or place.written * 1e-9, place))
         if not images:
             raise InputError(f"{self.bag.path}: the video of {self.topic} ({codec}) has no start, so none is decoded")
         self._video = VideoFile(file, stop=stop)

@@ -281,6 +281,13 @@ def test_a_folder_that_holds_only_a_bag_is_one(form, views, tmp_path):
     assert recorded_scene(path).tracker.kind == "bag"
 
 
+def test_bags_of_several_recordings_are_not_joined(views, tmp_path):
+    for name in ("monday.bag", "tuesday_1.bag"):
+        write_bag(tmp_path / "week" / name, "ros1", recording(views[:1], "ros1"))
+    with pytest.raises(InputError, match=r"monday\.bag, tuesday_1\.bag"):
+        recorded_scene(tmp_path / "week")
+
+
 def test_a_bag_that_was_cut_off_names_what_mends_it(views, tmp_path):
     path = write_bag(tmp_path / "room", "mcap", recording(views[:3]))
     (file,) = path.glob("*.mcap")

@@ -44,7 +44,7 @@ def test_the_odometry_of_a_robot_is_its_transform_from_odom(shared_data):
 @pytest.mark.parametrize("name", ["alltypes_mcap", "alltypes_sqlite3"])
 def test_every_message_that_is_used_is_read_from_bags_of_all_types(name, shared_data):
     bag = Bag(shared_data("captures") / "rosbag" / name)
-    for kind in (*IMAGES, INFO, CLOUD, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"):
+    for kind in (*IMAGES[:2], INFO, CLOUD, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"):
         (topic,) = bag.of_types(kind)
         messages = list(bag.messages(topic))
         assert len(messages) == 2
