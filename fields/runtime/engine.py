@@ -21,7 +21,7 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fields.runtime.surroundings import cache_notes, provide_cache, why_too_narrow
+from fields.runtime import surroundings
 
 if TYPE_CHECKING:
     import taichi as ti  # noqa: TID251 (this is the one place)
@@ -199,18 +199,18 @@ def engine() -> Engine:
 @functools.cache
 def _load() -> ModuleType:
     chosen = engine()
-    if (narrow := why_too_narrow()) is not None:
+    if (narrow := surroundings.why_too_narrow()) is not None:
         raise EngineError(narrow)
     for name, value in chosen.switches.items():
         os.environ.setdefault(name, value)
-    provide_cache(chosen.package)
+    surroundings.provide_cache(chosen.package)
     try:
         module = importlib.import_module(chosen.package)
     except ImportError as error:
         raise EngineError(
             f"{chosen.title} cannot be loaded ({error}): install it anew, or set {VARIABLE} to another"
         ) from error
-    if chosen.saves_cache_on_reset or cache_notes():  # a temporary cache is removed after that
+    if chosen.saves_cache_on_reset or surroundings.notes:  # a temporary cache is removed after that
         atexit.register(module.reset)
     if chosen.slow_attributes:
         vars(module)["data_oriented"] = _data_oriented

@@ -8,12 +8,13 @@ import shutil
 import tempfile
 from pathlib import Path
 
-__all__ = ["cache_notes", "provide_cache", "why_too_narrow"]
+__all__ = ["notes", "provide_cache", "why_too_narrow"]
 
 # Address space that a process needs [bytes]. The engine reserves memory by the gigabyte, most of which it never uses.
 NEEDED = 3_400_000_000
 
-_notes: list[str] = []
+notes: list[str] = []
+"""What the user should know of the cache, in at most one line."""
 
 
 def why_too_narrow() -> str | None:
@@ -51,12 +52,7 @@ def provide_cache(package: str) -> None:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # registered first, so called after the engine's reset
     os.environ["XDG_CACHE_HOME"] = folder
     os.environ.setdefault("MPLCONFIGDIR", folder)  # Open3D loads Matplotlib, which would complain
-    _notes.append(
+    notes.append(
         f"{base or 'the home folder'} cannot be written or is not there: kernels are kept until this process ends; set "
         "XDG_CACHE_HOME to keep them"
     )
-
-
-def cache_notes() -> list[str]:
-    """Return what the user should know of the cache, in at most one line."""
-    return list(_notes)

@@ -19,6 +19,7 @@ from modp_ti.config.settings import WITH_SECRETS, SceneConfig
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
+from modp_ti.files.urls import shown_url
 from modp_ti.outputs.progress import StageProgress
 from modp_ti.tasks import Answer, End, Ended, Engine, Resources, Retried, Running, Stopping, Task, Watched, run_tasks
 
@@ -203,8 +204,9 @@ class _Batch:
 
 def _before(scene: Scene) -> SceneResult:
     """Return the result of a scene before the batch begins."""
+    given = shown_url(str(scene.given))
     if scene.config is None:
-        return SceneResult(scene.name, str(scene.given), None, State.failed, error=scene.error)
-    result = SceneResult(scene.name, str(scene.given), str(scene.config.output), State.waiting)
+        return SceneResult(scene.name, given, None, State.failed, error=scene.error)
+    result = SceneResult(scene.name, given, str(scene.config.output), State.waiting)
     metrics = finished_metrics(scene.config)
     return result if metrics is None else replace(result, state=State.before, **figures(metrics))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.files.errors import InputError
-from modp_ti.files.urls import actual_url
+from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.bare_recording import is_recording, named_scene
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.tasks import Resources
@@ -57,7 +57,7 @@ def read_scenes(given: Iterable[Path], overrides: Sequence[str] = (), preset: st
                 other = outputs[config.output]
                 raise InputError(f"{path}: {config.output} is the output folder of {other} too: set another one")
         except InputError as error:
-            scenes.append(Scene(_unique(path.name or str(path), scenes), path, error=str(error)))
+            scenes.append(Scene(_unique(Path(shown_url(str(path))).name or str(path), scenes), path, error=str(error)))
             continue
         outputs[config.output] = path
         scenes.append(Scene(_unique(config.output.name, scenes), path, config))

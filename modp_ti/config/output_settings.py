@@ -52,7 +52,7 @@ class ViewSettings(StrictModel):
     )
     host: str = Field(
         default="127.0.0.1",
-        description="address of the server: 127.0.0.1 is reachable only from this machine, 0.0.0.0 from the network",
+        description="address to listen at: 127.0.0.1 is reachable only from this machine, 0.0.0.0 from the network",
     )
     port: int = Field(
         default=8080,

@@ -17,6 +17,7 @@ from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files import exists, is_file
 from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.terminal import require_text
 from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.bags import SUFFIXES, has_poses
 from modp_ti.inputs.captures import ARCHIVES, KINDS
@@ -108,6 +109,7 @@ def recorded_scene(
             recordings.
     """
     path, overrides = path.expanduser().absolute(), list(overrides)
+    require_text(str(path))
     if (path / SCENE).is_file():
         raise InputError(f"{path} has a {SCENE}: name that file, or the folder of the images")
     name = path.resolve().name if path.is_dir() else path.stem

@@ -28,10 +28,10 @@ __all__ = ["CAPTURES"]
 NAN, INFINITY = float("nan"), float("inf")
 
 
-def archive(files: dict[str, bytes]) -> bytes:
+def archive(files: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
     """Return a zip archive."""
     with io.BytesIO() as stream:
-        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as written:
+        with zipfile.ZipFile(stream, "w", method) as written:
             for name, data in files.items():
                 written.writestr(name, data)
         return stream.getvalue()
@@ -93,6 +93,9 @@ def _matrix(path: str, cells: int) -> dict[str, Corruption]:
 
 RECORD3D: dict[str, dict[str, Corruption]] = {
     "room.r3d": {
+        "a bomb of bzip2": changed(lambda data: archive({"metadata": b" " * 60_000_000}, zipfile.ZIP_BZIP2)),
+        "a bomb of LZMA": changed(lambda data: archive({"metadata": b" " * 60_000_000}, zipfile.ZIP_LZMA)),
+        "a file without a name": changed(lambda data: archive({"xxxx": b"1"}).replace(b"xxxx", b"\0xxx")),
         "a bomb for the metadata": in_archive("metadata", lambda data: b" " * 60_000_000 + data),
         "metadata that are no JSON": in_archive("metadata", lambda data: data[:-20]),
         "no poses": in_archive("metadata", lambda data: data.replace(b'"poses"', b'"posts"')),
@@ -204,8 +207,11 @@ STRAY_SCANNER: dict[str, dict[str, Corruption]] = {
     },
 }
 
+# Each mapping merges the one before nine times.
+MERGED = "a0: &a0 {k: 1}\n" + "".join(f"a{n}: &a{n}\n  <<: [{', '.join(9 * [f'*a{n - 1}'])}]\n" for n in range(1, 30))
 EUROC: dict[str, dict[str, Corruption]] = {
     "room/mav0/cam0/sensor.yaml": {
+        "merge keys that multiply": changed(lambda data: data + MERGED.encode()),
         "no intrinsics": replaced("intrinsics:", "extrinsics:"),
         "intrinsics of words": replaced("intrinsics: [", "intrinsics: [a, "),
         "a focal length of 0": replaced("intrinsics: [40.0", "intrinsics: [0.0"),

@@ -33,6 +33,7 @@ IMAGES: dict[str, dict[str, Corruption]] = {
         "pixels missing": whole(png_file(48, 36)),
         "a checksum that is wrong": changed(lambda data: data[:60] + bytes(40) + data[100:]),
         "no end": changed(lambda data: data[:-12]),
+        "a chunk of a gigabyte": changed(lambda data: data[:33] + struct.pack(">I", 1 << 30) + b"tEXt" + data[33:]),
         "a GIF in its place": whole(b"GIF89a\xff\xff\xff\xff" + bytes(40)),
     },
     "images/1.jpg": {
@@ -40,6 +41,9 @@ IMAGES: dict[str, dict[str, Corruption]] = {
         "0 x 0": jpeg_of_size(0, 0),
         "another size": jpeg_of_size(96, 72),
         "no end": changed(lambda data: data[:-2]),
+        "thousands of scans": changed(
+            lambda data: data[:-2] + 5000 * data[data.rindex(b"\xff\xda") :][:40] + data[-2:]
+        ),
         "a start alone": whole(b"\xff\xd8"),
         "padding alone": whole(b"\xff\xd8" + b"\xff" * 200_000),
     },
@@ -102,6 +106,14 @@ MASK: dict[str, dict[str, Corruption]] = {
 
 VIDEO: dict[str, Corruption] = {
     "text": whole("a video of a room\n"),
+    "an index of 80 million frames": changed(
+        lambda data: (
+            data[: data.index(b"stsz") + 8] + struct.pack(">II", 500, 80_000_000) + data[data.index(b"stsz") + 16 :]
+        )
+    ),
+    "an edit list of millions": changed(
+        lambda data: data[: data.index(b"elst") + 8] + struct.pack(">I", 90_000_000) + data[data.index(b"elst") + 12 :]
+    ),
     "no data": changed(lambda data: data[: data.index(b"mdat") + 4] + b"\0" * 64),
     "a box of 2^63": changed(lambda data: data + b"\0\0\0\1mdat\x7f" + b"\xff" * 7),
     "a Matroska start alone": whole(b"\x1aE\xdf\xa3\x9f"),

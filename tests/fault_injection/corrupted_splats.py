@@ -31,6 +31,24 @@ def unpacked(change: Callable[[bytes], bytes]) -> Corruption:
     return changed(lambda data: gzip.compress(change(gzip.decompress(data)), mtime=0))
 
 
+def zstandard_bomb(count: int) -> bytes:
+    """Return an `.spz` file of version 4 with so many Gaussians, all of zeros, in blocks that repeat one byte."""
+    size = struct.Struct("<Q")
+
+    def stream(length: int) -> bytes:
+        blocks, left = b"", length
+        while left > 0:
+            block = min(left, 1 << 17)
+            left -= block
+            blocks += ((block << 3) | 2 | (left == 0)).to_bytes(3, "little") + b"\0"
+        return b"\x28\xb5\x2f\xfd\xe0" + size.pack(length) + blocks
+
+    sizes = [count * each for each in (9, 1, 3, 3, 4)]
+    streams = [stream(length) for length in sizes]
+    table = b"".join(size.pack(len(part)) + size.pack(length) for part, length in zip(streams, sizes, strict=True))
+    return b"NGSP" + struct.pack("<II4BI12x", 4, count, 0, 12, 0, 5, 32) + table + b"".join(streams)
+
+
 SPZ: dict[str, Corruption] = {
     "another magic": in_gzip(0, "<I", 7),
     "version 0": in_gzip(4, "<I", 0),
@@ -46,6 +64,7 @@ SPZ: dict[str, Corruption] = {
     "a header alone": unpacked(lambda data: data[:16]),
     "half a header": unpacked(lambda data: data[:8]),
     "a bomb": unpacked(lambda data: data[:16] + bytes(50_000_000)),
+    "millions of version 4 in no bytes": whole(zstandard_bomb(12_000_000)),
     "a plain start": whole(b"NGSP" + struct.pack("<II4BI", 4, 40, 0, 12, 0, 6, 32) + bytes(200)),
     "a table beyond the end": whole(b"NGSP" + struct.pack("<II4BI", 4, 40, 0, 12, 0, 6, 2**32 - 1) + bytes(200)),
 }
@@ -90,6 +109,19 @@ def of_size(width: int, height: int) -> Callable[[bytes], bytes]:
     return change
 
 
+def packed_by(method: int) -> Corruption:
+    """Pack the archive's files in another way, and `meta.json` with 60 million blanks."""
+
+    def change(data: bytes) -> bytes:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(data)) as packed, zipfile.ZipFile(stream, "w", method) as written:
+            for each in packed.namelist():
+                written.writestr(each, packed.read(each) + b" " * (60_000_000 if each == "meta.json" else 0))
+        return stream.getvalue()
+
+    return changed(change)
+
+
 SOG: dict[str, Corruption] = {
     "no JSON": in_sog("meta.json", lambda data: data[:-9]),
     "nested 5000 deep": in_sog("meta.json", lambda data: b"[" * 5000),
@@ -106,6 +138,11 @@ SOG: dict[str, Corruption] = {
     "a bound of NaN": meta("means/maxs", [NAN, 1, 1]),
     "a bound of 1e300": meta("means/maxs", [1e300, 1, 1]),
     "an empty codebook": meta("scales/codebook", []),
+    "a codebook of lists": meta("sh0/codebook", [[0, 0]] * 256),
+    "a codebook of lists for scales": meta("scales/codebook", [[0]] * 256),
+    "a codebook too short": meta("scales/codebook", [0.0] * 255),
+    "a million Gaussians": meta("count", 1 << 20),
+    "a member of bzip2": packed_by(zipfile.ZIP_BZIP2),
     "a codebook of words": meta("sh0/codebook", ["a"] * 256),
     "an infinite codebook": meta("sh0/codebook", [INFINITY] * 256),
     "an image that is missing": meta("quats/files", ["other.webp"]),

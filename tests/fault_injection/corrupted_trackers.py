@@ -291,6 +291,7 @@ MODP: dict[str, dict[str, Corruption]] = {
     "point_cloud/point_cloud_1.txt": rows_of("1 2 3", 1, 2),
     "point_cloud/point_cloud_2.npy": {
         "2^50 rows": npy_file("{'descr': '<f4', 'fortran_order': False, 'shape': (1125899906842624, 3), }"),
+        "brackets without an end": npy_file("{'descr': '<f4', 'fortran_order': False, 'shape': (8, (3, }"),
         "negative rows": npy_file("{'descr': '<f4', 'fortran_order': False, 'shape': (-8, 3), }"),
         "one column": npy_file("{'descr': '<f4', 'fortran_order': False, 'shape': (24,), }"),
         "two columns": npy_file("{'descr': '<f4', 'fortran_order': False, 'shape': (12, 2), }"),

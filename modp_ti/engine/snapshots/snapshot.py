@@ -168,6 +168,7 @@ class Snapshot:
         """
         state = MapState(self.arrays, self.numbers["frames"])
         rows, points = state.group("frames"), state.group("points")
+        _require_columns(rows["index"], rows["timestamp"], rows["held_out"])
         if not all(isinstance(name, str) for name in state.numbers["name"]) or not np.isfinite(rows["camera"]).all():
             raise ValueError("a frame's name is no text, or its camera no camera")
         frames = DeliveredFrames(
@@ -193,7 +194,8 @@ class Snapshot:
         """Raise ValueError unless the arrays have the form in which the restored objects are written again."""
         for name, array in again.arrays.items():
             stored = self.arrays[name]
-            if stored.shape != array.shape or (stored.dtype.kind in "iu") != (array.dtype.kind in "iu"):
+            kinds = {each.dtype.kind.replace("u", "i") for each in (stored, array)}
+            if stored.shape != array.shape or len(kinds) > 1:
                 raise ValueError(f"{name} is {stored.dtype} of shape {stored.shape}, not {array.dtype} {array.shape}")
 
     def online(self) -> MapVersion | None:
@@ -218,6 +220,7 @@ class Snapshot:
         """Copy the saved notes into a new record."""
         state = MapState(self.arrays, {})
         frames, steps = state.group("record"), state.group("record_steps")
+        _require_columns(*frames.values(), *steps.values())
         columns = {name: frames[name].tolist() for name in FRAME_COLUMNS}
         for name in ("psnr", "mapped_psnr"):
             columns[name] = [None if np.isnan(value) else value for value in columns[name]]
@@ -225,6 +228,11 @@ class Snapshot:
         record.steps = [StepNote(*row) for row in zip(*(steps[name].tolist() for name in STEP_COLUMNS), strict=True)]
         record.started = self.number("started")
         self._require_like(record_state(record))
+
+
+def _require_columns(*arrays: NDArray) -> None:
+    if any(array.ndim != 1 for array in arrays):
+        raise ValueError("a column of frames or steps has several dimensions")
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:

@@ -94,8 +94,10 @@ def _inflates(data: bytes) -> bool:
     wanted = 0 if interlaced else height * (1 + (width * PNG_CHANNELS[kind] * depth + 7) // 8)
     inflater, found, at = zlib.decompressobj(), 0, 8
     try:
-        while at + 12 <= len(data) and not inflater.eof:
+        while at + 12 <= len(data) and data[at + 4 : at + 8] != b"IEND":
             (length,) = struct.unpack_from(">I", data, at)
+            if at + 12 + length > len(data):  # the decoder would allocate it
+                return False
             if data[at + 4 : at + 8] == b"IDAT":
                 rest = memoryview(data)[at + 8 : at + 8 + length]
                 while rest and not inflater.eof:

@@ -30,12 +30,7 @@ class Browser:
         frames: Number of frames to choose from; 0 for no choice.
 
     Attributes:
-        client: viser's handle of the browser.
-        frame: The slider of the frames, or None.
-        mode: The choice of the mode.
         boxes: The box of each node that can be hidden.
-        look: The button that takes the camera to the current frame.
-        link: The button that shows a link to what is seen.
         nodes: The nodes of this browser alone, by name.
     """
 
@@ -68,10 +63,8 @@ class Browser:
     def link_to_view(self) -> str:
         """The query of the page's address that opens it with this browser's camera."""
         c = self.client.camera
-        vectors = {"Position": c.position, "LookAt": c.look_at, "Up": c.up_direction, "Fov": [c.fov]}
-        return "?" + "&".join(
-            f"initialCamera{name}={','.join(f'{number:.4g}' for number in vector)}" for name, vector in vectors.items()
-        )
+        parts = {"Position": c.position, "LookAt": c.look_at, "Up": c.up_direction, "Fov": [c.fov]}
+        return "?" + "&".join(f"initialCamera{k}={','.join(f'{x:.4g}' for x in part)}" for k, part in parts.items())
 
     def note(self, text: str) -> None:
         """Show Markdown text below the mode."""

@@ -13,18 +13,19 @@ import errno
 import http
 import ipaddress
 import logging
-import math
+import re
 import secrets
 import socket
 import threading
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 from urllib.parse import urlsplit
 from weakref import WeakValueDictionary
 
 import msgspec
+import numpy as np
 import viser
 import websockets
 import websockets.asyncio.server
@@ -48,51 +49,31 @@ MOST_CONNECTIONS = 64
 CLOSING = 1.0
 # Number of ports that are tried, from the wanted one on.
 TRIED_PORTS = 1000
-# Largest coordinate of a camera [page units], and largest side of a canvas [px].
-FARTHEST, WIDEST = 1e12, 1 << 16
+# Largest number of a camera, in page units and in pixels.
+FARTHEST = 1e9
 # The address is in no other page's reach: neither as the referrer, nor in a frame, nor in a cache.
 HEADERS = {"Referrer-Policy": "no-referrer", "X-Frame-Options": "DENY", "Cache-Control": "no-store"}
 
-Side = Annotated[int, msgspec.Meta(ge=0, le=WIDEST)]
+# What a camera's message holds, beside its type.
+CAMERA = [field.name for field in fields(_messages.ViewerCameraMessage)]
 
 
-class _Camera(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=True):
-    """Where a browser looks from."""
-
-    wxyz: tuple[float, float, float, float]
-    position: tuple[float, float, float]
-    fov: float
-    near: float
-    far: float
-    image_height: Side
-    image_width: Side
-    look_at: tuple[float, float, float]
-    up_direction: tuple[float, float, float]
-
-    def fits(self, _: Any) -> bool:
-        numbers = (*self.wxyz, *self.position, *self.look_at, *self.up_direction, self.fov, self.near, self.far)
-        return all(math.isfinite(number) and abs(number) <= FARTHEST for number in numbers)
+def _camera_fits(content: dict[str, Any]) -> bool:
+    """Whether a browser can look from there."""
+    msgspec.convert(content, _messages.ViewerCameraMessage)
+    numbers = np.hstack([content[name] for name in CAMERA])
+    sides = content["image_height"], content["image_width"]
+    return len(content) == 1 + len(CAMERA) and bool((abs(numbers) <= FARTHEST).all()) and min(sides) >= 0
 
 
-class _Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True):
-    """A new value of a control."""
-
-    uuid: str
-    updates: dict[str, Any]
-
-    def fits(self, control: Any) -> bool:
-        value = self.updates.get("value")
-        if len(self.updates) != 1 or isinstance(value, bool) != (type(control.value) is bool):
-            return False
-        if isinstance(control, viser.GuiSliderHandle):
-            return isinstance(value, (int, float)) and control.min <= value <= control.max
-        if isinstance(control, viser.GuiDropdownHandle):
-            return value in control.options
-        return isinstance(control, (viser.GuiCheckboxHandle, viser.GuiButtonHandle))
-
-
-# The messages of our page. All others are passed over: pointers, forms, commands, uploads, the tunnel.
-TAKEN: dict[str, type[_Camera] | type[_Update]] = {"ViewerCameraMessage": _Camera, "GuiUpdateMessage": _Update}
+def _update_fits(content: dict[str, Any], control: Any) -> bool:
+    """Whether a control can have the value."""
+    value = content["updates"]["value"]
+    if len(content["updates"]) != 1 or isinstance(value, bool) != (type(control.value) is bool):
+        return False
+    if isinstance(control, viser.GuiSliderHandle):
+        return isinstance(value, (int, float)) and control.min <= value <= control.max
+    return not isinstance(control, viser.GuiDropdownHandle) or value in control.options
 
 
 class _Connection(websockets.asyncio.server.ServerConnection):
@@ -197,14 +178,13 @@ class Door:
         if not isinstance(message, bytes):
             raise ValueError("text")
         content = msgspec.msgpack.decode(message, type=dict[str, Any])
-        kind = TAKEN.get(content["type"])
-        if kind is None:
+        if content["type"] == "ViewerCameraMessage":
+            fits = _camera_fits(content)
+        elif content["type"] == "GuiUpdateMessage" and content["uuid"] in self._controls:
+            fits = _update_fits(content, self._controls[content["uuid"]])
+        else:  # none of our page: pointers, forms, commands, uploads, the tunnel
             return False
-        read = msgspec.convert(content, kind)
-        control = self._controls.get(read.uuid) if isinstance(read, _Update) else None
-        if isinstance(read, _Update) and control is None:
-            return False
-        if not read.fits(control):
+        if not fits:
             raise ValueError("out of range")
         return True
 
@@ -257,12 +237,11 @@ class Door:
             name, port = given.hostname or "", given.port or 80
         except ValueError:
             return False
-        names = {self._host.lower(), self._socket.getsockname()[0]}
+        bound = self._socket.getsockname()[0]
+        names = {self._host.lower(), bound}
         names |= {socket.gethostname().lower()} if self.beyond_this_machine else {"localhost", "127.0.0.1", "::1"}
-        if self._socket.getsockname()[0] in ("0.0.0.0", "::"):
-            with contextlib.suppress(ValueError):
-                names.add(str(ipaddress.ip_address(name)))  # any address of this machine
-        return port == self.port and name in names
+        any_address = bound in ("0.0.0.0", "::") and re.fullmatch(r"[0-9.]+|[0-9a-f:]+", name)
+        return port == self.port and (name in names or bool(any_address))
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -269,7 +269,7 @@ class Page:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         number = client.client_id
-        choose, browser = self._choose, Browser(client, self._modes, self._frames if self._choose else 0)
+        browser = Browser(client, self._modes, self._frames if self._choose else 0)
 
         def on(register: Callable[[Callable[[Any], None]], Any], act: Callable[[], None]) -> None:
             register(lambda _: self.attempt(number, act))
@@ -277,8 +277,7 @@ class Page:
         with self._lock:
             self._browsers[number] = browser
             browser.note(self._drawn)
-        if choose is not None and browser.frame is not None:
-            slider = browser.frame
+        if (choose := self._choose) is not None and (slider := browser.frame) is not None:
             on(slider.on_update, lambda: choose(number, min(int(slider.value), self._frames - 1)))
             choose(number, 0)
         on(browser.mode.on_update, lambda: self._set_mode(browser))

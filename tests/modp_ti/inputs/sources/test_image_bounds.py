@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import image_bounds
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 
@@ -40,7 +41,31 @@ def test_deep_grey_and_transparent_images_are_let_through() -> None:
 
 def test_an_image_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(image_bounds, "available_memory", lambda: 1000)
-    assert "do not fit into this machine's memory" in why_undecodable(encoded(".jpg", 48, 36))
+    large = encoded(".bmp", 6000, 4000, channels=3)
+    assert "do not fit into this machine's memory" in why_undecodable(large)
+    with pytest.raises(InputError) as lacking:  # an ordinary image is not to blame
+        why_undecodable(encoded(".jpg", 48, 36))
+    assert "\n" not in str(lacking.value)
+
+
+def test_a_chunk_beyond_the_end_is_refused_since_the_decoder_allocates_it() -> None:
+    png = encoded(".png", 48, 36)
+    at = png.index(b"IDAT") - 4
+    longer = png[:at] + struct.pack(">I", 1 << 30) + png[at + 4 :]
+    assert why_undecodable(png) is None and why_undecodable(longer) is not None
+    assert why_undecodable(png[:-12] + struct.pack(">I", 1 << 30) + b"tEXt" + png[-12:]) is not None
+
+
+def test_a_jpeg_of_thousands_of_scans_is_refused_and_progressive_ones_are_not() -> None:
+    image = np.random.default_rng(5).integers(0, 255, (48, 36, 3), np.uint8)
+    progressive = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    scan = progressive.rindex(b"\xff\xda")
+    assert why_undecodable(progressive) is None
+    assert why_undecodable(progressive[:-2] + 600 * progressive[scan:-2] + b"\xff\xd9") is not None
+    # What follows the end, as in motion photos, and metadata count as none.
+    appended = progressive + 600 * b"\xff\xda\0\0"
+    comment = progressive[:2] + b"\xff\xfe" + struct.pack(">H", 2402) + 600 * b"\xff\xda\0\0" + progressive[2:]
+    assert why_undecodable(appended) is None and why_undecodable(comment) is None
 
 
 def test_a_size_that_the_bytes_cannot_hold_is_refused() -> None:

@@ -6,7 +6,8 @@ import struct
 
 import pytest
 
-from modp_ti.inputs.sources.video_container import missing_bytes
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.video_container import missing_bytes, require_true_index
 
 
 def box(kind: bytes, content: bytes) -> bytes:
@@ -65,3 +66,49 @@ def test_containers_without_a_length_are_not_judged(tmp_path, data):
     file = tmp_path / "video"
     file.write_bytes(data)
     assert missing_bytes(file) is None
+
+
+def index(*boxes: tuple[bytes, int], first: bytes = b"ftyp", samples: int = 5000) -> bytes:
+    """An MP4 of `samples` bytes whose index has these boxes, each with its count."""
+    content = b"".join(
+        mp4_box(kind, bytes(4 if kind in (b"trun", b"elst") else 8) + struct.pack(">I", n)) for kind, n in boxes
+    )
+    place = b"moof" if boxes[0][0] == b"trun" else b"moov"
+    return (
+        mp4_box(first, bytes(8))
+        + mp4_box(place, mp4_box(b"trak", content))
+        + mp4_box(b"mdat", b"stsz" + b"\xff" * samples)
+    )
+
+
+def mp4_box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content) + 8) + kind + content
+
+
+@pytest.mark.parametrize(
+    "boxes",
+    [
+        [(b"stsz", 80_000_000)],
+        [(b"stsz", 3000), (b"stsz", 3000)],
+        [(b"stz2", 80_000_000)],
+        [(b"trun", 80_000_000)],
+        [(b"stsz", 100), (b"elst", 10_000)],
+        [(b"cmov", 0)],
+    ],
+)
+@pytest.mark.parametrize("first", [b"ftyp", b"styp"])
+def test_an_index_of_more_frames_than_bytes_is_refused(tmp_path, boxes, first):
+    (tmp_path / "a.mp4").write_bytes(index(*boxes, first=first))
+    with pytest.raises(InputError):
+        require_true_index(tmp_path / "a.mp4")
+
+
+def test_an_index_of_frames_that_are_there_is_taken(tmp_path):
+    for data in (
+        index((b"stsz", 4000), (b"elst", 0)),
+        index((b"trun", 4000)),
+        index((b"stsz", 100), (b"elst", 3)),
+        b"RIFF",
+    ):
+        (tmp_path / "a.mp4").write_bytes(data)
+        require_true_index(tmp_path / "a.mp4")

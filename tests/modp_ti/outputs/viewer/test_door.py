@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import http.client
 import inspect
+import io
 import socket
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -353,3 +355,21 @@ def test_the_browser_that_paused_is_known_until_it_leaves(page: Page):
         time.sleep(0.01)
     assert len(page.requests) == 1
     other.close()
+
+
+def test_the_address_is_printed_even_if_nothing_else_is():
+    from rich.console import Console
+
+    from modp_ti.config.settings import ViewSettings
+    from modp_ti.engine.build import open_observer
+    from modp_ti.outputs.progress import ProgressLine
+
+    for host, lines in (("127.0.0.1", 1), ("0.0.0.0", 2)):  # and a line that the page is open to other machines
+        said = io.StringIO()
+        line = ProgressLine(Console(file=said, quiet=True))
+        with ExitStack() as held:
+            open_observer(ViewSettings(enabled=True, host=host, port=0), line.note, line.insist, held)
+            line.note("something else")
+            url = said.getvalue().split()[1]
+            assert said.getvalue().count("\n") == lines
+            assert get(url)[0] == 200

@@ -1,0 +1,106 @@
+"""Names of files reach the terminal as text: neither obeyed by it nor by rich, and never as a traceback."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from modp_ti.files.errors import InputError
+from modp_ti.files.terminal import CleanConsole, require_text, shown
+from modp_ti.inputs.sources.image_folder import ImageFolder
+from modp_ti.outputs.progress import ProgressLine
+
+HOSTILE = "\x1b]0;title\x07\x9b31m\udcff\u202e[red]x[/red] :smile: Bäume.jpg"
+
+
+def test_what_cannot_be_seen_is_escaped_and_all_else_stays() -> None:
+    assert shown("Bäume\t[red]x\n") == "Bäume\t[red]x\n"
+    cleaned = shown(HOSTILE)
+    assert cleaned.isprintable() and cleaned.endswith("[red]x[/red] :smile: Bäume.jpg")
+    assert shown(cleaned) == cleaned
+    cleaned.encode("utf-8")
+
+
+def test_notes_states_bars_and_tables_show_names_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rich.table import Table
+
+    def printed(show) -> str:
+        console = CleanConsole()
+        console.file = io.StringIO()
+        show(console)
+        return console.file.getvalue().replace("\n", "")
+
+    def bar(console: CleanConsole) -> None:
+        line = ProgressLine(console)
+        line.start(HOSTILE, 1)
+        line.advance()
+        line.stop()
+
+    def state(console: CleanConsole) -> None:
+        console._force_terminal = True
+        with ProgressLine(console).working(HOSTILE):
+            pass
+
+    def table(console: CleanConsole) -> None:
+        rows = Table(box=None)
+        rows.add_row(HOSTILE)
+        console.print(rows)
+
+    monkeypatch.setenv("COLUMNS", "200")
+    for show in (lambda console: ProgressLine(console).note(HOSTILE), bar, state, table):
+        text = printed(show)
+        assert "[red]x[/re" in text and "\x1b]" not in text and "\x9b" not in text
+        text.encode("utf-8")
+
+
+def test_an_image_whose_name_is_no_text_is_refused_when_the_folder_is_opened(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes())
+    ImageFolder(tmp_path, 30.0)
+    (tmp_path / "a.png").rename(os.fsdecode(os.fsencode(tmp_path) + b"/b\xff.png"))
+    with pytest.raises(InputError) as refused:
+        ImageFolder(tmp_path, 30.0)
+    str(refused.value).encode("utf-8")
+    require_text("Bäume")
+
+
+def command(scene: Path, tail: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """`modp-ti check SCENE` in a shell of its own."""
+    call = f'{sys.executable} -m modp_ti.commands.app check "$1" {tail}'
+    env = {**os.environ, **variables}
+    return subprocess.run(["sh", "-c", call, "sh", scene], env=env, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tail", ["--json > /dev/full", "> /dev/full --json --quiet", "--json >&-"])
+def test_a_result_that_cannot_be_written_is_an_error_of_one_line(tmp_path: Path, tail: str) -> None:
+    done = command(tmp_path / "none.yaml", tail)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_a_locale_of_ascii_reads_and_prints_any_name(tmp_path: Path) -> None:
+    locale = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
+    (tmp_path / "Bäume.yaml").write_text("source: {path: Wälder}\n")
+    done = command(tmp_path / "Bäume.yaml", "", **locale)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "Bäume.yaml" in done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_lines_of_native_libraries_stay_off_the_terminal_and_those_of_python_do_not() -> None:
+    program = (
+        "import os, sys; from modp_ti.files.terminal import own_terminal, quiet_libraries\n"
+        "own_terminal()\n"
+        "with quiet_libraries(), quiet_libraries():\n"
+        "    os.write(2, b'native'); print('python', file=sys.stderr)\n"
+        "os.write(2, b'after')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert done.stderr == b"python\nafter"
