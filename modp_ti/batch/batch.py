@@ -194,7 +194,7 @@ class _Batch:
             with appearing(self._folder) as staged:
                 write_csv(staged / CSV, results)
                 write_parquet(staged / PARQUET, results)
-                write_summary_page(staged / PAGE, results)
+                write_summary_page(staged / PAGE, results, self._folder)
             self._unwritten = ""
         except InputError as error:
             self._unwritten = str(error)

@@ -15,12 +15,13 @@ from modp_ti.outputs.report import facts
 __all__ = ["write_summary_page"]
 
 
-def write_summary_page(path: Path, results: Sequence[SceneResult]) -> None:
+def write_summary_page(path: Path, results: Sequence[SceneResult], folder: Path | None = None) -> None:
     """Write the page. Raises OSError if it cannot be written.
 
     Args:
-        path: The page. Its links are relative to it, so the folders can be moved together.
+        path: The page.
         results: The results so far.
+        folder: The folder that its links are relative to, so that the folders can be moved together; None for its own.
     """
     import jinja2
 
@@ -41,7 +42,7 @@ def write_summary_page(path: Path, results: Sequence[SceneResult]) -> None:
         seconds=sum(result.seconds or 0.0 for result in finished),
         frames=sum(result.frames or 0 for result in finished),
         facts=facts,
-        links={result.name: _link(path.parent, result) for result in results},
+        links={result.name: _link(folder or path.parent, result) for result in results},
         written=time.strftime("%d %B %Y, %H:%M"),
     )
     replace_text(path, page)

@@ -36,7 +36,7 @@ class Unfinished:
 
     def interrupted(self) -> KeyboardInterrupt:
         """Save a snapshot and the map after Ctrl-C."""
-        resumable = self._checkpointer.keep()
+        resumable = self._checkpointer.keep() or self._checkpointer.usable
         said = f"interrupted after {len(self._mapper.frames)} frames{self._save()}"
         return KeyboardInterrupt(f"{said}; modp-ti run --resume {self._config.output} goes on" if resumable else said)
 

@@ -204,14 +204,16 @@ def _commit(output: Path, staged: Path, outdated: Collection[str]) -> None:
 
 
 def _move(output: Path, record: _Record) -> None:
-    """Do what a record says. It may have been done in part already."""
+    """Do what a record says. It may have been done in part already, and the record may be a stranger's."""
+    staged = output / PRIVATE / record.staged
+    files = sorted(_files(staged), key=lambda file: (file.name == LAST, file))
+    refuse_foreign(output, [*record.gone, *(file.relative_to(staged).as_posix() for file in files)])
     for name in sorted(record.gone, key=lambda name: (name != LAST, name)):
         (output / name).unlink(missing_ok=True)
         with suppress(OSError):  # those that still hold something stay
             for folder in PurePosixPath(name).parents[:-1]:
                 (output / folder).rmdir()
-    staged = output / PRIVATE / record.staged
-    for file in sorted(_files(staged), key=lambda file: (file.name == LAST, file)):
+    for file in files:
         target = output / file.relative_to(staged)
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.is_dir() and not target.is_symlink():

@@ -49,7 +49,7 @@ def test_the_loop_leaves_a_map_of_the_wall(ran: dict[str, dict]) -> None:
     render, truth = np.clip(names["picture"].colour, 0, 1), frame(3).image
     assert -10 * np.log10(((render - truth) ** 2).mean()) > 24
     assert sorted(p.name for p in (names["folder"] / "out" / "room").iterdir()) == [
-        *("colmap", "frames.json", "splats.ply", "trajectory.txt"),
+        *(".modp-ti", "colmap", "frames.json", "splats.ply", "trajectory.txt"),
     ]
     assert len(read_splats(names["folder"] / "out" / "room" / "splats.ply")["position"]) > 300
 

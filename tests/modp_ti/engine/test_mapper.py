@@ -66,7 +66,7 @@ def test_a_saved_map_is_the_map(mapper: Mapper, tmp_path: Path) -> None:
     mapper.save(tmp_path / "new" / "room.ply")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["new", "room"]
     assert sorted(p.name for p in (tmp_path / "room").iterdir()) == [
-        *("colmap", "frames.json", "notes.txt", "splats.ply", "trajectory.txt"),
+        *(".modp-ti", "colmap", "frames.json", "notes.txt", "splats.ply", "trajectory.txt"),
     ]
     state = mapper.pipeline.gaussians.to_numpy()
     for file in (tmp_path / "room" / "splats.ply", tmp_path / "new" / "room.ply"):

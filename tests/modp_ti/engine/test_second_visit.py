@@ -180,4 +180,4 @@ def test_a_recording_of_another_place_is_refused_in_one_line(first: Path, tmp_pa
 
 def test_the_first_visit_is_not_written_to(first: Path, room: Room, tmp_path: Path) -> None:
     result = run(second_scene(room, tmp_path), "--onto", str(first), "--quiet", "--set", f"output={first}")
-    assert result.returncode == 2 and "choose another output" in result.stderr
+    assert result.returncode == 2 and f"{first} (onto)" in result.stderr

@@ -166,6 +166,17 @@ def test_a_list_from_a_stranger_reaches_nothing_outside(tmp_path: Path, record: 
     assert (tmp_path / "victim").exists() and (tmp_path / "elsewhere" / "b").exists()
 
 
+def test_a_half_done_move_from_a_stranger_does_not_follow_his_links(tmp_path: Path) -> None:
+    output, home = tmp_path / "out", _tree(tmp_path / "home", {"keys": "mine"})
+    _tree(output, {f"{PRIVATE}/new/colmap/keys": "his", f"{PRIVATE}/new/colmap/more": "his"})
+    (output / "colmap").symlink_to(home)
+    record = {"files": ["colmap/keys", "colmap/more"], "staged": "new", "gone": ["colmap/keys"]}
+    replace_text(output / PRIVATE / "files.json", json.dumps(record))
+    with pytest.raises(InputError):
+        require_whole(output)
+    assert files_of(home) == {"keys": "mine"}
+
+
 def test_a_folder_of_an_earlier_version_is_known_by_its_settings(tmp_path: Path) -> None:
     output = _tree(tmp_path / "out", FIRST | {"colmap/mine.db": "mine"})
     assert not is_run_folder(output)

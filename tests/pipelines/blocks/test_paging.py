@@ -164,7 +164,7 @@ def test_keyframes_that_go_together_share_a_file(taichi_on_the_cpu: None, tmp_pa
     """A process may open 256 files at a time on macOS, 1,024 on Linux, and Python keeps those that are mapped open."""
     mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
     moved = sum(view.pyramid[0].on_disk for view in mapper.keyframes)
-    files = len(list(tmp_path.glob("blocks-*/keyframes-*")))
+    files = len(list(tmp_path.glob("blocks/*/keyframes-*")))
     assert 0 < files < moved
 
 
@@ -229,10 +229,10 @@ def test_hidden_gaussians_on_a_full_disk_stay_where_they_are(
 
 
 def test_the_saved_map_holds_the_blocks_on_disk_whose_files_go_with_it(taichi_on_the_cpu: None, tmp_path: Path) -> None:
-    (tmp_path / "blocks-left").mkdir()
+    (tmp_path / "blocks-of-mine").mkdir()
     mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
-    (folder,) = tmp_path.iterdir()
-    assert folder.name != "blocks-left" and list(folder.glob("*.npy"))
+    (folder,) = (tmp_path / "blocks").iterdir()
+    assert (tmp_path / "blocks-of-mine").is_dir() and list(folder.glob("*.npy"))
     # The saved map is what is in memory and what lies in these files, one after the other.
     write_splats(tmp_path / "map.ply", mapper.all_gaussians())
     saved = PlyData.read(tmp_path / "map.ply")["vertex"]
@@ -246,4 +246,4 @@ def test_the_saved_map_holds_the_blocks_on_disk_whose_files_go_with_it(taichi_on
     (tmp_path / "map.ply").unlink()
     del mapper
     gc.collect()
-    assert not list(tmp_path.iterdir())
+    assert not list((tmp_path / "blocks").iterdir()) and (tmp_path / "blocks-of-mine").is_dir()

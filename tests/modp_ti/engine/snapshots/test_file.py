@@ -33,7 +33,7 @@ def path(tmp_path: Path) -> Path:
 
 def test_what_is_written_is_read_back_to_the_bit(path: Path) -> None:
     arrays, about = read_arrays(path)
-    assert about == {"version": VERSION, **ABOUT}
+    assert about == {"version": VERSION, "program": __version__, **ABOUT}
     assert list(arrays) == list(ARRAYS)
     for name, array in ARRAYS.items():
         assert arrays[name].dtype == array.dtype and arrays[name].shape == array.shape
