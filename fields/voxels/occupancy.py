@@ -66,7 +66,7 @@ class OccupancyVoxels(Tenant):
         self.levels = levels
         self.resolution = resolution
         self.settle(coarsest, origin)
-        with settled(nodes=SparseBricks.NODES) as self.tenancy:
+        with settled(nodes=SparseBricks.NODES if has_sparse_fields() else 0) as self.tenancy:
             self._bricks: Bricks = SparseBricks(levels) if has_sparse_fields() else HashedBricks(levels)
             self._resting = RestingBricks(self._bricks)
 

@@ -61,7 +61,7 @@ def rasterize(
     camera: PinholeCamera,
     colour: Tensor | None = None,
     background: Tensor | None = None,
-    near: float = 0.01,
+    near: float | Tensor = 0.01,
 ) -> RasterizedView:
     """Render N Gaussians, differentiably with respect to every tensor. Call `initialise` first.
 
@@ -106,11 +106,12 @@ def rasterize(
     program()
     geometry = {"position": position, "log_scale": log_scale, "quaternion": quaternion, "opacity_logit": opacity_logit}
     _check(geometry, sh, colour, T_camera_world, background)
-    if not 0.0 < float(near) < math.inf:
+    near = float(near)
+    if not 0.0 < near < math.inf:
         raise ValueError(f"near is {near}, expected a positive depth")
-    _refuse_boundless(position.detach(), log_scale.detach(), T_camera_world.detach(), camera, float(near))
+    _refuse_boundless(position.detach(), log_scale.detach(), T_camera_world.detach(), camera, near)
     coefficients = sh if colour is None else ((colour - 0.5) / SH_C0)[:, None]
-    image, depth, opacity = _Rasterize.apply(*geometry.values(), coefficients, T_camera_world, camera, float(near))
+    image, depth, opacity = _Rasterize.apply(*geometry.values(), coefficients, T_camera_world, camera, near)
     if background is not None:
         image = image + (1.0 - opacity)[..., None] * background
     return RasterizedView(image, depth, opacity)

@@ -91,6 +91,8 @@ class Renderer:
     def __init__(self, gaussians: GaussianField, max_width: int, max_height: int, image_cache_gb: float = 2.0) -> None:
         real = gaussians.real
         self.gaussians = gaussians
+        largest = PinholeCamera(1.0, 1.0, 0.0, 0.0, max_width, max_height)  # refuses a size that is not whole
+        max_width, max_height = largest.width, largest.height
         with settled(nodes=3) as self.tenancy:
             # One SNode tree for everything that compositing reads and writes. With two, Taichi fetches the trees' roots
             # at every pixel, and LLVM cannot vectorise the inner loop (measured: six times slower).
