@@ -258,9 +258,9 @@ def __getattr__(name: str) -> Any:
 
 # Kernels can be launched from any thread, but only one after the other.
 lock = threading.RLock()
-# Where the engine runs: LLVM lets only the thread that has started the engine add fields.
-_home: ThreadPoolExecutor | None = None  # a thread of its own, which makes fields for all threads
-_starter: threading.Thread | None = None  # or the thread that has called `start`
+# LLVM lets only the thread that has started the engine add fields: one of its own, or that which has called `start`.
+_home: ThreadPoolExecutor | None = None
+_starter: threading.Thread | None = None
 
 
 def start(arch: object, in_own_thread: bool, **options: Any) -> None:

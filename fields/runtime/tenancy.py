@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 from fields.runtime.backend import (
     MAX_SPARSE,
-    has_sparse_fields,
     initialise,
     on_gpu,
     program,
@@ -45,17 +44,12 @@ class Tenancy:
 
     def __init__(self, kept: bool) -> None:
         self._program: object | None = program()
-        self._kept = kept
+        self.kept = kept
 
     @property
     def is_open(self) -> bool:
         """Whether the fields are still there."""
         return self._program is not None and self._program is running_program()
-
-    @property
-    def is_in_use(self) -> bool:
-        """Whether the fields have to stay."""
-        return self.is_open and self._kept
 
     def close(self) -> None:
         """Give up the fields. Their memory is used again once the engine has to start again to make room."""
@@ -65,13 +59,9 @@ class Tenancy:
     def __enter__(self) -> None:
         lock.acquire()
         if not self.is_open:
-            closed = self._program is None
+            why = "closed" if self._program is None else f"freed when {engine().title} was started again"
             lock.release()
-            raise RuntimeError(
-                "this object was closed: make a new one"
-                if closed
-                else f"{engine().title} was started again since this object was made, which freed it: make a new one"
-            )
+            raise RuntimeError(f"this object was {why}: make a new one")
 
     def __exit__(self, *_: object) -> None:
         lock.release()
@@ -121,7 +111,7 @@ def settled(nodes: int, kept: bool = True) -> Iterator[Tenancy]:
             yield _settling
             return
         program()
-        if has_sparse_fields() and not on_gpu() and sparse_nodes() + nodes > CROWDED:
+        if not on_gpu() and sparse_nodes() + nodes > CROWDED:
             if _is_empty():
                 restart()
             elif MAX_SPARSE is not None:
@@ -140,21 +130,20 @@ def settled(nodes: int, kept: bool = True) -> Iterator[Tenancy]:
 def in_engine(*methods: str) -> Callable[[type[T]], type[T]]:
     """Let methods of a class run only while the fields of its `tenancy` are there, one thread at a time."""
 
-    def guarded(cls: type[T]) -> type[T]:
+    def guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(method)
+        def call(self: Any, *arguments: Any, **named: Any) -> Any:
+            with self.tenancy:
+                return method(self, *arguments, **named)
+
+        return call
+
+    def with_guards(cls: type[T]) -> type[T]:
         for name in methods:
-            setattr(cls, name, _guarded(vars(cls)[name]))
+            setattr(cls, name, guarded(vars(cls)[name]))
         return cls
 
-    return guarded
-
-
-def _guarded(method: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(method)
-    def guarded(self: Any, *arguments: Any, **named: Any) -> Any:
-        with self.tenancy:
-            return method(self, *arguments, **named)
-
-    return guarded
+    return with_guards
 
 
 def empty() -> None:
@@ -171,7 +160,7 @@ def empty() -> None:
 
 def _is_empty() -> bool:
     gc.collect()  # what is only part of a cycle is not used any more
-    return not any(tenancy.is_in_use for tenancy in _tenancies)
+    return not any(tenancy.kept and tenancy.is_open for tenancy in _tenancies)
 
 
 def ensure_started(device: str) -> str:

@@ -68,10 +68,10 @@ class Mapper(Tenant):
 
     Example:
         modp_ti.initialise("cpu")
-        with modp_ti.Mapper(width=640, height=480) as mapper:
-            for frame in frames:  # of class `TrackedFrame`
-                mapper.add(frame)
-            mapper.save("out/room")
+        mapper = modp_ti.Mapper(width=640, height=480)
+        for frame in frames:  # of class `TrackedFrame`
+            mapper.add(frame)
+        mapper.save("out/room")
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Mapper(Tenant):
             ValueError: If the frame is out of order or larger than the mapper's images.
             BlockError: If a part of the map that lies on disk is damaged. The map is left without it.
         """
-        if self.frames.index and frame.timestamp < self.frames.timestamp[-1]:
+        if self.frames.index and frame.index > self.frames.index[-1] and frame.timestamp < self.frames.timestamp[-1]:
             before = self.frames.timestamp[-1]
             raise ValueError(f"{frame.name} has the time {frame.timestamp} s, the frame before it {before} s")
         return self.take(frame)
