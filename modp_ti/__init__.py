@@ -10,9 +10,9 @@ Map the scene that a `scene.yaml` describes:
 Map frames from your own loop:
 
     modp_ti.initialise("cpu")
-    mapper = modp_ti.Mapper(width=640, height=480)
-    mapper.add(modp_ti.TrackedFrame.from_arrays(index, image, T_camera_world, intrinsics, xyz, pixels))
-    mapper.save("out/room")
+    with modp_ti.Mapper(width=640, height=480) as mapper:
+        mapper.add(modp_ti.TrackedFrame.from_arrays(index, image, T_camera_world, intrinsics, xyz, pixels))
+        mapper.save("out/room")
 
 Find out where a new picture was taken in a finished map:
 
@@ -31,7 +31,10 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from modp_ti.files.own_zlib import keep_apart
 from modp_ti.version import __version__ as __version__
+
+keep_apart()  # before anything loads pycolmap
 
 # Only for type checkers and editors. At run time `__getattr__` imports these names on first access.
 if TYPE_CHECKING:

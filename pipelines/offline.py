@@ -14,6 +14,7 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
+from fields.runtime.tenancy import in_engine, settled
 from pipelines.corrections import CorrectionReport, revise
 from pipelines.densify.adaptive_density import AdaptiveDensity
 from pipelines.densify.point_initialisation import initialise, union_of_points
@@ -116,6 +117,7 @@ def scene_extent(store: KeyframeStore) -> float:
     return max(1.1 * radius, LEAST_EXTENT * store.scene_depth)
 
 
+@in_engine("process", "initialise", "optimise", "finish", "caught", "compile")
 class OfflineMapper(Pipeline):
     """Offline 3DGS: collects all frames, then optimises Gaussians on one random view per step.
 
@@ -133,13 +135,14 @@ class OfflineMapper(Pipeline):
         self.settings = settings
         self.rng = np.random.default_rng(seed)
         self.stopwatch = Stopwatch()
-        self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
-        self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
-        self.loss = photometric_loss(self.renderer.images)
-        self._last: LossValues | None = None
-        self.adam = Adam(self.gaussians)
-        self.safeguards = Safeguards()
-        self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
+        with settled(nodes=4) as self.tenancy:
+            self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
+            self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
+            self.loss = photometric_loss(self.renderer.images)
+            self._last: LossValues | None = None
+            self.adam = Adam(self.gaussians)
+            self.safeguards = Safeguards()
+            self.density = AdaptiveDensity(self.gaussians, settings, self.rng)
         self.trajectory = Trajectory()
         self.keyframes = KeyframeStore(trajectory=self.trajectory)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
+from fields.runtime.tenancy import in_engine
 from pipelines import finished_map, online_state
 from pipelines.corrections import CorrectionReport
 from pipelines.finished_map import FinishedMap
@@ -47,6 +48,8 @@ class LastPart:
     before: int
 
 
+@in_engine("compile", "process", "optimise", "optimise_further", "correct", "finish", "refine", "go_on_with")
+@in_engine("state", "restore")
 class OnlineMapper(OnlineMap):
     """Builds a Gaussian map from a stream of `TrackedFrame`s.
 

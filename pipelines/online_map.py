@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
+from fields.runtime.tenancy import in_engine, settled
+from fields.voxels.sparse_bricks import SparseBricks
 from pipelines.blocks.paging import Paging
 from pipelines.companions import Companion
 from pipelines.corrections import MapCorrector
@@ -36,6 +38,7 @@ from pipelines.transients.sweep import TransientSweep
 __all__ = ["OnlineMap"]
 
 
+@in_engine("prune", "all_gaussians", "mask_contradicted", "mask_latest", "watch_changes", "caught")
 class OnlineMap(Pipeline):
     """An online map and the objects that work on it. `OnlineMapper` adds the loop.
 
@@ -71,28 +74,31 @@ class OnlineMap(Pipeline):
         self.settings = settings
         self.rng = np.random.default_rng(seed)
         self.stopwatch = Stopwatch()
-        self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
-        self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
-        self.companions: list[Companion] = []  # filled below: some need the optimiser
-        self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings, self.companions)
-        self.loss = self.optimiser.loss
-        self.trajectory = Trajectory()
-        self.keyframes = KeyframeStore(len(settings.levels.probabilities), settings.levels.min_side, self.trajectory)
-        self.gate = FrameGate(settings.gate, self.trajectory)
-        self.selector = KeyframeSelector(settings.keyframes, self.trajectory)
-        depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
-        self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
-        self.budget = self.densifier.budget
-        self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
-        contribution = Contribution(self.gaussians, self.renderer)
-        self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
-        self.companions += [self.paging, OtherPlaces(self.densifier), self.hidden]
-        if settings.transients:
-            self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
-            self.companions.append(self.transients)
-        self.pace = pace or CompletePace(settings)
-        self.views = views or LocalGlobalViews(settings.views, self.rng)
-        self.corrector = MapCorrector(self.keyframes, self.densifier, self.paging)
+        with settled(nodes=4 + SparseBricks.NODES) as self.tenancy:
+            self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
+            self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
+            self.companions: list[Companion] = []  # filled below: some need the optimiser
+            self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings, self.companions)
+            self.loss = self.optimiser.loss
+            self.trajectory = Trajectory()
+            self.keyframes = KeyframeStore(
+                len(settings.levels.probabilities), settings.levels.min_side, self.trajectory
+            )
+            self.gate = FrameGate(settings.gate, self.trajectory)
+            self.selector = KeyframeSelector(settings.keyframes, self.trajectory)
+            depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
+            self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
+            self.budget = self.densifier.budget
+            self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
+            contribution = Contribution(self.gaussians, self.renderer)
+            self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
+            self.companions += [self.paging, OtherPlaces(self.densifier), self.hidden]
+            if settings.transients:
+                self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
+                self.companions.append(self.transients)
+            self.pace = pace or CompletePace(settings)
+            self.views = views or LocalGlobalViews(settings.views, self.rng)
+            self.corrector = MapCorrector(self.keyframes, self.densifier, self.paging)
         self.frame_count = self.settled = 0
 
     @property

@@ -14,6 +14,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
+from fields.runtime.tenancy import Tenancy
 from pipelines.corrections import CorrectionReport
 from pipelines.optimise.losses import PhotometricLoss
 from pipelines.optimise.safeguards import Safeguards
@@ -67,6 +68,7 @@ class Pipeline(ABC):
     renderer: Renderer
     loss: PhotometricLoss
     stopwatch: Stopwatch
+    tenancy: Tenancy
     transients: TransientSweep | None = None
     """Masks what moves; None if it is not masked."""
 

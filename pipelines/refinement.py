@@ -76,41 +76,42 @@ def refine(
         mapper.finish()
         modp_ti.refine(mapper, modp_ti.RefineSettings(steps=100))
     """
-    store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
-    if len(store) == 0 or mapper.gaussian_count == 0:
-        return
-    by_the_clock = schedule is not None or settings.seconds is not None
-    if schedule is None:
-        schedule = in_steps(settings.steps) if settings.seconds is None else in_seconds(settings.seconds)
-    step, share = done, schedule(done)
-    removes = settings.min_contribution > 0 and not (by_the_clock and len(store) > MOST_SWEPT)
-    if not done and share is not None:
-        mapper.begin_passes(np.arange(len(store)))
-    if removes and not done and share is not None:
+    with mapper.tenancy:
+        store, views, poses = mapper.keyframes, mapper.settings.views, mapper.settings.poses
+        if len(store) == 0 or mapper.gaussian_count == 0:
+            return
+        by_the_clock = schedule is not None or settings.seconds is not None
+        if schedule is None:
+            schedule = in_steps(settings.steps) if settings.seconds is None else in_seconds(settings.seconds)
+        step, share = done, schedule(done)
+        removes = settings.min_contribution > 0 and not (by_the_clock and len(store) > MOST_SWEPT)
+        if not done and share is not None:
+            mapper.begin_passes(np.arange(len(store)))
+        if removes and not done and share is not None:
+            with mapper.stopwatch.measure("refine"):
+                mapper.hidden.remove(settings.min_contribution, mapper.near)
+        groups = mapper.paging.groups()
+        ends = np.cumsum([0] + [len(places) for places in groups]) / len(store)  # of the groups' shares
+        while share is not None:
+            group = min(int(np.searchsorted(ends, share, side="right")) - 1, len(groups) - 1)
+            passed = (share - ends[group]) / (ends[group + 1] - ends[group])
+            decayed = max(passed - settings.hold, 0.0) / (1.0 - settings.hold)
+            moves = poses.enabled and (settings.poses or passed < settings.hold)
+            with mapper.stopwatch.measure("refine"):
+                p = global_probabilities(store, views.error_weight, 0.0, groups[group])
+                batch = [int(j) for j in mapper.rng.choice(groups[group], settings.views, p=p)]
+                slower = settings.position_decay**decayed
+                rates = mapper.optimiser.rates(
+                    store.scene_depth,
+                    position_factor=slower,
+                    scale_factor=settings.scale_decay**decayed,
+                    other_factor=settings.rate_decay**decayed,
+                )
+                psnr = mapper.optimiser.step(store, batch, rates, poses.learning_rate * slower if moves else 0.0)
+            step += 1
+            if progress is not None:
+                progress(step, psnr)
+            share = schedule(step)
         with mapper.stopwatch.measure("refine"):
-            mapper.hidden.remove(settings.min_contribution, mapper.near)
-    groups = mapper.paging.groups()
-    ends = np.cumsum([0] + [len(places) for places in groups]) / len(store)  # of the groups' shares
-    while share is not None:
-        group = min(int(np.searchsorted(ends, share, side="right")) - 1, len(groups) - 1)
-        passed = (share - ends[group]) / (ends[group + 1] - ends[group])
-        decayed = max(passed - settings.hold, 0.0) / (1.0 - settings.hold)
-        moves = poses.enabled and (settings.poses or passed < settings.hold)
-        with mapper.stopwatch.measure("refine"):
-            p = global_probabilities(store, views.error_weight, 0.0, groups[group])
-            batch = [int(j) for j in mapper.rng.choice(groups[group], settings.views, p=p)]
-            slower = settings.position_decay**decayed
-            rates = mapper.optimiser.rates(
-                store.scene_depth,
-                position_factor=slower,
-                scale_factor=settings.scale_decay**decayed,
-                other_factor=settings.rate_decay**decayed,
-            )
-            psnr = mapper.optimiser.step(store, batch, rates, poses.learning_rate * slower if moves else 0.0)
-        step += 1
-        if progress is not None:
-            progress(step, psnr)
-        share = schedule(step)
-    with mapper.stopwatch.measure("refine"):
-        mapper.optimiser.settle()
-    mapper.prune()
+            mapper.optimiser.settle()
+        mapper.prune()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fields.frames.camera_revision import CameraRevision
 
@@ -18,6 +19,8 @@ class PoseCorrection:
 
     Frames that are not listed follow the listed frames around them, or keep their poses with `others_stay`. A new
     camera is that of all frames, those after the correction included.
+
+    One frame may be given by its index and pose (4, 4), and numbers in any form that NumPy takes.
 
     Attributes:
         index: Indices (N,) int64 of the frames, increasing.
@@ -32,7 +35,8 @@ class PoseCorrection:
             increasing.
 
     Example:
-        mapper.correct(modp_ti.PoseCorrection(np.array([0, 1]), np.stack([np.eye(4), T_camera_world])))
+        mapper.correct(modp_ti.PoseCorrection(1, T_camera_world))
+        mapper.correct(modp_ti.PoseCorrection([0, 1], [np.eye(4), T_camera_world]))
     """
 
     index: NDArray[np.int64]
@@ -42,7 +46,28 @@ class PoseCorrection:
     camera: CameraRevision | None = None
     others_stay: bool = False
 
+    if TYPE_CHECKING:  # what the generated one takes, before `__post_init__` converts it
+
+        def __init__(
+            self,
+            index: ArrayLike,
+            T_camera_world: ArrayLike,
+            ids: ArrayLike = ...,
+            xyz: ArrayLike = ...,
+            camera: CameraRevision | None = None,
+            others_stay: bool = False,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
+        T, xyz = (np.asarray(array, dtype=np.float64) for array in (self.T_camera_world, self.xyz))
+        arrays = {"T_camera_world": T[None] if T.shape == (4, 4) else T, "xyz": xyz if xyz.size else xyz.reshape(-1, 3)}
+        for name, given in (("index", self.index), ("ids", self.ids)):
+            numbers = np.atleast_1d(given)
+            if numbers.ndim != 1 or (numbers.size and numbers.dtype.kind not in "iu"):
+                raise ValueError(f"{name} of a correction must be integers (N,), not {numbers.shape} {numbers.dtype}")
+            arrays[name] = numbers.astype(np.int64, copy=False)
+        for name, array in arrays.items():
+            object.__setattr__(self, name, array)
         n, m = len(self.index), len(self.ids)
         if n == 0 or self.T_camera_world.shape != (n, 4, 4) or not np.isfinite(self.T_camera_world).all():
             raise ValueError(f"a correction needs finite poses ({n}, 4, 4), not {self.T_camera_world.shape}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -117,6 +118,8 @@ class TrackedFrame:
             raise ValueError(f"{self.name}: mask is {self.mask.shape}, the image {expected}")
         if self.vignette is not None and self.vignette.shape != self.image.shape:
             raise ValueError(f"{self.name}: vignette is {self.vignette.shape}, the image {self.image.shape}")
+        if not math.isfinite(self.timestamp):
+            raise ValueError(f"{self.name}: timestamp is {self.timestamp}, expected seconds")
         if self.T_camera_world.shape != (4, 4) or not np.isfinite(self.T_camera_world).all():
             raise ValueError(f"{self.name}: T_camera_world must be a finite 4x4 matrix")
 
@@ -143,9 +146,9 @@ class TrackedFrame:
             image: Undistorted RGB image (H, W, 3), uint8, or float32 in [0, 1].
             T_camera_world: Pose (4, 4), world to camera, OpenCV axes.
             intrinsics: fx, fy, cx, cy [px]. The centre of the first pixel is at (0.5, 0.5).
-            xyz: Tracked points (N, 3) in the world frame.
+            xyz: Tracked points (N, 3) in the world frame; [] for none.
             pixels: Observations (N, 2) of these points in the image, as (x, y).
-            ids: Integer ids (N,), the same for the same point in every frame. None treats all points as new.
+            ids: Integer ids (N,), each once, the same for the same point in every frame. None treats all points as new.
             timestamp: Time stamp [s]; None for the index.
             name: Name of the frame; None for `frame INDEX`.
             mask: Validity mask (H, W) bool, True at valid pixels; None if all pixels are valid.
@@ -159,7 +162,7 @@ class TrackedFrame:
             ValueError: If a shape or value is wrong. The message is one line and names the frame.
         """
         name = f"frame {index}" if name is None else name
-        timestamp = float(index) if timestamp is None else timestamp
+        timestamp = float(index if timestamp is None else timestamp)
         colours = _colours(name, image)
         T = _pose(name, T_camera_world)
         camera = _camera(name, intrinsics, *colours.shape[:2])
@@ -243,11 +246,16 @@ def _camera(name: str, intrinsics: ArrayLike, height: int, width: int) -> Pinhol
 def _points(name: str, index: int, xyz: ArrayLike, pixels: ArrayLike, ids: ArrayLike | None) -> SparsePoints:
     """The points; ids that no other frame has if `ids` is None."""
     xyz, pixels = (np.array(array, dtype=np.float64) for array in (xyz, pixels))
+    if not (xyz.size or pixels.size):  # also []
+        xyz, pixels, ids = xyz.reshape(-1, 3), pixels.reshape(-1, 2), None
     if xyz.ndim != 2 or xyz.shape[1] != 3 or pixels.shape != (len(xyz), 2):
         raise ValueError(f"{name}: xyz has shape {xyz.shape}, pixels {pixels.shape}, expected (N, 3) and (N, 2)")
     numbers = index * IDS_PER_FRAME + np.arange(len(xyz)) if ids is None else np.asarray(ids)
     if numbers.shape != (len(xyz),) or numbers.dtype.kind not in "iu":
         raise ValueError(f"{name}: ids are {numbers.shape} {numbers.dtype}, expected ({len(xyz)},) integers")
+    found, times = np.unique(numbers, return_counts=True)
+    if len(found) < len(numbers):
+        raise ValueError(f"{name}: id {found[np.argmax(times)]} stands for {times.max()} points; give each once")
     try:
         return SparsePoints(xyz, pixels, numbers.astype(np.int64))
     except ValueError as error:

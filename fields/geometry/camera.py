@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +11,20 @@ from numpy.typing import NDArray
 __all__ = ["PinholeCamera"]
 
 
+def _number(value: float) -> float:
+    """The value as a float; NaN if it is no number."""
+    try:
+        return math.nan if isinstance(value, str) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
 @dataclass(frozen=True)
 class PinholeCamera:
     """Pinhole intrinsics with OpenCV axes. The centre of pixel (row 0, column 0) is at (0.5, 0.5).
 
-    There is no distortion model: sources undistort their images.
+    There is no distortion model: sources undistort their images. Numbers of other types, such as NumPy's or a width of
+    640.0, become plain ones.
 
     Attributes:
         fx: Horizontal focal length [px].
@@ -25,7 +35,7 @@ class PinholeCamera:
         height: Image height [px].
 
     Raises:
-        ValueError: If the size or a focal length is not positive.
+        ValueError: If the size or a focal length is not positive, the size is not whole, or a number is not finite.
 
     Example:
         camera = modp_ti.PinholeCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
@@ -39,10 +49,15 @@ class PinholeCamera:
     height: int
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera size must be positive, got {self.width}x{self.height}")
-        if not (self.fx > 0 and self.fy > 0):
-            raise ValueError(f"focal lengths must be positive, got fx={self.fx}, fy={self.fy}")
+        fx, fy, cx, cy, width, height = (_number(value) for value in vars(self).values())
+        if not (width >= 1 and height >= 1 and width.is_integer() and height.is_integer()):
+            raise ValueError(f"camera size must be positive and whole, got {self.width}x{self.height}")
+        if not (0 < fx < math.inf and 0 < fy < math.inf):
+            raise ValueError(f"focal lengths must be positive numbers, got fx={self.fx}, fy={self.fy}")
+        if not (math.isfinite(cx) and math.isfinite(cy)):
+            raise ValueError(f"the principal point must be finite, got cx={self.cx}, cy={self.cy}")
+        for name, value in zip(vars(self), (fx, fy, cx, cy, int(width), int(height)), strict=True):
+            object.__setattr__(self, name, value)
 
     @property
     def focal(self) -> float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fields.map.gaussian_arrays import read_numbers, read_values, write_integers, write_reals, write_values
 from fields.runtime.backend import growing, on_gpu, place, refuse_too_many_fields
 from fields.runtime.engine import ti
+from fields.runtime.tenancy import in_engine, settled
 
 __all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
 
@@ -20,6 +21,8 @@ NO_ANCHOR = -1
 MOMENTS = ("_m", "_v")  # suffixes of the names of Adam's first and second moments
 
 
+@in_engine("append", "remove", "load", "restore", "extend", "take", "gradients_into", "clear_gradients", "take_caught")
+@in_engine("to_numpy", "anchors", "coverages", "gradients_to_numpy", "history")
 @ti.data_oriented
 class GaussianField:
     """Anisotropic Gaussians in the world frame, with their gradients and Adam moments.
@@ -61,36 +64,37 @@ class GaussianField:
         def vector(n: int, needs_grad: bool = False):
             return ti.Vector.field(n, real, needs_grad=needs_grad)
 
-        self.position, self.position_m, self.position_v = vector(3, True), vector(3), vector(3)
-        self.log_scale, self.log_scale_m, self.log_scale_v = vector(3, True), vector(3), vector(3)
-        self.quaternion, self.quaternion_m, self.quaternion_v = vector(4, True), vector(4), vector(4)
-        self.opacity_logit = ti.field(real, needs_grad=True)
-        self.opacity_logit_m, self.opacity_logit_v = ti.field(real), ti.field(real)
-        self.sh, self.sh_m, self.sh_v = vector(3, True), vector(3), vector(3)
-        self.steps = ti.field(ti.i32)
-        self.anchor = ti.field(ti.i32)
-        self.touched = ti.field(ti.i32)
-        self.coverage = ti.field(ti.f32)
-        self._caught = ti.field(ti.i32)
+        with settled(nodes=1) as self.tenancy:
+            self.position, self.position_m, self.position_v = vector(3, True), vector(3), vector(3)
+            self.log_scale, self.log_scale_m, self.log_scale_v = vector(3, True), vector(3), vector(3)
+            self.quaternion, self.quaternion_m, self.quaternion_v = vector(4, True), vector(4), vector(4)
+            self.opacity_logit = ti.field(real, needs_grad=True)
+            self.opacity_logit_m, self.opacity_logit_v = ti.field(real), ti.field(real)
+            self.sh, self.sh_m, self.sh_v = vector(3, True), vector(3), vector(3)
+            self.steps = ti.field(ti.i32)
+            self.anchor = ti.field(ti.i32)
+            self.touched = ti.field(ti.i32)
+            self.coverage = ti.field(ti.f32)
+            self._caught = ti.field(ti.i32)
 
-        builder = ti.FieldsBuilder()
-        blocks = growing(builder, self.capacity // BLOCK)
-        # One dense child per access pattern, so that culling does not load Adam's moments into the cache.
-        geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
-        place(geometry, blocks, BLOCK)
-        place([f.grad for f in geometry], blocks, BLOCK)
-        moments = [self.position_m, self.position_v, self.log_scale_m, self.log_scale_v]
-        moments += [self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v]
-        place(moments, blocks, BLOCK)
-        for fields in ([self.sh], [self.sh.grad], [self.sh_m, self.sh_v]):
-            place(fields, blocks, BLOCK, self.sh_count)
-        place([self.steps, self.anchor, self.touched, self.coverage], blocks, BLOCK)
-        if not on_gpu():
-            self.slot, self.tangent = ti.field(ti.i32), vector(6, True)
-            place([self.slot, self.tangent, self.tangent.grad], blocks, BLOCK)
-        builder.dense(ti.i, 2).place(self._caught)
-        builder.finalize()
-        refuse_too_many_fields(self._caught)
+            builder = ti.FieldsBuilder()
+            blocks = growing(builder, self.capacity // BLOCK)
+            # One dense child per access pattern, so that culling does not load Adam's moments into the cache.
+            geometry = (self.position, self.log_scale, self.quaternion, self.opacity_logit)
+            place(geometry, blocks, BLOCK)
+            place([f.grad for f in geometry], blocks, BLOCK)
+            moments = [self.position_m, self.position_v, self.log_scale_m, self.log_scale_v]
+            moments += [self.quaternion_m, self.quaternion_v, self.opacity_logit_m, self.opacity_logit_v]
+            place(moments, blocks, BLOCK)
+            for fields in ([self.sh], [self.sh.grad], [self.sh_m, self.sh_v]):
+                place(fields, blocks, BLOCK, self.sh_count)
+            place([self.steps, self.anchor, self.touched, self.coverage], blocks, BLOCK)
+            if not on_gpu():
+                self.slot, self.tangent = ti.field(ti.i32), vector(6, True)
+                place([self.slot, self.tangent, self.tangent.grad], blocks, BLOCK)
+            builder.dense(ti.i, 2).place(self._caught)
+            builder.finalize()
+            refuse_too_many_fields(self._caught)
 
     def __len__(self) -> int:
         return self.count

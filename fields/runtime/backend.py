@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from fields.runtime.device_check import computes_rightly
-from fields.runtime.engine import configuration, engine, forget_arrays, running_program, ti
+from fields.runtime.engine import configuration, engine, forget_arrays, lock, running_program, start, ti
 from fields.runtime.kernel_sources import answer_quickly
 from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
 from fields.runtime.workers import pin_workers, threads_of_process
@@ -27,7 +27,11 @@ __all__ = [
     "place",
     "program",
     "refuse_too_many_fields",
+    "restart",
+    "running_backend",
     "sparse",
+    "sparse_nodes",
+    "too_many",
     "torch_device",
     "without_waiting",
 ]
@@ -40,6 +44,7 @@ MAX_SPARSE = engine().max_sparse
 # fields and PyTorch use the remaining memory.
 SPARSE_POOL = 1.0
 _sparse: list[ti.SNode] = []  # the sparse SNodes since the engine was started
+_started: tuple[str, int | None, int] = "cpu", None, 0  # arguments of the last `initialise`
 
 
 def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -> str:
@@ -48,6 +53,8 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
     Kernels are stored in the engine's offline cache, so that only the first process on a machine compiles them. PyTorch
     is limited to one thread: its problems here are small, and its waiting threads take the cores from the engine's (a
     depth estimate took 1.9 s instead of 0.05 s).
+
+    Maps, renderers and voxels made before cannot be used any more: they raise RuntimeError.
 
     Args:
         device: "cpu", "cuda", "vulkan", "metal", or "auto" for the first that is available of CUDA, a GPU through Metal
@@ -66,6 +73,19 @@ def initialise(device: str = "cpu", threads: int | None = None, seed: int = 0) -
     Example:
         backend = modp_ti.initialise("auto", seed=1)
     """
+    global _started
+    with lock:
+        backend = _initialise(device, threads, seed)
+        _started = device, threads, seed
+        return backend
+
+
+def restart() -> None:
+    """Start the engine as it was started before, which frees all fields."""
+    initialise(*_started)
+
+
+def _initialise(device: str, threads: int | None, seed: int) -> str:
     options = {"offline_cache": True, "log_level": ti.ERROR, "random_seed": seed, "default_fp": ti.f32}
     torch.set_num_threads(1)
     if threads is not None:
@@ -137,7 +157,7 @@ def _start(arch: object, options: dict) -> None:
     _sparse.clear()
     forget_arrays()
     with contextlib.redirect_stdout(io.StringIO()):
-        ti.init(arch=arch, **options)
+        start(arch, arch == ti.cpu, **options)
 
 
 def describe(backend: str) -> str:
@@ -170,6 +190,20 @@ def program() -> object:
             f'{engine().title} does not run yet: call modp_ti.initialise("cpu") (or "cuda", "auto") first'
         )
     return running
+
+
+def running_backend() -> str | None:
+    """Return the name of the backend in use as `initialise` does; None before it has been called."""
+    return (
+        None
+        if running_program() is None
+        else {ti.cuda: "cuda", ti.vulkan: "vulkan", ti.metal: "metal"}.get(configuration().arch, "cpu")
+    )
+
+
+def sparse_nodes() -> int:
+    """Return the number of sparse SNodes that were made since the engine was started."""
+    return len(_sparse)
 
 
 def on_gpu() -> bool:
@@ -225,7 +259,7 @@ def sparse(parent: ti.FieldsBuilder | ti.SNode, axes: list, shape: Sequence[int]
         RuntimeError: If there are more than the engine supports in a process.
     """
     if not on_gpu() and MAX_SPARSE is not None and len(_sparse) >= MAX_SPARSE:
-        raise _too_many()
+        raise too_many()
     _sparse.append(parent.pointer(axes, shape))
     return _sparse[-1]
 
@@ -259,11 +293,12 @@ def refuse_too_many_fields(last_placed: ti.ScalarField | ti.MatrixField) -> None
         RuntimeError: If there are more SNodes than the engine supports in a process.
     """
     if MAX_SNODES is not None and last_placed.snode.ptr.id >= MAX_SNODES:
-        raise _too_many()
+        raise too_many()
 
 
-def _too_many() -> RuntimeError:
+def too_many() -> RuntimeError:
+    """Return the error for a map, renderer or voxels for which there is no room."""
     return RuntimeError(
-        f"more maps and renderers than one {engine().title} process holds; call initialise() before making "
-        "another, which frees those made so far"
+        f"more maps and renderers than one {engine().title} process holds; close one, or call initialise() before "
+        "making another, which frees those made so far"
     )

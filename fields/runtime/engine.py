@@ -13,8 +13,10 @@ import atexit
 import functools
 import importlib
 import os
+import threading
 import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -35,9 +37,12 @@ __all__ = [
     "engine",
     "error_class",
     "forget_arrays",
+    "forget_unfinished",
+    "lock",
     "owner_of_kernel",
     "part",
     "running_program",
+    "start",
     "ti",
 ]
 
@@ -214,6 +219,7 @@ def _load() -> ModuleType:
         atexit.register(module.reset)
     if chosen.slow_attributes:
         vars(module)["data_oriented"] = _data_oriented
+    module.FieldsBuilder._finalize = _finalised_at_home(module.FieldsBuilder._finalize)
     return module
 
 
@@ -251,6 +257,55 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()["ti"] = module = _load()
     return module
+
+
+# ---- threads ---------------------------------------------------------------------------------------------------
+
+# Kernels can be launched from any thread, but only one after the other.
+lock = threading.RLock()
+# LLVM lets only the thread that has started the engine add fields: one of its own, or that which has called `start`.
+_home: ThreadPoolExecutor | None = None
+_starter: threading.Thread | None = None
+
+
+def start(arch: object, in_own_thread: bool, **options: Any) -> None:
+    """Start the engine, which frees all fields.
+
+    Args:
+        arch: The backend, for example `ti.cpu`.
+        in_own_thread: Let any thread make fields, not only the calling one.
+        options: Options of `ti.init`.
+    """
+    global _home, _starter
+    if _home is not None:
+        _home.shutdown(wait=False)
+    # Always a new one: in a forked process, the old thread does not exist.
+    _home, _starter = (ThreadPoolExecutor(1, "engine"), None) if in_own_thread else (None, threading.current_thread())
+    if _home is None:
+        ti.init(arch=arch, **options)
+    else:
+        _home.submit(ti.init, arch=arch, **options).result()
+
+
+def _finalised_at_home(finalise: Callable[..., Any]) -> Callable[..., Any]:
+    """Make the method of a fields builder that adds its fields to the engine run in the right thread."""
+
+    def finalised(*arguments: Any, **named: Any) -> Any:
+        if _home is not None:
+            return _home.submit(finalise, *arguments, **named).result()
+        if configuration().arch == ti.cuda and _starter is not threading.current_thread():
+            raise RuntimeError("on CUDA, make maps and renderers in the thread that called modp_ti.initialise()")
+        return finalise(*arguments, **named)
+
+    return finalised
+
+
+def forget_unfinished() -> None:
+    """Let go of the fields that were declared and not added to the engine, which would refuse any kernel."""
+    runtime = part("lang.impl").get_runtime()
+    runtime.unfinalized_fields_builder.clear()
+    for fields in (runtime.global_vars, runtime.grad_vars, runtime.dual_vars, runtime.matrix_fields):
+        fields.clear()
 
 
 # ---- arrays ----------------------------------------------------------------------------------------------------

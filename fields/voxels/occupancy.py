@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fields.runtime.backend import has_sparse_fields, program
+from fields.runtime.backend import has_sparse_fields
+from fields.runtime.tenancy import Tenant, in_engine, settled
 from fields.voxels.bricks import BRICK_BYTES, BRICK_LEVELS, BRICKS, SIDE, WORDS, Bricks, corner_of, places_of_marks
 from fields.voxels.hashed_bricks import HashedBricks
 from fields.voxels.resting_bricks import RESTING_BYTES, RestingBricks
@@ -18,7 +19,8 @@ MAX_LEVELS = 15
 FARTHEST = 2.0**31 - 1.0
 
 
-class OccupancyVoxels:
+@in_engine("clear", "rest", "marks", "restore", "query", "update", "bytes_to_mark", "admit")
+class OccupancyVoxels(Tenant):
     """Multi-level occupancy voxels: mark where the map already holds Gaussians, at several cell sizes.
 
     Level l has cells of size `coarsest / 2^l`. A position belongs to the cell floor(offset / cell size), where offset
@@ -61,12 +63,12 @@ class OccupancyVoxels:
                 f"voxels need 1 to {MAX_LEVELS} levels and resolution * 2^(levels - 1) <= {SIDE}; "
                 f"got {levels=}, {resolution=}"
             )
-        program()
         self.levels = levels
         self.resolution = resolution
         self.settle(coarsest, origin)
-        self._bricks: Bricks = SparseBricks(levels) if has_sparse_fields() else HashedBricks(levels)
-        self._resting = RestingBricks(self._bricks)
+        with settled(nodes=SparseBricks.NODES if has_sparse_fields() else 0) as self.tenancy:
+            self._bricks: Bricks = SparseBricks(levels) if has_sparse_fields() else HashedBricks(levels)
+            self._resting = RestingBricks(self._bricks)
 
     def settle(self, coarsest: float, origin: ArrayLike) -> None:
         """Set the size of the coarsest cell and the centre of the covered volume. No cell may be marked yet.

@@ -47,6 +47,8 @@ class SparseBricks(Bricks):
         levels: Number of levels.
     """
 
+    NODES = len(POINTERS)
+
     def __init__(self, levels: int) -> None:
         super().__init__(levels)
         self.words = ti.field(ti.u64)

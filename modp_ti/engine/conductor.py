@@ -85,8 +85,8 @@ class Conductor:
             yield event
 
     def add(self, mapper: Mapper, frame: TrackedFrame) -> FrameReport | None:
-        """Map a frame, as `Mapper.add` does."""
-        return mapper.add(frame)
+        """Map a frame, as `Mapper.take` does."""
+        return mapper.take(frame)
 
     def correct(self, mapper: Mapper, correction: PoseCorrection) -> None:
         """Apply a correction."""

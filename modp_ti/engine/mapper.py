@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -14,7 +15,7 @@ from fields.frames.origin import far_origin, shifted, shifted_poses
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from fields.runtime.backend import program
+from fields.runtime.tenancy import Tenant, in_engine
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
 from modp_ti.inputs.delivered_frames import DeliveredFrames
@@ -39,11 +40,15 @@ from pipelines.transients.changes import EarlierVisit
 __all__ = ["Mapper"]
 
 
-class Mapper:
+@in_engine(
+    "add", "take", "optimise_further", "correct", "finish", "refine", "restore", "go_on_with", "watch_changes", "merge"
+)
+@in_engine("trajectory", "render", "version", "save")
+class Mapper(Tenant):
     """Maps frames of up to `width` x `height` pixels as they arrive.
 
-    `initialise` must be called first. A process has room for one map of a room's size; call `initialise` again to free
-    it before making another.
+    `initialise` must be called first. A process has room for one map; close it before making another, for example by
+    using it as a context manager. Any thread may call it; a call waits until the one before it has ended.
 
     Args:
         width: Largest image width [px].
@@ -60,7 +65,8 @@ class Mapper:
         finished: Whether `finish` has run since the last frame was added.
 
     Raises:
-        RuntimeError: If `initialise` has not been called, or Taichi holds another map already.
+        RuntimeError: If `initialise` has not been called, or the process holds another map. Every method raises it
+            once the map is gone, after `close` or another `initialise`.
 
     Example:
         modp_ti.initialise("cpu")
@@ -79,17 +85,17 @@ class Mapper:
         pace: Pace | None = None,
         folder: Path | None = None,
     ) -> None:
-        program()
         self.pipeline: Pipeline
         if isinstance(settings, OfflineSettings):
             self.pipeline = OfflineMapper(settings, width, height, seed)
         else:
             self.pipeline = OnlineMapper(settings or MappingSettings(), width, height, seed, pace=pace, folder=folder)
+        self.tenancy = self.pipeline.tenancy
         self.frames = DeliveredFrames(trajectory=self.pipeline.trajectory)
         self.finished = True
 
     def add(self, frame: TrackedFrame) -> FrameReport | None:
-        """Process the next frame. Frames must come in increasing order of their indices.
+        """Process the next frame. Frames must come in increasing order of their indices, and no time may fall.
 
         Returns:
             What the frame did to the map, or None if it is held out and hence does not change the map.
@@ -98,6 +104,13 @@ class Mapper:
             ValueError: If the frame is out of order or larger than the mapper's images.
             BlockError: If a part of the map that lies on disk is damaged. The map is left without it.
         """
+        if self.frames.index and frame.index > self.frames.index[-1] and frame.timestamp < self.frames.timestamp[-1]:
+            before = self.frames.timestamp[-1]
+            raise ValueError(f"{frame.name} has the time {frame.timestamp} s, the frame before it {before} s")
+        return self.take(frame)
+
+    def take(self, frame: TrackedFrame) -> FrameReport | None:
+        """Process the next frame as `add` does, whatever its time: those of joined recordings may fall."""
         size, images = frame.camera, self.pipeline.renderer.images
         if not self.takes(size.width, size.height):
             raise ValueError(
@@ -139,11 +152,10 @@ class Mapper:
         Raises:
             InputError: If the correction refers to a frame that has not been added yet.
         """
-        if correction.index[-1] > self.frames.index[-1]:
-            raise InputError(
-                f"the tracker corrects frame {correction.index[-1]} after frame {self.frames.index[-1]}, "
-                "before it has come"
-            )
+        last = self.frames.index[-1] if self.frames.index else None
+        if last is None or correction.index[-1] > last:
+            after = "" if last is None else f" after frame {last},"
+            raise InputError(f"the tracker corrects frame {correction.index[-1]}{after} before it has come")
         correction = shifted(correction, -self.frames.from_origin)
         report = self.pipeline.correct(correction, more)
         self.frames.correct(correction, report.around, report.moved)
@@ -178,15 +190,18 @@ class Mapper:
         """Call `finish`, then optimise the map on all keyframes equally. More frames may follow.
 
         Args:
-            steps: Number of refinement steps. It replaces `settings.steps` and `settings.seconds`.
+            steps: Number of refinement steps, 0 or more. It replaces `settings.steps` and `settings.seconds`.
             settings: The other settings of the refinement, None for the defaults.
             progress: Callback, see `pipelines.refinement.refine`.
             done: Steps that were done before, see `pipelines.refinement.refine`.
             schedule: When the refinement ends instead of after `steps`, see `pipelines.refinement.refine`.
 
         Raises:
+            TypeError, ValueError: If `steps` is no such number.
             ValueError: If the map is an offline one, whose optimisation already covers all frames.
         """
+        if operator.index(steps) < 0:
+            raise ValueError(f"a refinement has 0 steps or more, not {steps}")
         if not self.pipeline.can_be_refined:
             raise ValueError("an offline map is not refined: give its settings more steps")
         self.finish()

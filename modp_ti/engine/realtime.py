@@ -131,7 +131,7 @@ class RealtimeRun(Conductor):
         decisions = len(self.pace.decisions)
         self.pace.begin_frame(arrived, began)
         before = dict(mapper.pipeline.stopwatch.seconds)
-        report = mapper.add(frame)
+        report = mapper.take(frame)
         after = mapper.pipeline.stopwatch.seconds
         self._done = self._clock()
         depth, optimise = (after.get(stage, 0.0) - before.get(stage, 0.0) for stage in ("depth", "optimise"))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
+from fields.runtime.tenancy import in_engine
 from pipelines.optimise.exposure import MIN_OPACITY, MIN_PIXELS, fitted_gains
 from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.optimise.pose_refinement import PoseRefinement
@@ -23,6 +24,7 @@ SSIM_WEIGHT = 0.2
 REFIT = 10
 
 
+@in_engine("refine")
 class ViewAlignment:
     """Refines the pose of a view so that the render of a fixed map resembles its image.
 
@@ -36,6 +38,7 @@ class ViewAlignment:
 
     def __init__(self, renderer: Renderer, near: float) -> None:
         self.renderer = renderer
+        self.tenancy = renderer.tenancy
         self.near = near
         self.loss = photometric_loss(renderer.images)
 

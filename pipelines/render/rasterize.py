@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,8 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import hat, orthonormalised
 from fields.map.gaussians import SH_C0, GaussianField
 from fields.runtime.backend import on_gpu, program, torch_device
-from fields.runtime.engine import engine, ti
+from fields.runtime.engine import engine, lock, ti
+from fields.runtime.tenancy import empty, settled
 from pipelines.render.renderer import Renderer
 
 __all__ = ["RasterizedView", "rasterize"]
@@ -26,6 +28,8 @@ GPU_POOL = 1_500_000
 MAX_KEPT = engine().max_rasterizers
 # Largest deviation of a pose's entries from a rigid motion. This tolerates rounding and drift, but no scale or shear.
 MAX_DRIFT = 1e-3
+# Logarithm of the largest standard deviation in the image [px]: numbers of wider Gaussians leave the range of float32.
+MAX_SPAN = math.log(1e8)
 
 
 class RasterizedView(NamedTuple):
@@ -57,7 +61,7 @@ def rasterize(
     camera: PinholeCamera,
     colour: Tensor | None = None,
     background: Tensor | None = None,
-    near: float = 0.01,
+    near: float | Tensor = 0.01,
 ) -> RasterizedView:
     """Render N Gaussians, differentiably with respect to every tensor. Call `initialise` first.
 
@@ -69,8 +73,10 @@ def rasterize(
     being rigid. A plain gradient step on T itself leaves SE(3) to second order.
 
     The function keeps its fields between calls, one set for each type, number of harmonics, and doubling of the largest
-    image size. There is room for two sets, so start with the largest image. `backward` renders again if another image
-    has been rendered in between. It is not differentiable itself. On CUDA, everything runs on the default stream.
+    image size. There is room for two sets with Taichi; another takes their place if no map is in use, which takes
+    seconds, so start with the largest image. `backward` renders again if another image has been rendered in between. It
+    is not differentiable itself. Calls from several threads wait for one another. On CUDA, everything runs on the
+    default stream.
 
     Args:
         position: Means (N, 3) in the world frame.
@@ -82,7 +88,7 @@ def rasterize(
         camera: Intrinsics and image size.
         colour: View-independent colours (N, 3), instead of `sh`. Values below 0 are drawn as 0.
         background: Colour (3,) where no Gaussian is drawn; None for black.
-        near: Depth below which nothing is drawn [scene units].
+        near: Depth below which nothing is drawn [scene units], above 0.
 
     Returns:
         Image, depth and opacity.
@@ -100,8 +106,12 @@ def rasterize(
     program()
     geometry = {"position": position, "log_scale": log_scale, "quaternion": quaternion, "opacity_logit": opacity_logit}
     _check(geometry, sh, colour, T_camera_world, background)
+    near = float(near)
+    if not 0.0 < near < math.inf:
+        raise ValueError(f"near is {near}, expected a positive depth")
+    _refuse_boundless(position.detach(), log_scale.detach(), T_camera_world.detach(), camera, near)
     coefficients = sh if colour is None else ((colour - 0.5) / SH_C0)[:, None]
-    image, depth, opacity = _Rasterize.apply(*geometry.values(), coefficients, T_camera_world, camera, float(near))
+    image, depth, opacity = _Rasterize.apply(*geometry.values(), coefficients, T_camera_world, camera, near)
     if background is not None:
         image = image + (1.0 - opacity)[..., None] * background
     return RasterizedView(image, depth, opacity)
@@ -156,6 +166,22 @@ def _check(
         raise ValueError(f"quaternion of Gaussian {int(zero.nonzero()[0, 0])} is zero")
 
 
+def _refuse_boundless(position: Tensor, log_scale: Tensor, T: Tensor, camera: PinholeCamera, near: float) -> None:
+    """Raise ValueError for a Gaussian whose standard deviation in the image exceeds `MAX_SPAN`."""
+    if len(log_scale) == 0:
+        return
+    widest, focal = log_scale.amax(dim=1), math.log(max(camera.fx, camera.fy))
+    if float(widest.max()) + focal - math.log(near) <= MAX_SPAN:  # nearly always
+        return
+    depth = position @ T[2, :3].to(position) + float(T[2, 3])
+    bad = (depth > near) & (widest + focal - depth.clamp(min=near).log() > MAX_SPAN)
+    if bad.any():
+        at = int(bad.nonzero()[0, 0])
+        raise ValueError(
+            f"log_scale of Gaussian {at} is {float(widest[at]):.3g}, which is more than 1e8 px wide in this view"
+        )
+
+
 def _kind(tensor: Tensor) -> str:
     return str(tensor.dtype).removeprefix("torch.")
 
@@ -177,14 +203,14 @@ class _Rasterizer:
     """The fields for one type, SH degree and maximum image size.
 
     Attributes:
-        owner: The engine's program that owns the fields.
+        tenancy: Whether the fields are still there.
         drawn: Number of images rendered so far. Only the last one is stored.
     """
 
     def __init__(self, degree: int, kind: torch.dtype, width: int, height: int) -> None:
-        self.owner = program()
-        self.gaussians = GaussianField(degree, GPU_POOL if on_gpu() else engine().max_gaussians, REAL[kind])
-        self.renderer = Renderer(self.gaussians, width, height)
+        with settled(nodes=4, kept=False) as self.tenancy:
+            self.gaussians = GaussianField(degree, GPU_POOL if on_gpu() else engine().max_gaussians, REAL[kind])
+            self.renderer = Renderer(self.gaussians, width, height)
         self.kind, self.width, self.height = kind, width, height
         self.drawn = 0
 
@@ -203,17 +229,15 @@ _rasterizers: list[_Rasterizer] = []
 
 def _rasterizer(kind: torch.dtype, sh_count: int, camera: PinholeCamera) -> _Rasterizer:
     """Return an existing rasterizer that fits, or a new one with the size rounded up as `ImageBuffers` does."""
-    if any(rasterizer.owner is not program() for rasterizer in _rasterizers):
+    if not all(rasterizer.tenancy.is_open for rasterizer in _rasterizers):
         _rasterizers.clear()
     degree = int(np.sqrt(sh_count)) - 1
     for found in _rasterizers:
         if found.fits(degree, kind, camera):
             return found
     if len(_rasterizers) == MAX_KEPT:
-        raise RuntimeError(
-            f"rasterize keeps fields for {MAX_KEPT} types, SH degrees or doublings of the image size, and this is "
-            "another: begin with the largest image, or call modp_ti.initialise(), which frees all fields"
-        )
+        empty()
+        _rasterizers.clear()
     width, height = max(64, 1 << (camera.width - 1).bit_length()), -(-camera.height // 256) * 256
     _rasterizers.append(_Rasterizer(degree, kind, width, height))
     return _rasterizers[-1]
@@ -228,12 +252,13 @@ class _Rasterize(torch.autograd.Function):
         ctx.camera, ctx.near, ctx.pose = camera, near, _rigid(inputs[5])
         ctx.save_for_backward(*inputs)
         ctx.set_materialize_grads(False)
-        rasterizer = _draw(ctx, inputs)
-        ctx.rasterizer, ctx.drawn = rasterizer, rasterizer.drawn
         size = camera.height, camera.width
         like = {"dtype": inputs[0].dtype, "device": inputs[0].device}
         outputs = torch.empty(*size, 3, **like), torch.empty(size, **like), torch.empty(size, **like)
-        rasterizer.renderer.images.read_into(*outputs)
+        with lock:
+            ctx.rasterizer = rasterizer = _draw(ctx, inputs)
+            ctx.drawn = rasterizer.drawn
+            rasterizer.renderer.images.read_into(*outputs)
         return outputs
 
     @staticmethod
@@ -242,10 +267,6 @@ class _Rasterize(torch.autograd.Function):
         ctx, *gradients: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
-        rasterizer = ctx.rasterizer
-        # Another image may have been rendered since, or Taichi restarted.
-        if rasterizer.owner is not program() or rasterizer.drawn != ctx.drawn:
-            rasterizer = _draw(ctx, inputs)
         with_depth = gradients[1] is not None
         size, like = (ctx.camera.height, ctx.camera.width), inputs[0]
         shapes = (*size, 3), size, size
@@ -253,13 +274,18 @@ class _Rasterize(torch.autograd.Function):
             like.new_zeros(shape) if gradient is None else gradient.to(like.dtype).contiguous()
             for shape, gradient in zip(shapes, gradients, strict=True)
         ]
-        renderer, gaussians = rasterizer.renderer, rasterizer.gaussians
-        gaussians.clear_gradients()
-        renderer.images.set_gradients(*filled)
-        renderer.backward(with_depth)
         outputs = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs[:5]]
-        gaussians.gradients_into(outputs)
-        return *outputs, _pose_gradient(renderer.camera_gradient(), ctx.pose, inputs[5]), None, None
+        with lock:
+            rasterizer = ctx.rasterizer
+            # Another image may have been rendered since, or Taichi restarted.
+            if not rasterizer.tenancy.is_open or rasterizer.drawn != ctx.drawn:
+                rasterizer = _draw(ctx, inputs)
+            renderer, gaussians = rasterizer.renderer, rasterizer.gaussians
+            gaussians.clear_gradients()
+            renderer.images.set_gradients(*filled)
+            renderer.backward(with_depth)
+            gaussians.gradients_into(outputs)
+            return *outputs, _pose_gradient(renderer.camera_gradient(), ctx.pose, inputs[5]), None, None
 
 
 def _draw(ctx, inputs: list[Tensor]) -> _Rasterizer:

@@ -16,6 +16,7 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import on_gpu, refuse_too_many_fields
 from fields.runtime.engine import ti
+from fields.runtime.tenancy import in_engine, settled
 from pipelines.render.cpu.binning import CHUNKS, Binning
 from pipelines.render.cpu.compositing import Compositing
 from pipelines.render.cpu.photometric_model import PhotometricModel
@@ -64,6 +65,7 @@ class RenderedView:
         return np.where(self.opacity >= min_opacity, self.depth / np.maximum(self.opacity, 1e-6), 0.0)
 
 
+@in_engine("forward", "develop", "backward", "camera_gradient", "exposure_gradient", "render", "rendered")
 class Renderer:
     """Differentiable renderer of one `GaussianField`, for images of any size up to a maximum.
 
@@ -89,30 +91,33 @@ class Renderer:
     def __init__(self, gaussians: GaussianField, max_width: int, max_height: int, image_cache_gb: float = 2.0) -> None:
         real = gaussians.real
         self.gaussians = gaussians
-        # One SNode tree for everything that compositing reads and writes. With two, Taichi fetches the trees' roots at
-        # every pixel, and LLVM cannot vectorise the inner loop (measured: six times slower).
-        builder = ti.FieldsBuilder()
-        self.view = ViewField(builder, real)
-        self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
-        self.images = ImageBuffers(builder, max_width, max_height, real, image_cache_gb)
-        self.projection: Projection
-        self.binning: BinningStage
-        self.compositing: CompositingStage
-        self.photometric_model: PhotometricModel
-        if on_gpu():
-            self.pairs = pairs = DevicePairs(builder, max_width, max_height)
-            self.projection = DeviceProjection(gaussians, self.view, self.projected)
-            self.binning = DeviceBinning(self.view, self.projected, pairs)
-            self.compositing = DeviceCompositing(self.view, self.projected, pairs, self.images)
-            self.photometric_model = DevicePhotometricModel(self.images)
-        else:
-            self.pairs = pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
-            self.projection = Projection(gaussians, self.view, self.projected)
-            self.binning = Binning(self.view, self.projected, pairs)
-            self.compositing = Compositing(self.view, self.projected, pairs, self.images)
-            self.photometric_model = PhotometricModel(self.images)
-        builder.finalize()
-        refuse_too_many_fields(self.pairs.last_placed)
+        largest = PinholeCamera(1.0, 1.0, 0.0, 0.0, max_width, max_height)  # refuses a size that is not whole
+        max_width, max_height = largest.width, largest.height
+        with settled(nodes=3) as self.tenancy:
+            # One SNode tree for everything that compositing reads and writes. With two, Taichi fetches the trees' roots
+            # at every pixel, and LLVM cannot vectorise the inner loop (measured: six times slower).
+            builder = ti.FieldsBuilder()
+            self.view = ViewField(builder, real)
+            self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
+            self.images = ImageBuffers(builder, max_width, max_height, real, image_cache_gb)
+            self.projection: Projection
+            self.binning: BinningStage
+            self.compositing: CompositingStage
+            self.photometric_model: PhotometricModel
+            if on_gpu():
+                self.pairs = pairs = DevicePairs(builder, max_width, max_height)
+                self.projection = DeviceProjection(gaussians, self.view, self.projected)
+                self.binning = DeviceBinning(self.view, self.projected, pairs)
+                self.compositing = DeviceCompositing(self.view, self.projected, pairs, self.images)
+                self.photometric_model = DevicePhotometricModel(self.images)
+            else:
+                self.pairs = pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
+                self.projection = Projection(gaussians, self.view, self.projected)
+                self.binning = Binning(self.view, self.projected, pairs)
+                self.compositing = Compositing(self.view, self.projected, pairs, self.images)
+                self.photometric_model = PhotometricModel(self.images)
+            builder.finalize()
+            refuse_too_many_fields(self.pairs.last_placed)
         self.view_renders = 0
 
     def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float, exact: bool = True) -> None:

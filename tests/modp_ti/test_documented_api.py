@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from modp_ti.outputs.formats.splats_ply import read_splats
+from tests.patience import PATIENCE
 from tests.pipelines.wall import frame
 
 pytestmark = pytest.mark.slow
@@ -66,3 +69,27 @@ def test_the_voxels_thin_the_points(ran: dict[str, dict]) -> None:
     cells = np.floor(names["kept"] / 0.25)
     assert len(np.unique(cells, axis=0)) == len(cells) == len(np.unique(np.floor(names["points"] / 0.25), axis=0))
     assert names["finer"].sum() < len(names["kept"]) + 500
+
+
+TRACKER = """
+from collections.abc import Iterator
+import numpy as np
+from numpy.typing import NDArray
+Arrays = tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+def my_tracker() -> Iterator[Arrays]: ...
+"""
+
+
+def test_every_block_passes_a_type_checker(tmp_path: Path) -> None:
+    pytest.importorskip("basedpyright")
+    for number, (_, code) in enumerate(BLOCKS):
+        (tmp_path / f"block_{number}.py").write_text(TRACKER + code)
+    checked = subprocess.run(
+        [sys.executable, "-m", "basedpyright", "--level", "error", "--pythonpath", sys.executable, str(tmp_path)],
+        cwd=PAGE.parents[1],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert checked.returncode == 0, checked.stdout

@@ -14,6 +14,7 @@ from rich.console import Console
 from fields.frames.origin import shifted_poses
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from fields.runtime.tenancy import Tenant
 from modp_ti.config.settings import IntrinsicsSettings
 from modp_ti.outputs.locating.map_views import MapViews, map_depth
 from modp_ti.outputs.locating.picture import camera_of, read_picture
@@ -59,7 +60,7 @@ class Location:
     note: str = ""
 
 
-class Locator:
+class Locator(Tenant):
     """Locates pictures in the map of a finished run.
 
     The map is rendered from its keyframes. Features of a picture are matched with those of the renders that resemble
@@ -67,7 +68,7 @@ class Locator:
     pose, first by features and then photometrically. A pose is accepted only if the picture and the render from it
     have features in common at the same places, and look alike.
 
-    This starts the device, as `initialise` does.
+    This starts the device, as `initialise` does, unless a map is in use in this process: then the two share it.
 
     Args:
         output: Output folder of a run. Only the map and its poses are read, not the images.
@@ -75,7 +76,8 @@ class Locator:
         console: Receives the progress, None for no output.
 
     Raises:
-        InputError: If the folder holds no finished run.
+        InputError: If the folder holds no finished run, or a map is in use on another device.
+        RuntimeError: If there is no room next to the maps in use. Methods raise it once `initialise` is called again.
 
     Example:
         locator = modp_ti.Locator("out/room")
@@ -95,6 +97,7 @@ class Locator:
         cameras = [run.cameras[index] for index in shown]
         self._side = max(max(camera.width, camera.height) for camera in cameras)
         self._renderer = renderer = MapRenderer(gaussians, self._side, self._side, run.record.near)
+        self.tenancy = renderer.tenancy
         shots = list(zip(cameras, run.poses[shown], strict=True))
         views = MapViews(renderer, line.through("rendering the map", shots, len(shots)))
         self._search = Search(renderer, views)

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
-from fields.runtime.backend import initialise, on_gpu
+from fields.runtime.backend import on_gpu
 from fields.runtime.engine import engine
+from fields.runtime.tenancy import ensure_started, in_engine, settled
 from modp_ti.files.errors import InputError
 from pipelines.blocks.shown_map import ShownMap
 from pipelines.render.renderer import RenderedView, Renderer
@@ -25,7 +26,7 @@ POOL = 1_500_000
 
 
 def start_device(device: str) -> str:
-    """Start Taichi.
+    """Start Taichi, unless maps are in use in this process: then they share it.
 
     Args:
         device: "cpu", "cuda", "vulkan", "metal" or "auto".
@@ -34,14 +35,15 @@ def start_device(device: str) -> str:
         The backend in use.
 
     Raises:
-        InputError: If Taichi does not start.
+        InputError: If Taichi does not start, or is in use on another device.
     """
     try:
-        return initialise(device)
+        return ensure_started(device)
     except RuntimeError as error:
         raise InputError(str(error)) from None
 
 
+@in_engine("view")
 class MapRenderer:
     """Renders a saved map. Taichi must have been started.
 
@@ -64,14 +66,15 @@ class MapRenderer:
             )
         count, coefficients = gaussians["sh"].shape[:2]
         pool = min(max(count, 1) if on_gpu() else max(count, POOL), engine().max_gaussians)
-        field = GaussianField(round(coefficients**0.5) - 1, pool)
-        self._shown = ShownMap(field, gaussians)
-        try:
-            if self._shown.fits:
-                field.load(dict(gaussians))
-        except ValueError as error:
-            raise InputError(f"the map cannot be rendered: {error}") from None
-        self.renderer = Renderer(field, width, height)
+        with settled(nodes=4) as self.tenancy:
+            field = GaussianField(round(coefficients**0.5) - 1, pool)
+            self._shown = ShownMap(field, gaussians)
+            try:
+                if self._shown.fits:
+                    field.load(dict(gaussians))
+            except ValueError as error:
+                raise InputError(f"the map cannot be rendered: {error}") from None
+            self.renderer = Renderer(field, width, height)
         self.near = near
 
     @property

@@ -29,6 +29,8 @@ def frame(**changes: object) -> TrackedFrame:
         ({"mask": np.ones((6, 7), dtype=bool)}, "mask is"),
         ({"T_camera_world": np.full((4, 4), np.nan)}, "finite 4x4"),
         ({"T_camera_world": np.eye(3)}, "finite 4x4"),
+        ({"timestamp": float("nan")}, r"a\.png: timestamp is nan"),
+        ({"timestamp": float("inf")}, r"a\.png: timestamp is inf"),
     ],
 )
 def test_frames_that_do_not_fit_together_are_refused(changes: dict[str, object], complaint: str) -> None:
@@ -114,3 +116,21 @@ def test_arrays_that_do_not_fit_are_told_in_one_line(
     with pytest.raises(error, match=complaint) as told:
         TrackedFrame.from_arrays(**(ARRAYS | changes))
     assert str(told.value).startswith("frame 3: ") and "\n" not in str(told.value)
+
+
+IMAGE = np.zeros((6, 8, 3), dtype=np.uint8)
+
+
+def test_a_frame_may_have_no_points() -> None:
+    for nothing in ([], np.zeros((0, 3)), ()):
+        for ids in (None, []):
+            given = TrackedFrame.from_arrays(0, IMAGE, np.eye(4), (10.0, 10.0, 4.0, 3.0), nothing, [], ids)
+            assert given.points.xyz.shape == (0, 3) and given.points.pixels.shape == (0, 2) and len(given.points) == 0
+    with pytest.raises(ValueError, match=r"^frame 0: xyz"):
+        TrackedFrame.from_arrays(0, IMAGE, np.eye(4), (10.0, 10.0, 4.0, 3.0), [], [[1.0, 1.0]])
+
+
+def test_an_id_that_stands_twice_is_named() -> None:
+    xyz, pixels = [[0.0, 0.0, 2.0]] * 3, [[1.0, 1.0]] * 3
+    with pytest.raises(ValueError, match=r"^frame 3: id 7 [^\n]*$"):
+        TrackedFrame.from_arrays(3, IMAGE, np.eye(4), (10.0, 10.0, 4.0, 3.0), xyz, pixels, [7, 2, 7])

@@ -33,8 +33,26 @@ def test_the_image_ends_before_its_width() -> None:
     assert CAMERA.contains(pixels).tolist() == [True, True, False, False, False]
 
 
-@pytest.mark.parametrize("wrong", [{"width": 0}, {"fx": 0.0}, {"fy": -1.0}, {"fx": float("nan")}])
-def test_impossible_cameras_are_refused(wrong: dict[str, float]) -> None:
-    values = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "width": 4, "height": 4} | wrong
-    with pytest.raises(ValueError, match="must be positive"):
-        PinholeCamera(**values)
+VALUES = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "width": 4, "height": 4}
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize("value", [0, -3.0, 4.5, NAN, INF, "4", None])
+@pytest.mark.parametrize("name", ["width", "height"])
+def test_impossible_sizes_are_refused_in_one_line(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=r"^[^\n]*must be positive and whole[^\n]*$"):
+        PinholeCamera(**VALUES | {name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("fx", 0.0), ("fy", -1.0), ("fx", NAN), ("fx", INF), ("cx", NAN), ("cy", INF)]
+)
+def test_impossible_intrinsics_are_refused_in_one_line(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=r"^[^\n]*must be[^\n]*$"):
+        PinholeCamera(**VALUES | {name: value})
+
+
+def test_numbers_of_any_type_become_plain_ones() -> None:
+    camera = PinholeCamera(np.float64(60), np.float32(60), 32, np.int64(24), 64.0, np.int32(48))
+    assert camera == PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)
+    assert [type(value) for value in vars(camera).values()] == [float] * 4 + [int] * 2

@@ -142,23 +142,3 @@ for start in range(20):
 print("unharmed")
 """
     assert python(code).stdout.split()[-1:] == ["unharmed"]
-
-
-@pytest.mark.skipif(engine() != TAICHI, reason="only Taichi has this limit")
-def test_a_second_map_in_a_process_is_refused_until_the_first_is_freed() -> None:
-    code = """
-from fields.runtime.backend import initialise
-from pipelines.online import OnlineMapper
-from pipelines.settings import MappingSettings
-for _ in range(2):
-    initialise("cpu")
-    first = OnlineMapper(MappingSettings(), 64, 48)
-try:
-    OnlineMapper(MappingSettings(), 64, 48)
-except RuntimeError as error:
-    print(error)
-"""
-    assert python(code).stdout.splitlines()[-1] == (
-        "more maps and renderers than one Taichi process holds; call initialise() before making another, which frees "
-        "those made so far"
-    )

@@ -108,3 +108,17 @@ def test_a_correction_moves_the_poses_but_of_no_frame_to_come(mapper: Mapper) ->
     mapper.correct(PoseCorrection(index, moved))
     shift = [T[:3, :3].T @ T[:3, 3] - P[:3, :3].T @ P[:3, 3] for T, P in zip(mapper.trajectory(), poses, strict=True)]
     np.testing.assert_allclose(shift, np.tile([0.0, 0.5, 0.0], (5, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [-3, 2.5, float("nan"), "5"])
+def test_a_refinement_has_a_whole_number_of_steps(mapper: Mapper, steps: object) -> None:
+    before = mapper.pipeline.renderer.view_renders
+    with pytest.raises((TypeError, ValueError), match=r"^[^\n]+$"):
+        mapper.refine(steps)  # pyright: ignore[reportArgumentType]
+    assert mapper.pipeline.renderer.view_renders == before
+
+
+def test_no_time_falls(mapper: Mapper) -> None:
+    with pytest.raises(ValueError, match=r"^late .* 0\.0 s, the frame before it 0\.1"):
+        mapper.add(replace(frame(5), timestamp=0.0, name="late"))
+    assert len(mapper.frames) == 5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -142,6 +143,10 @@ def test_a_gradient_can_be_taken_again_and_by_parts(scene: dict[str, Tensor]) ->
         ({"log_scale": torch.full((60, 3), torch.nan)}, ValueError, "log_scale of Gaussian 0 is not finite"),
         ({"quaternion": torch.eye(60, 4)}, ValueError, "quaternion of Gaussian 4 is zero"),
         ({"colour": torch.ones(60, 3)}, TypeError, "either sh or colour"),
+        ({"near": float("nan")}, ValueError, "near is nan"),
+        ({"near": 0.0}, ValueError, "near is 0.0"),
+        ({"near": -1.0}, ValueError, "near is -1.0"),
+        ({"log_scale": torch.eye(60, 3) * 25.0, "position": torch.ones(60, 3)}, ValueError, "log_scale of Gaussian 0"),
     ],
 )
 def test_what_does_not_fit_is_told_in_one_line(
@@ -156,14 +161,44 @@ def test_what_does_not_fit_is_told_in_one_line(
 
 
 @pytest.mark.slow
-def test_more_sets_of_fields_than_are_kept_are_refused_with_the_way_out(
+def test_another_set_of_fields_than_there_is_room_for_takes_the_place_of_the_others(
     anew: None, scene: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipelines.render.rasterize.MAX_KEPT", 2)
-    view(scene)
+    plain = scene | {"sh": scene["sh"][:, :1]}
+    expected = view(scene)
     view(scene, camera=LARGE)
-    with pytest.raises(RuntimeError, match=r"begin with the largest image, or call modp_ti\.initialise"):
-        view(scene | {"sh": scene["sh"][:, :1]})
+    view(plain)
+    torch.testing.assert_close(view(scene), expected, rtol=0, atol=0)
+    assert view(plain).image.sum() > 0
+
+
+@pytest.mark.slow
+def test_no_set_of_fields_takes_the_place_of_what_is_in_use(
+    anew: None, scene: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.render.rasterize.MAX_KEPT", 1)
+    gaussians = GaussianField(0, 1024)
+    expected = view(scene)
+    with pytest.raises(RuntimeError, match=r"^[^\n]+$"):
+        view(scene, camera=LARGE)
+    torch.testing.assert_close(view(scene), expected, rtol=0, atol=0)
+    assert len(gaussians.to_numpy()["position"]) == 0
+
+
+@pytest.mark.slow
+def test_threads_get_each_its_own_picture_and_gradient(anew: None) -> None:
+    scenes = [tensors(random_gaussians(60, seed=seed, degree=1)) for seed in range(4)]
+
+    def drawn(scene: dict[str, Tensor]) -> dict[str, NDArray]:
+        picture = view(scene)
+        return {"image": picture.image.detach().numpy(), **gradients_of(picture, scene)}
+
+    expected = [drawn(scene) for scene in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        for found, truth in zip(pool.map(drawn, scenes * 5), expected * 5, strict=True):
+            for name in truth:
+                np.testing.assert_array_equal(found[name], truth[name])
 
 
 @pytest.mark.slow
