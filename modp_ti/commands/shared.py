@@ -28,8 +28,6 @@ from modp_ti.files.urls import without_secrets
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from modp_ti.files.terminal import CleanConsole
-
 __all__ = [
     "BAD_INPUT",
     "MARKUP",
@@ -64,8 +62,6 @@ USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
 # Longest error message in characters, since messages may quote the content of a damaged file.
 MAX_MESSAGE = 1000
-
-_consoles: list[CleanConsole] = []  # those of the command that runs
 
 
 class Device(str, Enum):
@@ -154,12 +150,14 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
     An InputError or EngineError is printed in one line, any other exception with its traceback. With `as_json`, the
     outcome is printed as one JSON object, and everything else goes to standard error.
     """
+    from modp_ti.outputs.progress import progress_ending
+
     result, signals = Outcome(), EndingSignals()
     own_terminal()
     if as_json and sys.stdout is None:
         _end(BAD_INPUT, "--json needs standard output, which is closed", as_json=False)
     try:
-        with _to_standard_error() if as_json else nullcontext(), _tidy_terminal():
+        with _to_standard_error() if as_json else nullcontext(), progress_ending():
             yield result
     except (InputError, EngineError) as error:
         _end(BAD_INPUT, one_line(error), as_json)
@@ -179,17 +177,6 @@ def outcome(as_json: bool) -> Iterator[Outcome]:
         _say(shown(result.text))
     if result.code:
         raise typer.Exit(result.code)
-
-
-@contextmanager
-def _tidy_terminal() -> Iterator[None]:
-    """End the progress lines that an exception has left on the terminal, and show its cursor again."""
-    try:
-        yield
-    finally:
-        for console in _consoles:
-            console.tidy()
-        _consoles.clear()
 
 
 @contextmanager
@@ -241,9 +228,7 @@ def progress_console(quiet: bool) -> Console:
     """A console for progress and notes, on standard error; it prints nothing if `quiet`."""
     from modp_ti.files.terminal import CleanConsole
 
-    console = CleanConsole(stderr=True, quiet=quiet)
-    _consoles.append(console)
-    return console
+    return CleanConsole(stderr=True, quiet=quiet)
 
 
 def examples(*lines: str) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 __all__ = ["EndingSignals", "exit_code", "left_to_parent", "withheld"]
 
 ENDING = tuple(number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGHUP"))
-# Time [s] within which another SIGHUP is the same one: the shell and the system both send it.
+# Time [s] after a signal within which a SIGHUP says nothing new: shell and system both send it, systemd after SIGTERM.
 SAME_HANGUP = 2.0
 
 _last: tuple[int, float] = (signal.SIGINT, 0.0)  # the last of the signals, and when it came [s]
@@ -36,6 +36,8 @@ class EndingSignals:
     """
 
     def __init__(self, handler: Callable[[int], object] | None = None, others: bool = False) -> None:
+        global _last
+        _last = signal.SIGINT, 0.0
         self._before: dict[int, Any] = {}
         for number in ENDING if threading.current_thread() is threading.main_thread() else ():
             before = signal.getsignal(number)
@@ -96,12 +98,12 @@ def _interrupt(number: int, *_: object) -> None:
 def _is_new(number: int) -> bool:
     """Take note of a signal. Returns whether it says anything new."""
     global _last
-    (last, when), now = _last, time.monotonic()
+    (_, when), now = _last, time.monotonic()
     _last = number, now
     if number in (signal.SIGINT, signal.SIGTERM):
         return True
     _leave_closed_terminal()
-    return last != number or now - when > SAME_HANGUP
+    return now - when > SAME_HANGUP
 
 
 def _leave_closed_terminal() -> None:

@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from threading import Lock
 
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.live import Live
 from rich.segment import Segment
 
 from modp_ti.files.errors import InputError
@@ -42,12 +41,7 @@ def require_text(name: str) -> None:
 
 
 class CleanConsole(Console):
-    """A console that shows every text as it is, and that can end its progress line wherever an exception came from.
-
-    Texts are shown without rich's markup, and with control characters escaped.
-    """
-
-    _line: Live | None = None
+    """A console that shows every text as it is: without rich's markup, and with control characters escaped."""
 
     def __init__(self, stderr: bool = False, quiet: bool = False) -> None:
         super().__init__(stderr=stderr, quiet=quiet, markup=False, emoji=False)
@@ -55,16 +49,6 @@ class CleanConsole(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=shown(segment.text))
-
-    def set_live(self, live: Live) -> bool:
-        self._line = live
-        return super().set_live(live)
-
-    def tidy(self) -> None:
-        """End the line that is shown, and show the cursor."""
-        if self._line is not None:
-            self._line.stop()
-        self.show_cursor(True)
 
 
 def own_terminal() -> None:

@@ -216,7 +216,7 @@ def _free(name: str, recording: Path | None = None, taken: Collection[Path] = ()
     name = name[:MAX_NAME] or "recording"
     for number in itertools.count(1):
         folder = OUTPUTS / (name if number == 1 else f"{name}-{number}")
-        if folder.resolve() in taken:
+        if folder.resolve() in taken or (folder / "recording.yaml").exists():  # the frames of a killed live run
             continue
         written = folder / "config.yaml"
         if not written.exists() or (recording is not None and _recording_of(written) == recording.resolve()):

@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from modp_ti.outputs.live_status import LiveStatus
     from pipelines.pipeline import FrameReport
 
-__all__ = ["ProgressLine", "StageProgress"]
+__all__ = ["ProgressLine", "StageProgress", "progress_ending"]
 
 T = TypeVar("T")
 
 # Time between two progress lines in a log [s].
 LOG_EVERY = 30.0
+
+_shown: set[ProgressLine] = set()
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,17 @@ class StageProgress:
             return self.what
         total = "" if self.total is None else f"/{self.total}"
         return f"{self.what} {self.done}{total}  {self.state}{self.left}".rstrip()
+
+
+@contextmanager
+def progress_ending() -> Iterator[None]:
+    """End the lines that an exception inside this context has left on the terminal, and show its cursor again."""
+    try:
+        yield
+    finally:
+        for line in list(_shown):
+            line.stop()
+        Console(stderr=True).show_cursor(True)
 
 
 class ProgressLine:
@@ -139,6 +152,7 @@ class ProgressLine:
             console=self.console,
         )
         self._progress.add_task(what, total=total, completed=done, state="", left="")
+        _shown.add(self)
         self._progress.start()
         self._tell()
 
@@ -174,6 +188,7 @@ class ProgressLine:
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
+            _shown.discard(self)
 
     def summary(self, metrics: dict) -> None:
         """Print the run's result in one line. A run without scores has none there."""

@@ -3,17 +3,7 @@
 from __future__ import annotations
 
 from modp_ti.engine.snapshots.checkpointer import Checkpointer
-from modp_ti.engine.snapshots.recovery import Recovery, discard
 from modp_ti.engine.snapshots.resume import continued, fetch_snapshot, load_resumed, replay
 from modp_ti.engine.snapshots.snapshot import Snapshot
 
-__all__ = [
-    "Checkpointer",
-    "Recovery",
-    "Snapshot",
-    "continued",
-    "discard",
-    "fetch_snapshot",
-    "load_resumed",
-    "replay",
-]
+__all__ = ["Checkpointer", "Snapshot", "continued", "fetch_snapshot", "load_resumed", "replay"]

@@ -37,10 +37,15 @@ class Recovery:
         self._written = False
 
     def write(self) -> None:
-        """Write the file, if the tracker keeps something. Raises InputError if it cannot be written."""
+        """Write the file, if the tracker keeps something. Raises InputError if there is one, or it is unwritable."""
         kept, settings = self._tracker.kept, self._config.without_clock().model_dump(mode="json")
         if self._written or not kept:
             return
+        if (self._config.output / FILE).exists():
+            raise InputError(
+                f"{self._config.output / FILE}: names the frames of a live run that was killed: map them with "
+                f"`modp-ti run --resume {self._config.output}`, or delete the file"
+            )
         for section, changes in {**kept, "export": {"session": False}}.items():
             settings[section] |= changes
         try:

@@ -66,7 +66,7 @@ class StreamDigest:
                 self._take(*(array for array in (event.camera.lookup, event.camera.covered) if array is not None))
             return
         camera, points = event.camera, event.points
-        self._images[event.name] = _checksum(event.rgba)
+        self._images[event.name] = _checksum(event)
         self.value = zlib.crc32(event.name.encode("utf-8"), self.value)
         numbers = [event.index, event.timestamp, camera.fx, camera.fy, camera.cx, camera.cy]
         self._take(np.array(numbers, dtype=np.float64), event.T_camera_world, points.xyz, points.pixels, points.ids)
@@ -82,12 +82,16 @@ class StreamDigest:
         """
         index = dict(zip(frames.name, frames.index, strict=True))
         for frame in again:
-            if frame.name in index and self._images.get(frame.name) in (None, _checksum(frame.rgba)):
+            if frame.name in index and self._images.get(frame.name) in (None, _checksum(frame)):
                 yield frame if frame.index == index[frame.name] else replace(frame, index=index[frame.name])
 
     def _take(self, *arrays: np.ndarray) -> None:
         for array in arrays:
             self.value = zlib.crc32(np.ascontiguousarray(array).data, self.value)
+
+
+def _checksum(frame: TrackedFrame) -> int:
+    return zlib.adler32(np.ascontiguousarray(frame.rgba).data)
 
 
 @dataclass(frozen=True)
@@ -269,7 +273,3 @@ def record_state(record: RunRecord) -> MapState:
 
     groups = {"record": arrays(record.frames, FRAME_COLUMNS), "record_steps": arrays(record.steps, STEP_COLUMNS)}
     return MapState.of(groups, {})
-
-
-def _checksum(image: NDArray[np.uint8]) -> int:
-    return zlib.adler32(np.ascontiguousarray(image).data)

@@ -79,15 +79,15 @@ class Connection:
                 self.socket.settimeout(min(max(left, 0.001), GLANCE))
                 part = self.socket.recv(min(size - len(data), CHUNK))
             except TimeoutError:
-                silent = time.monotonic() - heard
                 if left > 0 and others():
                     if not begun and not data:
                         raise OthersSpeakError from None
-                    left = min(left, FIRST_PATIENCE - silent)
+                    if time.monotonic() - heard > FIRST_PATIENCE:
+                        left, patience = 0.0, FIRST_PATIENCE
                 if left > 0:
                     continue
                 where = "in mid-message" if begun or data else "without a message"
-                raise SenderGoneError(f"the sender was silent for {min(patience, silent):.3g} s {where}") from None
+                raise SenderGoneError(f"the sender was silent for {patience:g} s {where}") from None
             except ConnectionResetError:
                 # A sender that exits without reading WELCOME causes one reset. What it sent may still be readable.
                 if self._reset:

@@ -55,6 +55,8 @@ def _messages(file: Path) -> Iterator[bytes]:
                 start = stream.read(FRAME.size)
                 number, *_, size = FRAME.unpack(start)
                 assert hello is not None, "parse_header refuses others"
+                if size > length - FRAME.size:
+                    return
                 try:
                     image = (file.parent / FRAMES / hello.encoding.file(number)).read_bytes()
                 except OSError:  # it was refused

@@ -234,3 +234,33 @@ def test_frames_are_not_left_out_before_the_first_is_taken():
         backlog.add(0.1 * i, i)
     assert backlog.take(100.0) == (0.0, 0)
     assert backlog.take(100.1) == (0.1, 1)
+
+
+def taken_and_decoded(rate: int, every: bool) -> tuple[list[int], int]:
+    """Play a minute to a tracker of 80 ms a frame. Returns the frames that it got, and the number of decoded ones.
+
+    Args:
+        every: Decode every frame, wanted or not.
+    """
+    backlog: Backlog[int] = Backlog()
+    free, decoded, taken = 0.0, 0, []
+    for number, time in enumerate(at(rate, 60)):
+        wanted = every or backlog.wants()
+        decoded += wanted
+        backlog.add(time, number if wanted else None)
+        if time >= free and (found := backlog.take(time)) is not None:
+            taken.append(found[1])
+            free = time + 0.08
+    counts = backlog.arrivals
+    assert counts.arrived == 60 * rate == len(taken) + counts.thinned + len(backlog)
+    return taken, decoded
+
+
+@pytest.mark.parametrize(("rate", "share"), [(30, 1.0), (120, 0.6), (240, 0.4)])
+def test_frames_that_will_be_left_out_are_not_decoded(rate: int, share: float) -> None:
+    taken, decoded = taken_and_decoded(rate, every=False)
+    expected, _ = taken_and_decoded(rate, every=True)
+    assert decoded <= share * 60 * rate
+    assert taken == sorted(set(taken))
+    assert len(taken) >= 0.85 * len(expected)
+    assert np.diff(taken)[10:].max() <= 1.5 * np.diff(expected)[10:].max()

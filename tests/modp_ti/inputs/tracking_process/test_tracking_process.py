@@ -262,5 +262,6 @@ def test_what_was_recorded_stays_when_the_parent_is_killed(camera, box_walk, tmp
     assert len(images.names) > 2
     assert list(map(images.timestamp, images.names)) == sorted(map(images.timestamp, images.names))
     sent = encoded(box_walk.images[0][..., ::-1])
-    expected = cv2.imdecode(np.frombuffer(sent, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
-    assert np.abs(images.read(images.names[0]) - expected).mean() < 4  # two decoders of JPEG
+    expected = cv2.imdecode(np.frombuffer(sent, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    found = images.read(images.names[0])
+    assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.95  # two decoders of JPEG
