@@ -94,7 +94,7 @@ ANYWHERE: dict[str, Corruption] = {
     "missing": Path.unlink,
 }
 TEXT: dict[str, Corruption] = {
-    "UTF-16": changed(lambda data: data.decode().encode("utf-16")),
+    "UTF-32": changed(lambda data: data.decode().encode("utf-32")),
     "a byte that is no text": changed(lambda data: data[: len(data) // 2] + b"\xff\xfe" + data[len(data) // 2 :]),
     "a line without an end": changed(lambda data: b"1 " * 500_000 + data),
 }

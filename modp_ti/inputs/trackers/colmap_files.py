@@ -8,6 +8,7 @@ file rules that out.
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import struct
 import tempfile
@@ -46,7 +47,7 @@ def read_colmap_model(folder: Path, posed_alone: bool = False) -> pycolmap.Recon
     Raises:
         InputError: If the model is incomplete or damaged.
     """
-    lacking = {s: {stem for stem in STEMS if not (folder / f"{stem}{s}").exists()} for s in (".bin", ".txt")}
+    lacking = {s: {stem for stem in STEMS if not os.path.lexists(folder / f"{stem}{s}")} for s in (".bin", ".txt")}
     there = [s for s in lacking if not lacking[s]]
     if posed_alone:
         there += [s for s in lacking if lacking[s] == {"points3D"}]
