@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from modp_ti.files.urls import without_secrets
-from modp_ti.outputs.time_left import RECENT, TimeLeft, duration
+from modp_ti.outputs.time_left import TimeLeft, duration
 
 if TYPE_CHECKING:
     from modp_ti.outputs.live_status import LiveStatus
@@ -125,7 +125,6 @@ class ProgressLine:
         done: int = 0,
         later: Callable[[float], float | None] | None = None,
         prepares: bool = False,
-        recent: float = RECENT,
     ) -> None:
         """Begin the line of a stage.
 
@@ -136,10 +135,9 @@ class ProgressLine:
             later: Returns the time that the following stages will take [s], given the recent time of an item [s].
                 While it returns None, no time is shown. None if nothing follows.
             prepares: Whether the time of the first item includes preparations.
-            recent: Share of the elapsed time whose items set the pace, see `TimeLeft`.
         """
         self.stop()
-        self._left = TimeLeft(total, done, clock=time.monotonic, prepares=prepares, recent=recent)
+        self._left = TimeLeft(total, done, clock=time.monotonic, prepares=prepares)
         self._later = later or _nothing
         self._state = ""
         self._logged = time.monotonic()

@@ -34,7 +34,7 @@ class TimeLeft:
 
     The pace is by default that of the items finished in the last third of the elapsed time, since a keyframe takes
     longer the larger the map is. No estimate is made in the first ten seconds, or if the number of items is unknown.
-    Gaps are left out, but for items that come in bursts.
+    Gaps are left out.
 
     Args:
         total: Number of items; None if unknown.
@@ -42,7 +42,6 @@ class TimeLeft:
         clock: Returns the time [s].
         earliest: Time before the first estimate [s].
         prepares: Whether the time of the first item includes preparations; it is then left out.
-        recent: Share of the elapsed time whose items set the pace. 1 for items that come in bursts.
 
     Attributes:
         total: As the argument. It may be changed.
@@ -56,13 +55,11 @@ class TimeLeft:
         clock: Callable[[], float],
         earliest: float = EARLIEST,
         prepares: bool = False,
-        recent: float = RECENT,
     ) -> None:
         self.total = total
         self._clock = clock
         self._earliest = earliest
         self._prepares = prepares
-        self._recent = recent
         self._began = clock()
         self._done = done
         # Times and counts, oldest first. The first one is the latest that lies before the recent share.
@@ -74,7 +71,7 @@ class TimeLeft:
         """Set the number of items that are done."""
         now = self._clock() - self._gaps
         first, last = self._history[0][0], self._history[-1][0]
-        items = done > self._done and not self._prepares and self._recent < 1
+        items = done > self._done and not self._prepares
         if items and now - last > max(GAP, last - first):
             if self._done - self._gap_at >= GAP_APART:
                 self._gaps += now - last
@@ -85,7 +82,7 @@ class TimeLeft:
             self._history = deque([(now, done)])
         self._done = done
         self._history.append((now, done))
-        since = now - self._recent * (now - self._began)
+        since = now - RECENT * (now - self._began)
         while len(self._history) > 2 and self._history[1][0] <= since:
             self._history.popleft()
 

@@ -51,18 +51,6 @@ def test_preparations_are_not_extrapolated() -> None:
     assert left.seconds() == pytest.approx(0.2 * (1000 - 61))
 
 
-def test_items_in_bursts_are_estimated_from_all_of_them() -> None:
-    """Of four tasks with 30 items each, the second begins with 20 s in which no item is finished."""
-    clock = Clock()
-    left, recent = TimeLeft(120, clock=clock, recent=1.0), TimeLeft(120, clock=clock)
-    for number, cost in enumerate([20.0, *[0.2] * 29, 20.0], 1):
-        clock.now += cost
-        left.update(number)
-        recent.update(number)
-    assert left.seconds() == pytest.approx(89 * 45.8 / 31)
-    assert recent.seconds() == pytest.approx(89 * 20.0)
-
-
 @pytest.mark.parametrize("before", [0, 3, 100])
 @pytest.mark.parametrize("pause", [60.0, 3600.0])
 def test_a_pause_is_left_out(pause: float, before: int) -> None:
