@@ -38,7 +38,7 @@ from pipelines.transients.sweep import TransientSweep
 __all__ = ["OnlineMap"]
 
 
-@in_engine("prune", "all_gaussians", "mask_contradicted", "mask_latest", "watch_changes", "caught")
+@in_engine("prune", "all_gaussians", "begin_passes", "watch_changes", "caught")
 class OnlineMap(Pipeline):
     """An online map and the objects that work on it. `OnlineMapper` adds the loop.
 
