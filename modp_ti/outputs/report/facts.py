@@ -15,6 +15,7 @@ from fields.runtime.engine import engine
 from fields.runtime.parallel import available_cores
 from modp_ti.config.keys import as_yaml, documented_values
 from modp_ti.config.settings import SceneConfig
+from modp_ti.files.urls import without_secrets
 from modp_ti.version import __version__
 
 __all__ = [
@@ -117,8 +118,10 @@ def _processor() -> str:
 def shareable(text: str, *folders: Path) -> str:
     """Remove from text what a page must not give away, since pages are shared.
 
-    Paths in one of the folders become relative to it; of other absolute paths, the last name is left.
+    URLs are without user, password and query. Paths in one of the folders become relative to it; of other absolute
+    paths, the last name is left.
     """
+    text = without_secrets(text)
     for folder in sorted({*folders} - {Path(folder.anchor) for folder in folders}, key=lambda f: -len(str(f))):
         text = re.sub(rf"(?<![\w./-]){re.escape(str(folder))}[/\\]+", "", text)
     home = os.path.expanduser("~")

@@ -289,6 +289,8 @@ def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path, stages) -> N
     run = made_up_run(tmp_path, frames=6, refine=0, holdout=0)
     results = Results(run.config, delivered(list(run.tracked), [False] * 6))
     scores = list(run.scores) if stages == "all" else []
+    with results.writing_map():
+        (results.folder / "splats.ply").touch()
     with results.writing_figures():
         for i in range(6):
             image, render = picture(i, (16, 16)), picture(i + 1, (16, 16))
