@@ -22,6 +22,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.engine import session
 from modp_ti.engine.build import build_mapper
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import summary
@@ -278,12 +279,12 @@ class DeafMapper:
     """Hears no frame."""
 
     pipeline = DeafPipeline()
-    frames = ()
+    frames = DeliveredFrames()
 
     def takes(self, width, height) -> bool:
         return True
 
-    def add(self, frame) -> None: ...
+    def take(self, frame) -> None: ...
 
     def finish(self, progress) -> None: ...
 
