@@ -226,7 +226,6 @@ EUROC: dict[str, dict[str, Corruption]] = {
         "a lens of 1e200": replaced("coefficients: [0.0", "coefficients: [1.0e+200"),
         "a megabyte": changed(lambda data: data + b"# x\n" * 250_000),
         "nested 5000 deep": whole("[" * 5000),
-        "a tag": replaced("camera_model: pinhole", "camera_model: !!python/object/apply:os.system [ls]"),
         "text": whole("hello"),
     },
     "room/mav0/state_groundtruth_estimate0/data.csv": rows_of("1 2 3", 1, 1)
