@@ -134,7 +134,12 @@ def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scen
         "mapping: {optimise: {steps: 2}, densify: {pixels: 400}}\nrefine: {steps: 2}\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", RUNS, str(scene)], capture_output=True, text=True, timeout=PATIENCE, check=False
+        [sys.executable, "-c", RUNS, str(scene)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+        cwd=scene.parent,
     )
     assert done.returncode == 0, done.stderr
 
