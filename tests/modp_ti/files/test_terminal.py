@@ -44,7 +44,7 @@ def test_notes_states_bars_and_tables_show_names_as_they_are(monkeypatch: pytest
         line.stop()
 
     def state(console: CleanConsole) -> None:
-        console._force_terminal = True
+        console._force_terminal = console.is_interactive = True
         with ProgressLine(console).working(HOSTILE):
             console.print()  # which draws the message again below
 
@@ -54,7 +54,6 @@ def test_notes_states_bars_and_tables_show_names_as_they_are(monkeypatch: pytest
         console.print(rows)
 
     monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setenv("TERM", "xterm")  # a dumb one shows no states
     for show in (lambda console: ProgressLine(console).note(HOSTILE), bar, state, table):
         text = printed(show)
         assert "[red]x[/re" in text and "\x1b]" not in text and "\x9b" not in text
