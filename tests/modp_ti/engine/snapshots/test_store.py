@@ -13,6 +13,7 @@ from modp_ti.engine.snapshots import fetch_snapshot, load_resumed
 from modp_ti.engine.snapshots.file import FILE, read_arrays, write_arrays
 from modp_ti.engine.snapshots.store import SnapshotStore
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import list_files
 from modp_ti.files.storage import StorageError
 
 SCENE = "source: {path: images, scale: 1}\ntracker: {kind: colmap}\noutput: out\nsnapshot_every: 3\n"
@@ -65,6 +66,7 @@ def test_the_snapshot_that_is_further_is_taken(
         put(snapshot(tmp_path / "other" / FILE, config, *there), config)
     if here is not None:
         snapshot(config.output / FILE, config, *here)
+        list_files(config.output, [FILE])
     fetch_snapshot(config)
     assert place(config.output / FILE) == expected
 

@@ -108,7 +108,7 @@ def test_the_command_prints_a_line_a_camera_and_one_object_for_programs(capture,
     result = listed("--quiet")
     assert result.exit_code == 0
     assert result.stdout.splitlines() == [
-        "0  HD Webcam?[2J, 640x480, 30 a second",
+        "0  HD Webcam\\x1b[2J, 640x480, 30 a second",
         "2  Grabber, cannot be opened: in use by another program, or not permitted",
     ]
     data = json.loads(listed("--json").stdout)
