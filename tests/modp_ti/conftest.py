@@ -143,7 +143,8 @@ def finished(made_once: Callable[[str, Callable[[Path], None]], Path], room_reco
 
 @pytest.fixture
 def interruptible():
-    """Ctrl-C as in a shell's foreground: a process that was started in the background may ignore it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Signals as in a shell's foreground: in the background, Ctrl-C may be ignored, and under nohup SIGHUP is."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, before[0])
+    signal.signal(signal.SIGHUP, before[1])

@@ -31,7 +31,7 @@ export:  {report: false}
 """
 SAVED = {"splats.ply", "trajectory.txt", "frames.json", "colmap", "config.yaml"}
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("interruptible")]
 
 
 class Run:
