@@ -133,10 +133,10 @@ def test_the_frames_of_another_tracker_survive_a_killed_run(recording: Path, tmp
     (tmp_path / "scene.yaml").write_text("tracker: {kind: socket, path: server}\n" + LIVE)
     run = Run(tmp_path, str(tmp_path / "scene.yaml"))
     script = [sys.executable, str(ROOT / "scripts" / "send_frames.py"), str(recording / "scene.yaml")]
-    options = ["--to", str(tmp_path / "server"), "--late", "1", "--wait", "300"]
+    options = ["--to", str(tmp_path / "server"), "--late", "1", "--wait", "300", "--rate", "1"]
     sender = subprocess.Popen([*script, *options], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for((tmp_path / "out" / "recording.yaml").exists)
-    wait_for(lambda: len(list((tmp_path / "temporary").glob("*/frames/*.png"))) > 5)
+    wait_for(lambda: len(list((tmp_path / "temporary").glob("*/frames/*"))) > 12)
     assert run.end(signal.SIGKILL) == -signal.SIGKILL
     sender.kill()
     sender.wait()
