@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,8 +16,10 @@ from fields.geometry.pixel_metric import pixel_metric
 from fields.geometry.se3 import inverse_se3, log_se3
 from fields.map.keyframe import Keyframe
 from fields.map.trajectory import Trajectory
-from pipelines.render.renderer import Renderer
 from pipelines.settings import GateSettings
+
+if TYPE_CHECKING:  # `modp-ti check` measures sharpness without loading PyTorch
+    from pipelines.render.renderer import Renderer
 
 __all__ = ["FrameGate", "sharpness"]
 
