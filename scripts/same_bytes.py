@@ -81,7 +81,8 @@ class Version:
             self.run("redkitchen", self.scene, KITCHEN)
             self.run("offline", self.scene, [*small, "mode=offline", "offline.steps=150"])
             self.run("parts", self.scene, small, "--parts", 2)
-            self.run("onto", self.scene, [*small, "source.start=15"], "--onto", self.folder / "desk")
+            later = [*KITCHEN, "source.start=150", "source.stop=350"]
+            self.run("onto", self.scene, later, "--onto", self.folder / "redkitchen")
             self.killed_and_resumed("resumed", small)
         found = sorted(self.folder.glob("*/splats.ply")) + sorted(self.folder.glob("*/trajectory.txt"))
         return {str(file.relative_to(self.folder)): _digest(file) for file in found}
