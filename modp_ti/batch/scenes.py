@@ -10,7 +10,7 @@ from pathlib import Path
 from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.files.errors import InputError
 from modp_ti.files.urls import actual_url, shown_url
-from modp_ti.inputs.bare_recording import is_recording, named_scene
+from modp_ti.inputs.bare_recording import base_of, named_scene
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.tasks import Resources
 
@@ -66,7 +66,7 @@ def read_scenes(given: Iterable[Path], overrides: Sequence[str] = (), preset: st
 
 def _read(path: Path, overrides: Sequence[str], preset: str | None, taken: list[Path]) -> SceneConfig:
     config = named_scene(path, overrides, preset, taken)
-    refuse_output_in_input(config, Path.cwd() if is_recording(path) else path.parent)
+    refuse_output_in_input(config, base_of(path))
     if config.is_live:
         raise InputError(f"{path}: a live source has no place in a batch: map it with `modp-ti run`")
     if config.parts is not None:

@@ -41,7 +41,7 @@ def check(
         # Imported here, so that `--help` does not wait for the readers to load.
         from modp_ti.files.run_folder import require_usable
         from modp_ti.files.terminal import CleanConsole
-        from modp_ti.inputs.bare_recording import is_recording, named_scene
+        from modp_ti.inputs.bare_recording import base_of, named_scene
         from modp_ti.inputs.inspection import report as reports
         from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
         from modp_ti.inputs.scene_paths import refuse_output_in_input
@@ -50,7 +50,7 @@ def check(
         try:
             console = progress_console(quiet)
             config = named_scene(scene, set_ or [], say=ProgressLine(console).note)
-            refuse_output_in_input(config, Path.cwd() if is_recording(scene) else scene.resolve().parent)
+            refuse_output_in_input(config, base_of(scene))
             require_usable(config.output)
             report = inspect_scene(config, console)
         except InputError as error:

@@ -152,7 +152,7 @@ def _run(
 ) -> Path:
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.files.run_folder import require_usable
-    from modp_ti.inputs.bare_recording import is_recording
+    from modp_ti.inputs.bare_recording import base_of, is_recording
     from modp_ti.inputs.scene_paths import refuse_output_in_input
 
     snapshot = None
@@ -164,8 +164,7 @@ def _run(
         config, snapshot = load_resumed(resume, scene, overrides, preset)
     else:
         config = _new_scene(scene, stream, overrides, preset, quiet)
-        at = Path.cwd() if scene is None or is_recording(scene) else scene.resolve().parent
-        refuse_output_in_input(config, at)
+        refuse_output_in_input(config, Path.cwd() if scene is None else base_of(scene))
         require_usable(config.output)  # once more in the run: here, before Taichi is loaded
     if config.parts is not None:
         from modp_ti.parts.mapping import map_in_parts

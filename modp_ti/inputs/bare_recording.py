@@ -26,7 +26,7 @@ from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageF
 from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, is_video
 
-__all__ = ["is_recording", "named_scene", "recorded_scene", "streamed_scene"]
+__all__ = ["base_of", "is_recording", "named_scene", "recorded_scene", "streamed_scene"]
 
 OUTPUTS = Path("out")
 SCENE = "scene.yaml"
@@ -58,6 +58,11 @@ def is_recording(path: Path) -> bool:
     if path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES:
         return True
     return path.suffix.lower() not in SCENE_SUFFIXES and is_file(path) and is_video(path)
+
+
+def base_of(path: Path) -> Path:
+    """Return the folder that the paths of a scene file, or of a recording's settings, are relative to."""
+    return Path.cwd() if is_recording(path) else path.resolve().parent
 
 
 def named_scene(
