@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fields.runtime.engine import EngineError, engine
-from modp_ti.commands import batch, cameras, check, convert, export, locate, refine, render, run, view, warmup
+from modp_ti.commands import batch, cameras, check, export, locate, refine, render, run, view, warmup
 from modp_ti.commands.shared import BAD_INPUT, MARKUP, CommandGroup, examples
 from modp_ti.version import __version__
 
@@ -21,7 +21,6 @@ OVERVIEW = examples(
     "modp-ti refine OUT   (a finished map, by several processes)",
     "modp-ti render OUT --path orbit   (OUT: the output folder of a run)",
     "modp-ti export OUT --format html",
-    "modp-ti convert scene.spz scene.ply",
     "modp-ti locate OUT new.jpg",
 )
 ENDS = (
@@ -68,7 +67,6 @@ app.command("cameras", epilog=cameras.EXAMPLES)(cameras.cameras)
 app.command("check", epilog=check.EXAMPLES)(check.check)
 app.command("render", epilog=render.EXAMPLES)(render.render)
 app.command("export", epilog=export.EXAMPLES)(export.export)
-app.command("convert", epilog=convert.EXAMPLES)(convert.convert)
 app.command("locate", epilog=locate.EXAMPLES)(locate.locate)
 app.command("view", epilog=view.EXAMPLES)(view.view)
 app.command("warmup", epilog=warmup.EXAMPLES)(warmup.warmup)

@@ -1,4 +1,4 @@
-"""`modp-ti view OUT`: shows a finished map, or a file of splats, in the browser."""
+"""`modp-ti view OUT`: shows a finished map, or a PLY file of splats, in the browser."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from modp_ti.commands.shared import Device, Quiet, examples, outcome, progress_c
 __all__ = ["EXAMPLES", "view"]
 
 EXAMPLES = examples(
-    "modp-ti view out/room", "modp-ti view scene.spz", "modp-ti view out/room --port 0 --max-splats 1000000"
+    "modp-ti view out/room", "modp-ti view splats.ply", "modp-ti view out/room --port 0 --max-splats 1000000"
 )
 
 
 def view(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run, or a file of splats")],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="output folder of a finished run, or a .ply file of splats")
+    ],
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="address to listen at; 0.0.0.0 is for all that reach this machine")
     ] = "127.0.0.1",
@@ -26,7 +28,7 @@ def view(
     device: Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")] = Device.auto,
     quiet: Quiet = False,
 ) -> None:
-    """Show a finished map, or any splats, as a web page, until Ctrl-C."""
+    """Show a finished map, or a .ply file of splats, as a web page, until Ctrl-C."""
     with outcome(as_json=False):
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.config.settings import ViewSettings

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from tests.fault_injection.corrupted_bags import CORRUPTED_BAGS
 from tests.fault_injection.corrupted_captures import CAPTURES
 from tests.fault_injection.corrupted_media import IMAGES, MASK, PATH, RUN, VIDEO
-from tests.fault_injection.corrupted_splats import SPLATS
 from tests.fault_injection.corrupted_trackers import (
     ARIA,
     COLMAP,
@@ -27,7 +26,6 @@ from tests.fault_injection.corrupted_trackers import (
 )
 from tests.fault_injection.corruptions import ANYWHERE, TEXT, Corruption
 from tests.fault_injection.samples import SAMPLES
-from tests.fault_injection.samples import SPLATS as SPLAT_FILES
 from tests.fault_injection.small_bag import BAGS
 
 __all__ = ["CASES", "Case"]
@@ -106,10 +104,6 @@ def _cases() -> list[Case]:
             add(kind, file, anything(*_harmless(file)) | corruptions)
     for form, corruptions in CORRUPTED_BAGS.items():
         add(f"bag_{form}", BAGS.get(form, BAGS["mcap"]), anything() | corruptions)
-    for reader, file in SPLAT_FILES.items():
-        # Half of a .splat, and 64 bytes before it, are whole Gaussians again; archives may begin with anything.
-        whole = {"splat": ("cut in half", "noise before it"), "sog": ("noise before it",)}.get(reader, ())
-        add(reader, file, anything(*whole) | SPLATS[file])
     return cases
 
 

@@ -16,7 +16,7 @@ from threading import Event
 import numpy as np
 
 from modp_ti.files.errors import InputError
-from tests.fault_injection.samples import CAPTURES, SAMPLES, SPLATS, write_sample
+from tests.fault_injection.samples import CAPTURES, SAMPLES, write_sample
 
 __all__ = ["READERS", "Reader", "import_readers", "seeds"]
 
@@ -167,12 +167,6 @@ def _splats(file: Path) -> None:
     read_splats(file)
 
 
-def _any_splats(file: Path) -> None:
-    from modp_ti.outputs.formats.splat_files import read_any_splats
-
-    read_any_splats(file)
-
-
 def _weights(file: Path) -> None:
     from pipelines.torch_checkpoint import read_checkpoint
 
@@ -263,7 +257,6 @@ READERS: dict[str, Reader] = {
         Reader("video_container", "video", ("room.mp4",), _container),
         Reader("video", "video", ("room.mp4",), _video),
         Reader("splats", "run", ("out/splats.ply",), _splats),
-        *(Reader(form, form, (file,), _any_splats) for form, file in SPLATS.items()),
         Reader("run", "run", RUN_FILES, _run),
         Reader("weights", "weights", ("older.pth", "weights.pth"), _weights),
         *(Reader(kind, kind, SAMPLES[kind][0].files, _open) for kind in CAPTURES),
@@ -285,7 +278,6 @@ def import_readers() -> None:
             "config.scene_file",
             "outputs.formats.exposure",
             "outputs.formats.scores_csv",
-            "outputs.formats.splat_files",
             "outputs.formats.splats_ply",
             "outputs.formats.trajectory",
         ),

@@ -57,7 +57,7 @@ from tests.fault_injection.tracker_samples import (
     write_tum_rgbd,
 )
 
-__all__ = ["CAPTURES", "SAMPLES", "SPLATS", "Sample", "write_sample"]
+__all__ = ["CAPTURES", "SAMPLES", "Sample", "write_sample"]
 
 
 @dataclass(frozen=True)
@@ -229,23 +229,6 @@ CAPTURES = {
 """The files under test of captures, by kind."""
 
 
-SPLATS = {
-    "spz": "a.spz",
-    "sog": "a.sog",
-    "splat": "a.splat",
-    "ksplat": "a.ksplat",
-    "compressed_ply": "a.compressed.ply",
-}
-"""The files of splats of other programs, by reader."""
-
-
-def _write_splats(file: str, folder: Path) -> None:
-    from modp_ti.outputs.formats.splat_files import convert_splats
-
-    write_bytes(folder, "source.ply", splats())
-    convert_splats(folder / "source.ply", folder / file)
-
-
 EXPORT = ("export", "out", "--format", "points", "-o", "written.ply", "--quiet")
 RUN_MODEL = tuple(f"out/colmap/{stem}.bin" for stem in ("cameras", "images", "points3D"))
 SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
@@ -295,10 +278,6 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         *((Sample(kind, files), partial(_write_capture, kind)) for kind, files in CAPTURES.items()),
         *((Sample(f"bag_{form}", (BAGS[form],)), partial(_write_bag, form)) for form in FORMS),
         (Sample("bag_depth", (BAGS["mcap"],)), _write_bag_with_depths),
-        *(
-            (Sample(form, (file,), ("convert", file, "written.ply", "--quiet")), partial(_write_splats, file))
-            for form, file in SPLATS.items()
-        ),
     )
 }
 

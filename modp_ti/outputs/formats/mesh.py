@@ -17,7 +17,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.blocks import Boxes, planes_of, seen
 from modp_ti.files.atomic import written_aside
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.glb import write_glb, write_textured_glb
+from modp_ti.outputs.formats.gltf import write_mesh_glb
 from modp_ti.outputs.formats.open3d_io import open3d
 from modp_ti.outputs.formats.textured_mesh import TexturedMesh
 from pipelines.surface.distance_field import integrate
@@ -202,12 +202,13 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh) -> None:
         path: The file.
         mesh: An Open3D TriangleMesh, or a mesh with a texture, which becomes GLB.
     """
+    turn = [1.0, -1.0, -1.0]
     if isinstance(mesh, TexturedMesh):
-        write_textured_glb(path, mesh.vertices * [1.0, -1.0, -1.0], mesh.triangles, mesh.uv, mesh.image)
+        write_mesh_glb(path, mesh.vertices * turn, mesh.triangles, uv=mesh.uv, image=mesh.image)
         return
     if path.suffix.lower() == ".glb":
-        vertices = np.asarray(mesh.vertices) * [1.0, -1.0, -1.0]
-        write_glb(path, vertices, np.asarray(mesh.triangles), np.asarray(mesh.vertex_colors))
+        vertices, triangles = np.asarray(mesh.vertices) * turn, np.asarray(mesh.triangles)
+        write_mesh_glb(path, vertices, triangles, np.asarray(mesh.vertex_colors))
         return
     o3d = open3d()
     mesh.compute_vertex_normals()

@@ -10,6 +10,16 @@ Pixel i of an image belongs to Gaussian i, row by row. Images have red, green, b
     shN_centroids     the palette's other harmonics as indices into a codebook: a pixel per harmonic, 64 entries a row
 
 The axes are those of 3DGS files. `model` says that the map was optimised with anti-aliasing.
+
+Streamed SOG, the layout for large maps, version 1, is `lod-meta.json` and a folder of SOG files per chunk. A viewer
+loads the chunks that it needs. `lod-meta.json` holds
+
+    version, asset, count, counts, lodLevels    1; the program; number of Gaussians, in all and at each level
+    filenames                                   `meta.json` of each chunk, as in a `.sog` file but not in an archive
+    tree                                        boxes that hold boxes (`children`), or Gaussians at each level (`lods`):
+                                                a chunk (`file`), and the place and number of its Gaussians there
+
+A level with a higher number has less detail. All levels of a box show the same part of the map, and one is drawn.
 """
 
 from __future__ import annotations
@@ -25,22 +35,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.map.blocks import Boxes, extent_of
 from modp_ti.files.atomic import replace_file
-from modp_ti.files.json_text import parse_json
-from modp_ti.files.limits import BoundedZip, most_unpacked
-from modp_ti.files.reading import reading
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.outputs.formats.splat_packing import (
-    logits,
-    morton_order,
-    opacities,
-    smallest_three,
-    to_bits,
-    unit_quaternions,
-    with_largest,
-)
+from modp_ti.outputs.formats.splat_packing import morton_order, opacities, smallest_three, to_bits, unit_quaternions
+from pipelines.blocks.hierarchy import LEVELS, Hierarchy, Level
 
-__all__ = ["read_sog", "sog_bytes", "sog_files", "write_sog"]
+__all__ = ["sog_bytes", "write_sog", "write_sog_lod"]
 
 CODES = 256
 # Rounds of Lloyd's algorithm for a codebook and for the palette.
@@ -50,10 +50,8 @@ LARGEST_PALETTE, SHARE = 1 << 12, 16
 ENTRIES_PER_ROW = 64
 # Gaussians whose distances to the palette are computed at once.
 BLOCK = 4096
-# Largest meta.json that is read [bytes].
-MOST_TEXT = 1 << 20
-# Bytes of a Gaussian in the images. Most pixels of an image beyond twice those that are used, and of a palette.
-SPLAT, SPARE, MOST_PALETTE = 20, 1 << 12, 1 << 20
+# Number of Gaussians of a chunk of streamed SOG, about.
+CHUNK = 1 << 16
 
 
 def write_sog(path: str | os.PathLike[str], state: Mapping[str, NDArray]) -> None:
@@ -72,12 +70,12 @@ def sog_bytes(state: Mapping[str, NDArray]) -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         # A fixed date, so that the same map gives the same file.
-        for name, data in sog_files({name: values[order] for name, values in state.items()}).items():
+        for name, data in _sog_files({name: values[order] for name, values in state.items()}).items():
             archive.writestr(zipfile.ZipInfo(name), data)
     return content.getvalue()
 
 
-def sog_files(state: Mapping[str, NDArray]) -> dict[str, bytes]:
+def _sog_files(state: Mapping[str, NDArray]) -> dict[str, bytes]:
     """Return the files of a `.sog` archive by name, with the Gaussians in the order that is given."""
     count, harmonics = state["sh"].shape[:2]
     width = 4 * int(np.ceil(np.sqrt(max(count, 1)) / 4))
@@ -133,81 +131,94 @@ def sog_files(state: Mapping[str, NDArray]) -> dict[str, bytes]:
     return content | {"meta.json": json.dumps(meta, separators=(",", ":")).encode("ascii")}
 
 
-def read_sog(data: bytes, path: Path) -> dict[str, NDArray]:
-    """Read the content of a `.sog` file of version 2.
+def write_sog_lod(folder: Path, hierarchy: Hierarchy, chunk: int = CHUNK) -> None:
+    """Write a map at all its levels of detail.
 
     Args:
-        data: The content.
-        path: The file, for error messages.
+        folder: An existing folder.
+        hierarchy: The map.
+        chunk: Number of Gaussians of a chunk, about.
+    """
+    levels = [hierarchy.level(number) for number in range(LEVELS + 1)]
+    boxes = _boxes(hierarchy.blocks.boxes, levels)
+    leaves: list[dict[str, dict[str, int]]] = [{} for _ in range(len(boxes))]
+    tree, order = _tree(boxes, leaves, np.arange(len(boxes)))
+    filenames: list[str] = []
+    for number, level in enumerate(levels):
+        counts = level.counts[order]
+        # A chunk holds the leaves whose first Gaussians lie in the same stretch of that many.
+        of_leaf = (np.cumsum(counts) - counts) // chunk
+        for place, part in enumerate(np.split(order, np.flatnonzero(np.diff(of_leaf)) + 1)):
+            name = f"{number}_{place}"
+            _write_chunk(folder / name, level, part)
+            for leaf, count, end in zip(part, level.counts[part], np.cumsum(level.counts[part]), strict=True):
+                leaves[leaf][str(number)] = {"file": len(filenames), "offset": int(end - count), "count": int(count)}
+            filenames.append(f"{name}/meta.json")
+    meta = {
+        "version": 1,
+        "asset": {"generator": "MODP-Ti"},
+        "count": sum(map(len, levels)),
+        "counts": [len(level) for level in levels],
+        "lodLevels": len(levels),
+        "filenames": filenames,
+        "tree": tree,
+    }
+    (folder / "lod-meta.json").write_text(json.dumps(meta, separators=(",", ":")), encoding="ascii")
+
+
+def _write_chunk(folder: Path, level: Level, blocks: NDArray[np.integer]) -> None:
+    """Write the Gaussians of blocks, one block after the other."""
+    places = []
+    for block in blocks.tolist():
+        own = level.places_in(np.array([block]))
+        places.append(own[morton_order(level.values["position"][own])])
+    members = np.concatenate(places)
+    folder.mkdir()
+    for name, data in _sog_files({name: values[members] for name, values in level.values.items()}).items():
+        (folder / name).write_bytes(data)
+
+
+def _boxes(boxes: Boxes, levels: list[Level]) -> Boxes:
+    """Return the boxes around each block's Gaussians of all levels, since merged ones may reach farther."""
+    low, high = boxes.low.copy(), boxes.high.copy()
+    for level in levels[1:]:
+        position = level.values["position"].astype(np.float64)
+        reach = extent_of(level.values["log_scale"])[:, None]
+        low = np.minimum(low, np.minimum.reduceat(position - reach, level.first[:-1]))
+        high = np.maximum(high, np.maximum.reduceat(position + reach, level.first[:-1]))
+    return Boxes(low, high)
+
+
+def _tree(boxes: Boxes, leaves: list, members: NDArray[np.integer]) -> tuple[dict[str, Any], NDArray[np.integer]]:
+    """Halve blocks at the median along the axis where their centres spread most, until each is alone.
+
+    Args:
+        boxes: The box of each block.
+        leaves: What a leaf of the tree holds for each block.
+        members: The blocks.
 
     Returns:
-        Gaussians by name, as `GaussianField.load` takes them.
-
-    Raises:
-        InputError: If the file is damaged or of another version.
+        The tree, and the blocks in its order.
     """
-    with reading(path, "; a .sog file of version 2 is wanted"), BoundedZip(data) as archive:
-        if archive.getinfo("meta.json").file_size > MOST_TEXT:
-            raise ValueError("a large meta.json")
-        meta = parse_json(archive.read("meta.json").decode("utf-8"), f"{path}: meta.json")
-        count = meta["count"]
-        if meta["version"] != 2 or not isinstance(count, int) or count < 1:
-            raise ValueError("another version")
-        if count * SPLAT > most_unpacked(len(data)):
-            raise ValueError(f"{count} splats in {len(data)} bytes")
-        return _read(archive, meta, count)
+    node: dict[str, Any] = {"bound": _bound(boxes[members])}
+    if len(members) == 1:
+        return node | {"lods": leaves[members[0]]}, members
+    centre = 0.5 * (boxes.low[members] + boxes.high[members])
+    ordered = members[np.argsort(centre[:, np.ptp(centre, axis=0).argmax()], kind="stable")]
+    half = len(ordered) // 2
+    (left, first), (right, second) = (_tree(boxes, leaves, part) for part in (ordered[:half], ordered[half:]))
+    return node | {"children": [left, right]}, np.concatenate([first, second])
 
 
-def _read(archive: BoundedZip, meta: dict[str, Any], count: int) -> dict[str, NDArray]:
-    means, harmonics = meta["means"], meta.get("shN")
-    low, high = (np.array(means[bound], np.float64).reshape(3) for bound in ("mins", "maxs"))
-    files = means["files"]
-    steps = _pixels(archive, files[0], count)[:, :3] + 256.0 * _pixels(archive, files[1], count)[:, :3]
-    place = low + steps / 65535.0 * (high - low)
-    quats = _pixels(archive, meta["quats"]["files"][0], count)
-    constant = _pixels(archive, meta["sh0"]["files"][0], count)
-    sh = _codes(meta["sh0"])[constant[:, :3]][:, None]
-    if harmonics is not None:
-        coefficients = {1: 3, 2: 8, 3: 15}[harmonics["bands"]]
-        entries = _codes(harmonics)[_pixels(archive, harmonics["files"][0])[:, :3]]
-        labels = _pixels(archive, harmonics["files"][1], count).astype(np.int64)
-        rest = entries.reshape(-1, coefficients, 3)[labels[:, 0] + 256 * labels[:, 1]]
-        sh = np.concatenate([sh, rest], axis=1)
-    largest = quats[:, 3].astype(np.int64) - 252
-    if largest.min() < 0:
-        raise ValueError("rotations of another form")
-    return {
-        "position": np.sign(place) * np.expm1(np.abs(place)),
-        "log_scale": _codes(meta["scales"])[_pixels(archive, meta["scales"]["files"][0], count)[:, :3]],
-        "quaternion": with_largest(largest, (quats[:, :3] / 255.0 * 2.0 - 1.0) * np.sqrt(0.5)),
-        "opacity_logit": logits(constant[:, 3] / 255.0),
-        "sh": sh,
-    }
+def _bound(boxes: Boxes) -> dict[str, list[float]]:
+    """Return the box around boxes, in seven digits rounded outwards by a millionth of its size."""
+    low, high = boxes.low.min(axis=0), boxes.high.max(axis=0)
+    margin = 1e-6 * np.maximum(np.abs(low), np.abs(high)).max()
+    return {"min": _digits(low - margin), "max": _digits(high + margin)}
 
 
-def _codes(part: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the codebook (256,) of a part. Raises ValueError unless it holds so many finite numbers."""
-    codes = np.array(part["codebook"] if len(part["codebook"]) == CODES else np.nan)
-    if codes.shape != (CODES,) or codes.dtype.kind not in "if" or not np.isfinite(codes).all():
-        raise ValueError(f"a codebook of other than {CODES} finite numbers")
-    return codes.astype(np.float64)
-
-
-def _pixels(archive: BoundedZip, name: str, count: int | None = None) -> NDArray[np.uint8]:
-    """Return the first `count` pixels (count, 4) of an image in the archive, row by row; all of a palette's if None."""
-    from PIL import Image
-
-    # Images hardly shrink further in an archive.
-    entry = archive.getinfo(name)
-    if entry.file_size > 2 * entry.compress_size + MOST_TEXT:
-        raise ValueError("an image that unpacks to many times its size")
-    data = archive.read(entry)
-    if why_undecodable(data) is not None:
-        raise ValueError("an image of a wrong size")
-    with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-        if not (count or 0) <= image.width * image.height <= (MOST_PALETTE if count is None else 2 * count + SPARE):
-            raise ValueError(f"an image of {image.width}x{image.height} pixels, which is too small or too large")
-        return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
+def _digits(values: NDArray[np.float64]) -> list[float]:
+    return [float(f"{value:.7g}") for value in values]
 
 
 def codebook(values: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -8,15 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "logits",
+    "HALF_TURN",
+    "TURNED",
     "morton_order",
     "opacities",
     "packed",
     "smallest_three",
     "to_bits",
     "unit_quaternions",
-    "with_largest",
 ]
+
+# A rotation by 180 degrees around x, to axes with y up: of positions, and of the harmonics of degree 1, 2 and 3, of
+# which those that are odd in (y, z) change their sign.
+HALF_TURN = np.array([1.0, -1.0, -1.0])
+TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float64)
 
 
 def opacities(state: Mapping[str, NDArray]) -> NDArray[np.float64]:
@@ -46,20 +51,6 @@ def to_bits(values: NDArray, bits: int) -> NDArray[np.uint32]:
     """Quantise values in [0, 1], after clipping, to the nearest of the levels 0 to 2^bits - 1."""
     most = (1 << bits) - 1
     return np.round(np.clip(values, 0.0, 1.0) * most).astype(np.uint32)
-
-
-def logits(opacity: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the logits (N,) of opacities, which are kept half a step of eight bits away from 0 and 1."""
-    opacity = np.clip(opacity, 0.5 / 255.0, 254.5 / 255.0)
-    return np.log(opacity / (1.0 - opacity))
-
-
-def with_largest(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return unit quaternions (N, 4) from what `smallest_three` stores."""
-    q = np.zeros((len(largest), 4))
-    q[np.arange(4) != largest[:, None]] = others.ravel()
-    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(1.0 - (others**2).sum(axis=1), 0.0))
-    return q
 
 
 def packed(parts: NDArray[np.float64] | list[NDArray[np.float64]], bits: tuple[int, ...]) -> NDArray[np.uint32]:

@@ -16,7 +16,6 @@ from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
 from modp_ti.files.ply import parse_ply_header
 from modp_ti.files.reading import open_file
-from modp_ti.outputs.formats.splat_packing import logits
 
 __all__ = ["check_splats", "read_splats", "write_splats"]
 
@@ -24,6 +23,8 @@ __all__ = ["check_splats", "read_splats", "write_splats"]
 # renderers must use the same to reproduce the images. Brush and splat-transform read this comment and do so by
 # themselves.
 COMMENT = "SplatRenderMode: mip"
+# The logit of an opacity half a step of eight bits below 1, which an infinite one is read as.
+LARGEST_LOGIT = np.log(254.5 / 0.5)
 # Number of Gaussians that are written together, which bounds the memory that this takes.
 ROWS_EACH = 1 << 16
 
@@ -146,7 +147,7 @@ def read_splats(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     def columns(*wanted: str, may_be_infinite: bool = False) -> NDArray[np.float32]:
         values = np.ascontiguousarray(table[:, [column[name] for name in wanted]])
         if may_be_infinite:
-            values = np.where(np.isinf(values), logits(np.sign(values)), values).astype(np.float32)
+            values = np.where(np.isinf(values), np.copysign(LARGEST_LOGIT, values), values).astype(np.float32)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):
             raise InputError(f"{file}: Gaussian {bad[0]} holds NaN or infinite numbers; the file is damaged")

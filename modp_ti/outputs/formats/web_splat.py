@@ -11,17 +11,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import SH_C0
 from modp_ti.files.atomic import replace_file
-from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.splat_packing import logits, opacities, to_bits, unit_quaternions
+from modp_ti.outputs.formats.splat_packing import opacities, to_bits, unit_quaternions
 
-__all__ = ["read_web_splat", "write_web_splat"]
+__all__ = ["write_web_splat"]
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
@@ -43,30 +41,3 @@ def write_web_splat(path: str | os.PathLike[str], state: Mapping[str, NDArray]) 
     table["rgba"][:, 3] = to_bits(opacity[order], 8)
     table["rotation"] = np.clip(np.round(unit_quaternions(state)[order] * 128.0) + 128.0, 0, 255)
     replace_file(path, table.tobytes())
-
-
-def read_web_splat(data: bytes, path: Path) -> dict[str, NDArray]:
-    """Read the content of a `.splat` file.
-
-    Args:
-        data: The content.
-        path: The file, for error messages.
-
-    Returns:
-        Gaussians by name, as `GaussianField.load` takes them.
-
-    Raises:
-        InputError: If the file is damaged.
-    """
-    if len(data) == 0 or len(data) % RECORD.itemsize:
-        raise InputError(f"{path}: not a .splat file, or a damaged one: its size is not a multiple of 32")
-    table = np.frombuffer(data, RECORD)
-    if not (table["scale"] > 0).all() or not np.isfinite(table["position"]).all():
-        raise InputError(f"{path}: not a .splat file, or a damaged one: a number is out of range")
-    return {
-        "position": table["position"],
-        "log_scale": np.log(table["scale"]),
-        "quaternion": (table["rotation"].astype(np.float64) - 128.0) / 128.0,
-        "opacity_logit": logits(table["rgba"][:, 3] / 255.0),
-        "sh": ((table["rgba"][:, None, :3] / 255.0) - 0.5) / SH_C0,
-    }

@@ -10,11 +10,10 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files, refuse_foreign
 from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
 from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
+from modp_ti.outputs.formats.gltf import write_splat_glb
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, TRUNCATION, extracted, fused, supported, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points
-from modp_ti.outputs.formats.sog import write_sog
-from modp_ti.outputs.formats.sog_lod import write_sog_lod
-from modp_ti.outputs.formats.splat_glb import write_splat_glb
+from modp_ti.outputs.formats.sog import write_sog, write_sog_lod
 from modp_ti.outputs.formats.spz import DEFAULT_VERSION, write_spz
 from modp_ti.outputs.formats.textured_mesh import painted, require_atlas, unwrapped
 from modp_ti.outputs.formats.web_splat import write_web_splat

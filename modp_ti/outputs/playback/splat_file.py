@@ -1,4 +1,4 @@
-"""`open_splats`: a file of splats in place of a finished run, for `modp-ti view`."""
+"""`open_splats`: a PLY file of splats in place of a finished run, for `modp-ti view`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.frames_json import FramesRecord
-from modp_ti.outputs.formats.splat_files import read_any_splats
+from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.finished_run import FinishedRun
 
@@ -41,12 +42,16 @@ class SplatFile(FinishedRun):
 
 
 def open_splats(path: Path) -> SplatFile:
-    """Read a file of splats as a run of one frame, from which the whole is seen.
+    """Read a PLY file of splats as a run of one frame, from which the whole is seen.
 
     Raises:
-        InputError: If the file cannot be read.
+        InputError: If the file is no PLY file of 3DGS, cannot be read, or holds no splat.
     """
-    state = read_any_splats(path)
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: splats are read from .ply; splat-transform converts other formats")
+    state = read_splats(path)
+    if len(state["position"]) == 0:
+        raise InputError(f"{path}: holds no splat")
     centre = np.median(state["position"], axis=0).astype(np.float64)
     radius = max(float(np.quantile(np.linalg.norm(state["position"] - centre, axis=1), RADIUS)), 1e-9)
     T = looking_at(centre + radius * PLACE, centre, np.array([0.0, -1.0, 0.0]))

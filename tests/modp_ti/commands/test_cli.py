@@ -287,7 +287,6 @@ def test_ctrl_c_ends_a_real_process_with_130_and_leaves_nothing(scene):
         ["run", "a.yaml", "--set"],
         ["export", "out"],
         ["export", "out", "--format", "nonsense"],
-        ["convert", "a", "b", "c"],
         ["check"],
         ["locate", "out"],
         ["nonsense"],
@@ -321,7 +320,7 @@ def test_help_on_a_narrow_terminal_names_whole_options():
     assert "\u2026" not in text
 
 
-COMMANDS = ["run", "batch", "refine", "cameras", "check", "render", "export", "convert", "locate", "view", "warmup"]
+COMMANDS = ["run", "batch", "refine", "cameras", "check", "render", "export", "locate", "view", "warmup"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

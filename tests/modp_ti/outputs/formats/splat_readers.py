@@ -16,6 +16,7 @@ from plyfile import PlyData
 
 State = dict[str, NDArray]
 SH_C0 = 0.28209479177387814
+ODD = [1, 2, 4, 7, 9, 11, 12, 14]  # harmonics that are odd in y and z together
 
 
 def logit(opacity: NDArray) -> NDArray:
@@ -83,8 +84,7 @@ def read_spz(path: Path) -> State:
         row[largest] = np.sqrt(1 - (row**2).sum())
     sh = np.concatenate([((colours / 255 - 0.5) / 0.15)[:, None], rest], axis=1)
     # Right, up, back to right, down, front: y and z change their signs, and with them what is odd in both together.
-    odd = [1, 2, 4, 7, 9, 11, 12, 14]
-    sh[:, [k for k in odd if k <= coefficients]] *= -1
+    sh[:, [k for k in ODD if k <= coefficients]] *= -1
     return {
         "position": fixed / 2.0**fractional * [1, -1, -1],
         "log_scale": scales / 16 - 10,
@@ -176,44 +176,73 @@ def read_sog(path: Path) -> State:
     }
 
 
-def read_ksplat(path: Path) -> State:
+def read_ply(path: Path) -> State:
+    vertex = PlyData.read(path)["vertex"]
+    names = [p.name for p in vertex.properties]
+    assert names[:9] == [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+
+    def columns(*wanted: str) -> NDArray:
+        return np.stack([vertex[name] for name in wanted], axis=1)
+
+    # All coefficients of red come before those of green.
+    rest = [name for name in names if name.startswith("f_rest_")]
+    others = columns(*rest).reshape(len(vertex.data), 3, -1).transpose(0, 2, 1) if rest else np.zeros((0, 0, 3))
+    constant = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    return {
+        "position": columns(*"xyz"),
+        "log_scale": columns("scale_0", "scale_1", "scale_2"),
+        "quaternion": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        "opacity_logit": vertex["opacity"],
+        "sh": np.concatenate([constant, others], axis=1) if rest else constant,
+    }
+
+
+def read_glb(path: Path) -> State:
+    """Read a GLB of splats from glTF 2.0 and KHR_gaussian_splatting."""
     data = path.read_bytes()
-    assert data[:2] == b"\0\1"
-    most_sections, sections, most, count, level = struct.unpack_from("<4IH", data, 4)
-    assert (most_sections, sections, most) == (1, 1, count)
-    held, room, per_bucket, buckets, size = struct.unpack_from("<4If", data, 4096)
-    stride, steps, full, partly, degree = struct.unpack_from("<H2xI4xIIH", data, 4096 + 20)
-    assert (held, room, level, stride, full + partly) == (count, count, 1, 12, buckets)
-    filled = struct.unpack_from(f"<{partly}I", data, 5120)
-    places = 5120 + 4 * partly
-    at = places + 12 * buckets
-    rows: dict[str, list] = {name: [] for name in ("position", "log_scale", "quaternion", "opacity_logit", "sh")}
-    for bucket in range(buckets):
-        centre = np.array(struct.unpack_from("<3f", data, places + 12 * bucket))
-        for _ in range(per_bucket if bucket < full else filled[bucket - full]):
-            place, scale = struct.unpack_from("<3H", data, at), struct.unpack_from("<3e", data, at + 6)
-            *rgb, alpha = data[at + 20 : at + 24]
-            harmonics = list(struct.unpack_from(f"<{3 * ((degree + 1) ** 2 - 1)}e", data, at + 24))
-            sh = [(np.array(rgb) / 255 - 0.5) / SH_C0]
-            for each in range(1, degree + 1):
-                width = 2 * each + 1
-                red, green, blue = (harmonics[n * width : (n + 1) * width] for n in range(3))
-                sh += [np.array(colour) for colour in zip(red, green, blue, strict=True)]
-                del harmonics[: 3 * width]
-            rows["position"].append((np.array(place) - steps) * size / 2 / steps + centre)
-            rows["log_scale"].append(np.log(scale))
-            rows["quaternion"].append(struct.unpack_from("<4e", data, at + 12))
-            rows["opacity_logit"].append(logit(np.array(alpha / 255)))
-            rows["sh"].append(sh)
-            at += 24 + 6 * ((degree + 1) ** 2 - 1)
-    assert at == len(data)
-    return {name: np.array(values) for name, values in rows.items()}
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    document = json.loads(data[20 : 20 + size])
+    assert struct.unpack_from("<I4s", data, 20 + size) == (document["buffers"][0]["byteLength"], b"BIN\0")
+    primitive = document["meshes"][0]["primitives"][0]
+    extension = primitive["extensions"]["KHR_gaussian_splatting"]
+    assert primitive["mode"] == 0 and document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert (extension["kernel"], extension["colorSpace"]) == ("ellipse", "srgb_rec709_display")
+
+    def attribute(name: str) -> NDArray:
+        accessor = document["accessors"][primitive["attributes"][name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        start = 28 + size + view["byteOffset"]
+        values = np.frombuffer(data, kind, accessor["count"] * width, start).reshape(-1, width)
+        assert values.nbytes == view["byteLength"] and view["byteOffset"] % 4 == 0
+        if "min" in accessor:
+            np.testing.assert_array_equal(values.min(axis=0), np.float32(accessor["min"]))
+        return values
+
+    rest = [f"SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)]
+    rest = [name for name in rest if f"KHR_gaussian_splatting:{name}" in primitive["attributes"]]
+    sh = np.stack([attribute(f"KHR_gaussian_splatting:{name}") for name in rest], axis=1).copy()
+    sh[:, [k for k in ODD if k < sh.shape[1]]] *= -1
+    x, y, z, w = attribute("KHR_gaussian_splatting:ROTATION").T
+    opacity = attribute("KHR_gaussian_splatting:OPACITY")[:, 0]
+    np.testing.assert_allclose(attribute("COLOR_0")[:, 3] / 255, opacity, atol=0.51 / 255)
+    return {
+        "position": attribute("POSITION") * [1, -1, -1],
+        "log_scale": np.log(attribute("KHR_gaussian_splatting:SCALE")),
+        # Multiplied from the left by the quaternion (0, -1, 0, 0), w first.
+        "quaternion": np.stack([x, -w, z, -y], axis=1),
+        "opacity_logit": logit(opacity),
+        "sh": sh,
+    }
 
 
 READERS = {
+    "ply": read_ply,
     "splat": read_splat,
     "spz": read_spz,
     "sog": read_sog,
     "compressed-ply": read_compressed_ply,
-    "ksplat": read_ksplat,
+    "splat-glb": read_glb,
 }

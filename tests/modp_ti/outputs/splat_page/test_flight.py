@@ -15,7 +15,7 @@ from modp_ti.outputs.formats.frames_json import FramesRecord
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.splat_page.flight import DEPTH, level, moved, viewer_settings
-from tests.modp_ti.outputs.formats.test_compressed_splats import splats
+from tests.modp_ti.outputs.formats.test_splats import splats
 from tests.pipelines.reference import sh_basis
 
 UP = np.array([0.0, -1.0, 0.0])

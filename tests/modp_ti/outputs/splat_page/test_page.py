@@ -11,7 +11,7 @@ import pytest
 
 from modp_ti.outputs.formats.sog import sog_bytes
 from modp_ti.outputs.splat_page.page import write_splat_page
-from tests.modp_ti.outputs.formats.test_sog import clustered
+from tests.modp_ti.outputs.formats.test_splats import clustered
 
 NAME = "</title><script>alert('x')</script> & more"
 ALPHABET = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%&()*+-;,=>?@^_`{|}~"
