@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.inspection.conventions import Convention
-from modp_ti.inputs.multiview.estimators import estimated
 from modp_ti.inputs.multiview.features import Features, essential_matrix, match_anywhere
+from modp_ti.inputs.multiview.reprojection import estimated
 
 __all__ = ["EpipolarScore", "MatchedPair", "epipolar_score", "matched_pair"]
 

@@ -1,20 +1,20 @@
-"""Frames with the features that are tracked through them."""
+"""Frames with the features that are tracked through them: Shi-Tomasi corners and pyramidal Lucas-Kanade flow."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.klt.optical_flow import corners, flow
-from modp_ti.inputs.klt.relocalisation import describe
-from modp_ti.inputs.multiview.features import Features
+from modp_ti.inputs.multiview.features import Features, detect_features
 
-__all__ = ["WANTED", "Frame", "LocalisedFrame"]
+__all__ = ["WANTED", "Frame", "LocalisedFrame", "corners", "describe", "flow"]
 
 WANTED = 450  # features that are tracked
+DESCRIBED_SIDE = 400  # longer side at which SIFT features are detected: 60 % of the time that 640 px take
 
 
 @dataclass
@@ -70,3 +70,181 @@ class LocalisedFrame(Frame):
     """
 
     T_camera_world: NDArray[np.float64] = field(kw_only=True)
+
+
+def describe(grey: NDArray[np.uint8]) -> Features:
+    """SIFT features of a tracked image (H, W) uint8."""
+    return detect_features(np.repeat(grey[..., None], 3, axis=2), side=DESCRIBED_SIDE)
+
+
+WINDOW = (21, 21)
+LEVELS = 4  # pyramid levels above the image itself, at most
+# Levels above the image, forwards and backwards, where the predicted motion is at most SLOW px in the median. The way
+# back starts where it should end. All levels are used if a smaller share of the points than PREDICTED_SHARE is tracked.
+SLOW = 12.0
+SLOW_LEVELS, RETURN_LEVELS = 2, 1
+PREDICTED_SHARE = 0.85
+# Largest forward-backward error [px].
+ROUND_TRIP = 0.7
+# Smallest minimum eigenvalue of a corner's structure tensor, as a share of the best corner's.
+QUALITY = 0.002
+BORDER = 8  # px from the edge, where windows would be cut off
+# Bands of rows and strips of columns whose brightness is compared. The bands are lit apart if the logarithm of their
+# change deviates by UNEVEN between them, and by twice as much as between the strips.
+BANDS, STRIPS = 60, 4
+UNEVEN = 0.04
+
+
+def flow(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    pixels: NDArray[np.float64],
+    guess: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Track points from one image to the next, with a forward-backward check.
+
+    Pixel centres are at +0.5.
+
+    Args:
+        before: (H, W) uint8.
+        after: (H, W) uint8.
+        pixels: (N, 2) points in `before`.
+        guess: (N, 2) predicted positions in `after`, None to start from `pixels`. Few pyramid levels are enough where a
+            slow motion is predicted, unless that turns out to be wrong.
+
+    Returns:
+        Positions (N, 2) in `after`, and a mask (N,) of the points that were tracked.
+    """
+    if len(pixels) == 0:
+        return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+    before = _lit_alike(before, after)
+    levels = _levels(before)
+    if guess is not None and levels > SLOW_LEVELS and np.median(np.linalg.norm(guess - pixels, axis=1)) <= SLOW:
+        result, found = _flow(before, after, pixels, guess, SLOW_LEVELS, RETURN_LEVELS)
+        if found.mean() >= PREDICTED_SHARE:
+            return result, found
+    return _flow(before, after, pixels, pixels if guess is None else guess, levels, levels)
+
+
+def _flow(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    pixels: NDArray[np.float64],
+    guess: NDArray[np.float64],
+    levels: int,
+    return_levels: int,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Track points with the image and `levels` pyramid levels above it, on the way back `return_levels`; see `flow`."""
+    height, width = before.shape
+    # In cv2 the first pixel's centre is 0, and points are float32.
+    start = (pixels - 0.5).astype(np.float32)[:, None]
+    there = np.clip(guess - 0.5, (-width, -height), (2 * width, 2 * height)).astype(np.float32)[:, None]
+    options = {
+        "winSize": WINDOW,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
+    }
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, there.copy(), maxLevel=levels, **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, start.copy(), maxLevel=return_levels, **options)
+    found = (found[:, 0] > 0) & (returned[:, 0] > 0) & np.isfinite(there).all(axis=(1, 2))
+    found &= np.linalg.norm(back - start, axis=(1, 2)) < ROUND_TRIP
+    result = there[:, 0].astype(np.float64) + 0.5
+    found &= (result >= BORDER).all(axis=1) & (result <= (width - BORDER, height - BORDER)).all(axis=1)
+    return result, found
+
+
+def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Match brightness and contrast of `before` to `after`, since flow mistakes exposure changes for motion."""
+    gains = _gains_of_rows(before, after)
+    if gains is not None:
+        return np.clip(np.rint(before * gains[:, None]), 0, 255).astype(np.uint8)
+    (mean,), (deviation,) = (each.ravel() for each in cv2.meanStdDev(before))
+    (mean_after,), (deviation_after,) = (each.ravel() for each in cv2.meanStdDev(after))
+    gain = float(deviation_after / max(deviation, 1e-6))
+    if not 0.5 < gain < 2.0 or (abs(gain - 1.0) < 0.02 and abs(mean - mean_after) < 2.0):
+        return before
+    return np.asarray(cv2.convertScaleAbs(before, alpha=gain, beta=float(mean_after - gain * mean)), dtype=np.uint8)
+
+
+def _gains_of_rows(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    """Factors (H,) from the brightness of each row of `before` to that of `after`, where bands are lit differently.
+
+    Lamps that flicker with the mains, and a sensor that exposes its rows one after the other, give bands that wander
+    over the image. A scene that moves changes the brightness of rows too, but not alike in all columns.
+
+    Returns:
+        The factors; None if there are no bands.
+    """
+    then, now = (
+        np.log1p(cv2.resize(each, (STRIPS, BANDS), interpolation=cv2.INTER_AREA).astype(np.float32))
+        for each in (before, after)
+    )
+    change = cv2.blur(now - then, (1, 3))
+    common = np.median(change, axis=1)
+    if np.std(common) < max(UNEVEN, 2.0 * float(np.std(change - common[:, None]))):
+        return None
+    return np.exp(cv2.resize(common[:, None], (1, before.shape[0]), interpolation=cv2.INTER_LINEAR)[:, 0])
+
+
+def _levels(grey: NDArray[np.uint8]) -> int:
+    """Number of pyramid levels above the image whose shorter side still exceeds two windows."""
+    levels = 0
+    while levels < LEVELS and min(grey.shape) >> (levels + 1) > 2 * WINDOW[0]:
+        levels += 1
+    return levels
+
+
+def corners(
+    grey: NDArray[np.uint8],
+    taken: NDArray[np.float64],
+    wanted: int,
+    valid: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
+    """Detect new corners, distributed over a grid and away from existing features.
+
+    Args:
+        grey: (H, W) uint8.
+        taken: (M, 2) existing features.
+        wanted: Number of features, including `taken`.
+        valid: (H, W), False where no corner may be.
+
+    Returns:
+        Corners (N, 2), with pixel centres at +0.5.
+    """
+    height, width = grey.shape
+    if min(height, width) <= 4 * BORDER:
+        return np.zeros((0, 2))
+    cell = max(8, round(np.sqrt(width * height / max(wanted, 1))))
+    rows, columns = -(-height // cell), -(-width // cell)
+    response = cv2.cornerMinEigenVal(grey, 7, ksize=3)
+    local = response >= cv2.dilate(response, np.ones((7, 7), np.uint8))
+    usable = np.zeros((height, width), dtype=bool)
+    usable[BORDER:-BORDER, BORDER:-BORDER] = True
+    if valid is not None:
+        # A window across the mask's edge would track the edge.
+        usable &= cv2.erode(valid.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    if len(taken):
+        blocked = np.zeros((height, width), np.uint8)
+        for x, y in np.floor(taken).astype(int).tolist():
+            cv2.circle(blocked, (x, y), max(5, cell // 3), 1, -1)
+        usable &= blocked == 0
+    y, x = np.nonzero(local & usable)
+    strength = response[y, x]
+    good = strength > max(QUALITY * float(response.max()), 1e-6)
+    y, x, strength = y[good], x[good], strength[good]
+
+    occupied = np.zeros(rows * columns, dtype=np.int64)
+    if len(taken):
+        c = np.clip(np.floor(taken[:, 1] / cell), 0, rows - 1) * columns
+        c += np.clip(np.floor(taken[:, 0] / cell), 0, columns - 1)
+        occupied += np.bincount(c.astype(np.int64), minlength=rows * columns)
+    of_cell = (y // cell) * columns + x // cell
+    order = np.lexsort((-strength, of_cell))
+    of_cell, x, y, strength = of_cell[order], x[order], y[order], strength[order]
+    first = np.searchsorted(of_cell, of_cell)
+    rank = np.arange(len(of_cell)) - first + occupied[of_cell]
+    # First the best corner of each cell, then the next best ones where cells have none.
+    order = np.lexsort((-strength, rank))
+    chosen = order[: max(0, wanted - len(taken))]
+    chosen = chosen[rank[chosen] < 3]
+    return np.stack([x[chosen], y[chosen]], axis=1).astype(np.float64) + 0.5

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose, scale_of
-from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.multiview.adjustment_process import adjusted_apart
-from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_bundle
+from modp_ti.inputs.klt.camera import Lens
+from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_apart, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
 

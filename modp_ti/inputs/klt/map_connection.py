@@ -1,4 +1,4 @@
-"""Connection of the keyframes of a map that recognise each other, and the check that the map agrees with it."""
+"""Connection of keyframes that recognise each other, and joining of two maps that show the same places."""
 
 from __future__ import annotations
 
@@ -10,10 +10,19 @@ from numpy.typing import NDArray
 from modp_ti.inputs.klt.frame import LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import searched
-from modp_ti.inputs.klt.recognition import Recognition
-from modp_ti.inputs.klt.relocalisation import described_keyframe, inherited
+from modp_ti.inputs.klt.recognition import (
+    PlaceIndex,
+    Recognition,
+    agreeing,
+    described_keyframe,
+    inherited,
+    recognised,
+    world_points,
+)
+from modp_ti.inputs.klt.tracking import Tracking
+from modp_ti.inputs.multiview.reprojection import estimated, ray_errors
 
-__all__ = ["connected"]
+__all__ = ["MapJoining", "connected", "inverse_similarity", "joint_similarity"]
 
 ROUNDS = 2  # bundle adjustments, each without the outliers of the one before
 # The map contradicts a connection if the residuals of more of the connecting observations, or of the others, are those
@@ -70,3 +79,108 @@ def connect(landmarks: LandmarkMap, found: Sequence[Recognition]) -> list[tuple[
 
 def _observations(landmarks: LandmarkMap) -> int:
     return sum(int(landmarks.known[keyframe.ids].sum()) for keyframe in landmarks.keyframes)
+
+
+CANDIDATES = 3  # keyframes of another map with which a keyframe is compared
+AGREEING = 3  # keyframes that must agree
+PAUSE = 5  # keyframes after a join that was refused in which none is sought
+MAX_ERROR_3D = 0.05  # of corresponding points, relative to their depth
+MAX_ERROR = 5.0  # px
+
+
+class MapJoining:
+    """Finds out which map shows the place of the map that is being tracked.
+
+    Args:
+        seed: Seed of RANSAC and of the vocabulary.
+
+    Attributes:
+        refused: Number of joins that the joint map contradicted.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.refused = 0
+        self._index = PlaceIndex(seed)
+        self._seed = seed
+        self._pause: tuple[Tracking, int] | None = None  # a map, and its number of keyframes until which it rests
+        self._found: list[tuple[Tracking, Tracking, Recognition]] = []
+
+    def found(self, active: Tracking, others: Sequence[Tracking]) -> tuple[Tracking, list[Recognition]] | None:
+        """Compare the last keyframe of a map with the keyframes of other maps.
+
+        Returns:
+            The other map with at least AGREEING recognitions that agree; None if there is none.
+        """
+        by = active.map.keyframes[-1]
+        if self._pause is not None and active is self._pause[0] and len(active.map.keyframes) < self._pause[1]:
+            return None
+        candidates = [(other, keyframe) for other in others for keyframe in other.map.keyframes]
+        if not candidates:
+            return None
+        likeness = self._index.likeness(by, [keyframe for _, keyframe in candidates])
+        for at in np.argsort(-likeness, kind="stable")[:CANDIDATES]:
+            other, of = candidates[at]
+            recognition = recognised(other.map, of, active.map, by, self._seed)
+            if recognition is None:
+                continue
+            self._found.append((active, other, recognition))
+            same = [each for one, two, each in self._found if one is active and two is other]
+            same = agreeing(same, recognition)
+            if len({each.by.number for each in same}) >= AGREEING:
+                self._found.clear()  # the maps change
+                return other, same
+        return None
+
+    def refuse(self, active: Tracking) -> None:
+        """Note that the joint map contradicted what was found, so that the same is not found again at once."""
+        self.refused += 1
+        self._pause = active, len(active.map.keyframes) + PAUSE
+
+
+def joint_similarity(
+    landmarks: LandmarkMap, own: LandmarkMap, found: Sequence[Recognition], seed: int
+) -> NDArray[np.float64]:
+    """The similarity S_of_by (4, 4) that fits the matches of all recognitions best.
+
+    One is estimated from all pairs of matched points; it competes with those of the single recognitions by the number
+    of points that it leads to where the other map sees them.
+
+    Args:
+        landmarks: The map of the recognised keyframes.
+        own: The map of the keyframes that recognised them.
+        found: Recognitions that agree.
+        seed: Seed of RANSAC.
+    """
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    matched = [
+        (world_points(landmarks, each.of)[each.pairs[:, 0]], world_points(own, each.by)[each.pairs[:, 1]])
+        for each in found
+    ]
+    both = [np.isfinite(np.c_[there, here]).all(axis=1) for there, here in matched]
+    candidates = [each.S_of_by for each in found]
+    options = pycolmap.RANSACOptions()
+    options.max_error = MAX_ERROR_3D * float(np.median([each.depth for each in found]))
+    options.random_seed = seed
+    there = np.concatenate([pair[0][good] for pair, good in zip(matched, both, strict=True)])
+    here = np.concatenate([pair[1][good] for pair, good in zip(matched, both, strict=True)])
+    together = estimated(pycolmap.estimate_sim3d_robust, here, there, options)
+    if together is not None:
+        # The declared type leaves out the dictionary around the transform.
+        matrix = together["tgt_from_src"].matrix()  # pyright: ignore[reportIndexIssue]
+        candidates.append(np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)]))
+
+    def fitting(S: NDArray[np.float64]) -> int:
+        count = 0
+        for each, (_, here), good in zip(found, matched, both, strict=True):
+            rays = landmarks.lens.rays(described_keyframe(each.of).pixels[each.pairs[good, 0]])
+            error = ray_errors(each.of.T_camera_world, here[good] @ S[:3, :3].T + S[:3, 3], rays)
+            count += int((error * landmarks.lens.focal < MAX_ERROR).sum())
+        return count
+
+    return max(candidates, key=fitting)
+
+
+def inverse_similarity(S: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse (4, 4) of a similarity (4, 4)."""
+    return np.asarray(np.linalg.inv(S), dtype=np.float64)

@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
-from modp_ti.inputs.klt.camera_refinement import CameraRefinement
+from modp_ti.inputs.klt.camera import CameraRefinement, Lens
 from modp_ti.inputs.klt.frame import Frame
 from modp_ti.inputs.klt.initialisation import Initialisation
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
-from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.loop_closing import LoopClosing
-from modp_ti.inputs.klt.map_connection import connected
-from modp_ti.inputs.klt.map_joining import MapJoining, inverse_similarity, joint_similarity
+from modp_ti.inputs.klt.map_connection import MapJoining, connected, inverse_similarity, joint_similarity
 from modp_ti.inputs.klt.tracking import Tracking, View
 
 __all__ = ["Odometry"]

@@ -1,8 +1,8 @@
-"""Opening of the tracker `klt`: checks the images, and finds their camera if it is unknown."""
+"""Opening of the tracker `klt`: checks the images, and estimates their camera if it is unknown."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,18 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.klt.calibration import ADVICE, TYPICAL_FOCAL, estimated_intrinsics, estimation_note
-from modp_ti.inputs.klt.pose_graph import solver_is_there
+from modp_ti.inputs.klt.camera import (
+    ADVICE,
+    BEFORE_TRACKING,
+    FOCAL_FROM,
+    TYPICAL_FOCAL,
+    Lens,
+    estimation_note,
+    intrinsics_of,
+    is_plausible,
+)
+from modp_ti.inputs.klt.loop_closing import solver_is_there
+from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.selected_images import available, followed_scale, read_image, require_size
 from modp_ti.inputs.klt.tracker import KltTracker
 from modp_ti.inputs.opening import open_source, require_pinhole
@@ -21,7 +31,7 @@ from modp_ti.inputs.replay import readable_sizes
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, require_intrinsics
 from modp_ti.inputs.sources.image_header import focal_length_35mm
 
-__all__ = ["open_klt"]
+__all__ = ["estimated_intrinsics", "open_klt"]
 
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
@@ -124,3 +134,57 @@ def _estimated(reader: FrameReader, blank: Intrinsics, seed: int, progress: Prog
     total = min(CALIBRATION_FRAMES, len(there))
     found, used = estimated_intrinsics(images(), (width, height), guess.camera.fx, seed, progress, total)
     return (guess, note) if found is None else (found, estimation_note(found, used))
+
+
+# Further keyframes change the estimate little.
+ENOUGH = 60
+
+Image = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
+
+
+def estimated_intrinsics(
+    images: Iterable[Image],
+    size: tuple[int, int],
+    start: float,
+    seed: int,
+    progress: Progress | None,
+    total: int,
+    enough: int = ENOUGH,
+) -> tuple[Intrinsics | None, int]:
+    """Estimate one focal length and one radial distortion coefficient; the principal point is the image centre.
+
+    The images are tracked with the initial focal length. Then the map and the camera are bundle adjusted together.
+
+    Args:
+        images: Grey images (H, W) uint8 with masks of the usable pixels. All have one size, with the aspect ratio of
+            the stored images.
+        size: (width, height) of the stored images.
+        start: Initial focal length [px of the stored images].
+        seed: Seed of RANSAC.
+        progress: Called after each image.
+        total: Number of images to report to `progress`.
+        enough: Number of keyframes after which no further images are used.
+
+    Returns:
+        The camera of the stored images, or None if it cannot be estimated; and the number of images used.
+    """
+    odometry, used = None, 0
+    for grey, valid in images:
+        if odometry is None:
+            scale = grey.shape[1] / size[0]
+            lens = Lens.radial(start * scale, 0.0, grey.shape[1], grey.shape[0])
+            odometry = Odometry([lens], seed, BEFORE_TRACKING)
+        odometry.process(used, grey, valid)
+        used += 1
+        if progress is not None:
+            progress("estimating the camera", min(used, total - 1), total)
+        if odometry.tracking is not None and len(odometry.tracking.map.keyframes) >= enough:
+            break
+    if progress is not None:
+        progress("estimating the camera", total, total)
+    tracking = None if odometry is None else odometry.tracking
+    if tracking is None or len(tracking.map.keyframes) < FOCAL_FROM:
+        return None, used
+    tracking.refine_camera()
+    lens = tracking.map.lens
+    return (intrinsics_of(lens, size) if is_plausible(lens) else None), used

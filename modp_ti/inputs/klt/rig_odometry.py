@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
+from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
-from modp_ti.inputs.klt.initialisation import BETWEEN, LEAST_ANGLE, LEAST_SHIFT
+from modp_ti.inputs.klt.initialisation import BETWEEN, LEAST_ANGLE, LEAST_SHIFT, MAX_ERROR
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, triangulated
-from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.rig_tracking import RigTracking, localised_rig, replenished
 from modp_ti.inputs.klt.tracking import View
-from modp_ti.inputs.klt.two_view import MAX_ERROR
 from modp_ti.inputs.multiview.reprojection import ray_errors
 from modp_ti.inputs.multiview.rig_pose import relative_rig_pose
 

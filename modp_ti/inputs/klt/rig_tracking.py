@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised
-from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
+from modp_ti.inputs.klt.frame import Frame, LocalisedFrame, corners
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, MAX_ERROR, SIGMA, predicted_pixels, realigned, searched
-from modp_ti.inputs.klt.optical_flow import corners
-from modp_ti.inputs.klt.relocalisation import place_by_features
+from modp_ti.inputs.klt.recognition import place_by_features
 from modp_ti.inputs.klt.tracking import EAGER, KEYFRAME_SHARE, KEYFRAME_SHIFT, LAZY, View
 from modp_ti.inputs.multiview.rig_pose import refine_rig_pose, rig_errors, rig_pose_from_points
 

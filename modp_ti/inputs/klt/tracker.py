@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.klt.calibration import estimation_note, intrinsics_of
-from modp_ti.inputs.klt.camera_refinement import WHILE_TRACKING
+from modp_ti.inputs.klt.camera import WHILE_TRACKING, Lens, estimation_note, intrinsics_of
 from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
-from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.rig_odometry import RigOdometry
 from modp_ti.inputs.klt.selected_images import arriving, available, followed_scale, read_image

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised
 from fields.geometry.similarity import moved_pose, scale_of
-from modp_ti.inputs.klt.camera_refinement import CameraRefinement, is_plausible
+from modp_ti.inputs.klt.camera import CameraRefinement, is_plausible
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, predicted_pixels, realigned, searched
-from modp_ti.inputs.klt.map_revision import carry_over
-from modp_ti.inputs.klt.relocalisation import alike_keyframes, inherited, place_by_features, thumbnail
+from modp_ti.inputs.klt.recognition import alike_keyframes, inherited, place_by_features, thumbnail
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.reprojection import refine_pose
 
@@ -308,14 +307,8 @@ class Tracking:
                 self._last.ids = self._last.ids + offset
         return offset
 
-    def revise(self, before: LandmarkMap, after: LandmarkMap) -> None:
-        """Take the adjustment of an earlier copy of the map, when the last frame is a keyframe or there are no more.
-
-        Args:
-            before: The copy.
-            after: The copy after its adjustment.
-        """
-        moves = carry_over(self.map, before, after)
+    def follow_moves(self, moves: Sequence[NDArray[np.float64]]) -> None:
+        """Note that the keyframes were moved by S_after_before (4, 4), when the last frame is a keyframe or the end."""
         self.motion = self.motion.copy()
         self.motion[:3, 3] *= float(scale_of(moves[-1]))
         self._wide_is_due = True

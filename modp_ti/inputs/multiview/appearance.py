@@ -1,4 +1,4 @@
-"""`Appearance`: finds the images that resemble a picture, by one vector per image (VLAD, Jegou 2010)."""
+"""Images that resemble each other, by one vector per image (VLAD, Jegou 2010)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.multiview.features import Features
-from modp_ti.inputs.multiview.vlad import vlad
 
-__all__ = ["Appearance"]
+__all__ = ["Appearance", "image_pairs", "nearest_words", "vlad"]
 
 # Words of the vocabulary, and the most descriptors that it is trained with. On redkitchen, 16, 32 and 64 words find the
 # same views.
@@ -57,3 +56,60 @@ def _clustered(described: NDArray[np.float32], seed: int) -> NDArray[np.float32]
     _, _, centres = cv2.kmeans(described, count, np.zeros((0, 1), np.int32), criteria, 1, cv2.KMEANS_PP_CENTERS)
     # Rounded, since the threads of k-means may sum in another order.
     return np.round(np.asarray(centres, np.float32))
+
+
+# Up to this number of images, all pairs are matched.
+ALL_PAIRS = 60
+# Images that look most like an image, which are matched with it: beside its neighbours in a sequence, where they close
+# loops, and alone.
+ALIKE_IN_SEQUENCE, ALIKE = 8, 30
+
+
+def image_pairs(features: Sequence[Features], overlap: int | None, seed: int) -> list[tuple[int, int]]:
+    """Choose the pairs of images that are matched.
+
+    Args:
+        features: Features of each image.
+        overlap: Number of next images in a sequence that an image is matched with, besides those 2, 4, 8, ... images
+            later. None for images in no order.
+        seed: Seed of the vocabulary.
+
+    Returns:
+        Ascending pairs (i, j) with i < j.
+    """
+    count = len(features)
+    if count <= ALL_PAIRS:
+        return [(i, j) for i in range(count) for j in range(i + 1, count)]
+    pairs: set[tuple[int, int]] = set()
+    if overlap is not None:
+        apart = sorted({*range(1, overlap + 1), *(1 << k for k in range(count.bit_length()))})
+        pairs |= {(i, i + step) for i in range(count) for step in apart if i + step < count}
+    likeness = Appearance(features, seed).likeness().astype(np.float64)
+    index = np.arange(count)
+    near = np.abs(index[:, None] - index) <= (0 if overlap is None else overlap)
+    likeness[near] = -np.inf  # neighbours would take the places of those that close a loop
+    alike = np.argsort(-likeness, axis=1, kind="stable")[:, : ALIKE if overlap is None else ALIKE_IN_SEQUENCE]
+    pairs |= {(min(i, int(j)), max(i, int(j))) for i in range(count) for j in alike[i] if not near[i, j]}
+    return sorted(pairs)
+
+
+def vlad(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Descriptor (count * 128,) of an image from its features (N, 128); zero without features.
+
+    The residuals of each word have length 1 in it, so that repeated structure does not dominate.
+    """
+    if len(descriptors) == 0 or len(words) == 0:
+        return np.zeros(words.size, np.float32)
+    data = descriptors.astype(np.float32)
+    nearest = nearest_words(data, words)
+    member = np.zeros((len(words), len(data)), np.float32)
+    member[nearest, np.arange(len(data))] = 1.0
+    residual = member @ data - member.sum(axis=1, keepdims=True) * words  # of integers, and so exact
+    residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-12)
+    vector = residual.reshape(-1)
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def nearest_words(data: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The nearest word of each descriptor."""
+    return ((words * words).sum(axis=1) - 2.0 * (data @ words.T)).argmin(axis=1)

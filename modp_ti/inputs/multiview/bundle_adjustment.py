@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -10,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
+from modp_ti.files.child_environment import child_environment
 
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-__all__ = ["Bundle", "Refinable", "adjusted_bundle"]
+__all__ = ["Bundle", "Refinable", "adjusted_apart", "adjusted_bundle", "main"]
 
 TOLERANCE = 1e-5  # relative change of the cost below which the optimisation stops
 
@@ -204,3 +208,29 @@ def _options(steps: int, loss_width: float, refined: Collection[Refinable]) -> p
     solver.num_threads = 1  # with several threads, the order of summation and so the result would vary between runs
     solver.function_tolerance = TOLERANCE
     return options
+
+
+CODE = "from modp_ti.inputs.multiview.bundle_adjustment import main; main()"
+
+
+def adjusted_apart(*arguments: object, **keywords: object) -> Bundle | None:
+    """Call `adjusted_bundle` with these arguments in a process of its own.
+
+    Returns:
+        The same result; None also if the process fails, for example because memory is short.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", CODE],
+        input=pickle.dumps((arguments, keywords)),
+        stdout=subprocess.PIPE,
+        env=child_environment(),
+        start_new_session=True,  # Ctrl-C is for this process
+        check=False,
+    )
+    return None if done.returncode else pickle.loads(done.stdout)
+
+
+def main() -> None:
+    """Serve one call, which comes through the standard input."""
+    arguments, keywords = pickle.load(sys.stdin.buffer)
+    sys.stdout.buffer.write(pickle.dumps(adjusted_bundle(*arguments, **keywords)))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, orthonormalised
-from modp_ti.inputs.multiview.estimators import estimated
 
 __all__ = [
     "Observations",
+    "estimated",
     "point_errors",
     "pose_from_points",
     "ray_errors",
@@ -248,3 +250,17 @@ def solve_damped(left: NDArray[np.float64], right: NDArray[np.float64], damping:
     trace = np.trace(left, axis1=1, axis2=2)
     left = left + np.eye(3) * (damping * trace + (trace == 0))[:, None, None]
     return np.linalg.solve(left, right[..., None])[..., 0].astype(np.float64, copy=False)
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def estimated(estimator: Callable[P, R], *args: P.args, **options: P.kwargs) -> R | None:
+    """Return what an estimator finds, None where it fails on these correspondences."""
+    import cv2
+
+    try:
+        return estimator(*args, **options)
+    except (cv2.error, ValueError, RuntimeError, IndexError):  # the latter three from C++, through pycolmap
+        return None

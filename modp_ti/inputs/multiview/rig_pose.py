@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, orthonormalised
-from modp_ti.inputs.multiview.estimators import estimated
+from modp_ti.inputs.multiview.reprojection import estimated
 
 __all__ = ["refine_rig_pose", "relative_rig_pose", "rig_errors", "rig_pose_from_points"]
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from modp_ti.inputs.multiview.estimators import estimated
 from modp_ti.inputs.multiview.features import Features
+from modp_ti.inputs.multiview.reprojection import estimated
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 

@@ -14,9 +14,9 @@ from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.run_folder import appearing
-from modp_ti.inputs.klt.calibration import TYPICAL_FOCAL
+from modp_ti.inputs.klt.camera import TYPICAL_FOCAL
+from modp_ti.inputs.multiview.appearance import image_pairs
 from modp_ti.inputs.multiview.features import detect_features
-from modp_ti.inputs.multiview.image_pairs import image_pairs
 from modp_ti.inputs.multiview.structure import MatchedImage, reconstructed
 from modp_ti.inputs.opening import open_source, require_pinhole
 from modp_ti.inputs.protocol import Progress

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.pixel_metric import pixel_jacobian
-from modp_ti.inputs.multiview.estimators import estimated
+from modp_ti.inputs.multiview.reprojection import estimated
 
 __all__ = ["Resection", "pose_covariance", "reprojection_errors", "resect"]
 

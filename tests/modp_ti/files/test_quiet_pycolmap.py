@@ -34,7 +34,7 @@ IN_THREAD = "thread = threading.Thread(target=load); thread.start(); thread.join
 # one: Ceres warns of the former at every step, and tells of the latter as an error.
 DEGENERATE = """
 import numpy as np
-from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.multiview.bundle_adjustment import adjusted_bundle
 camera = Lens.radial(100.0, 0.0, 100, 100).camera
 draw = np.random.default_rng(0)

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, inverse_se3
+from modp_ti.inputs.klt.camera import Lens
+from modp_ti.inputs.klt.frame import corners, flow
+from modp_ti.inputs.klt.initialisation import two_views
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, triangulated
-from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.optical_flow import corners, flow
-from modp_ti.inputs.klt.patch_alignment import align_landmarks, reference_views
-from modp_ti.inputs.klt.two_view import two_views
+from modp_ti.inputs.klt.localisation import align_landmarks, reference_views
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 
 CAMERA = PinholeCamera(500.0, 500.0, 320.0, 240.0, 640, 480)

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_pose, scale_of
-from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.loop_closing import LoopClosing
+from modp_ti.inputs.klt.camera import Lens
+from modp_ti.inputs.klt.loop_closing import Link, LoopClosing, closed_loop
 from modp_ti.inputs.klt.odometry import Odometry
-from modp_ti.inputs.klt.pose_graph import Link, closed_loop
 from modp_ti.inputs.klt.recognition import Recognition, recognised
 from modp_ti.inputs.klt.tracking import Tracking
 from modp_ti.outputs.evaluation import umeyama
@@ -132,7 +131,7 @@ def test_opposite_walls_that_look_alike_make_no_loop(box_room, monkeypatch):
         recognitions.append(recognised(*arguments))
         return recognitions[-1]
 
-    monkeypatch.setattr("modp_ti.inputs.klt.loop_detection.recognised", noted)
+    monkeypatch.setattr("modp_ti.inputs.klt.loop_closing.recognised", noted)
     odometry, _ = followed(room, round_walk(80, 0.7), None)
     assert sum(found is not None for found in recognitions) >= 3
     assert (odometry.loops, odometry.undone) == (0, 0)

@@ -6,9 +6,9 @@ import numpy as np
 
 from fields.geometry.se3 import exp_se3
 from fields.geometry.similarity import moved_points, moved_pose
+from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.map_revision import carry_over
+from modp_ti.inputs.klt.loop_closing import carry_over
 
 S = np.diag([1.3, 1.3, 1.3, 1.0]) @ exp_se3([0.3, -0.2, 0.5, 0.2, 0.4, -0.1])
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose
+from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.map_joining import MapJoining
+from modp_ti.inputs.klt.map_connection import MapJoining
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.recognition import Recognition
 from modp_ti.inputs.klt.tracking import View

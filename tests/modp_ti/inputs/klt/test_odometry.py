@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
-from modp_ti.inputs.klt.lens import Lens
+from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.tracking import Tracking, View
 from modp_ti.outputs.evaluation import umeyama

@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose
+from modp_ti.inputs.klt.camera import Lens
+from modp_ti.inputs.klt.frame import corners
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.klt.optical_flow import corners
-from modp_ti.inputs.klt.place_recognition import PlaceIndex, vocabulary
-from modp_ti.inputs.klt.recognition import Recognition, agreeing, recognised
-from modp_ti.inputs.multiview.vlad import vlad
+from modp_ti.inputs.klt.recognition import PlaceIndex, Recognition, agreeing, recognised, vocabulary
+from modp_ti.inputs.multiview.appearance import vlad
 from tests.room import look_at
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fields.geometry.se3 import exp_se3
-from modp_ti.inputs.klt.lens import Lens
-from modp_ti.inputs.multiview.adjustment_process import adjusted_apart
-from modp_ti.inputs.multiview.bundle_adjustment import adjusted_bundle
+from modp_ti.inputs.klt.camera import Lens
+from modp_ti.inputs.multiview.bundle_adjustment import adjusted_apart, adjusted_bundle
 
 
 def test_a_process_of_its_own_finds_the_same_as_this_one():
@@ -28,5 +27,5 @@ def test_a_process_of_its_own_finds_the_same_as_this_one():
 
 
 def test_a_process_that_ends_early_brings_nothing(monkeypatch):
-    monkeypatch.setattr("modp_ti.inputs.multiview.adjustment_process.CODE", "import os; os._exit(137)")
+    monkeypatch.setattr("modp_ti.inputs.multiview.bundle_adjustment.CODE", "import os; os._exit(137)")
     assert adjusted_apart() is None

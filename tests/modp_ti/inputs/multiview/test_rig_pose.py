@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3
 from modp_ti.config.camera_settings import PanoramaSettings
+from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
-from modp_ti.inputs.klt.lens import Lens
 from modp_ti.inputs.multiview.rig_pose import refine_rig_pose, relative_rig_pose, rig_errors, rig_pose_from_points
 from modp_ti.inputs.sources.panorama import Projection, faces_of
 

@@ -9,8 +9,8 @@ import pytest
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, exp_se3
+from modp_ti.inputs.multiview.appearance import ALL_PAIRS, image_pairs
 from modp_ti.inputs.multiview.features import Features
-from modp_ti.inputs.multiview.image_pairs import ALL_PAIRS, image_pairs
 from modp_ti.inputs.multiview.structure import MatchedImage, reconstructed
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.intrinsics import Intrinsics
