@@ -82,7 +82,7 @@ _default_rng = np.random.default_rng
 def _other_stream(seed: object = None) -> np.random.Generator:
     """Replacement for `np.random.default_rng` with another stream per disturbance. Generators are passed through.
 
-    The samples of `fault_injection` keep their streams: where they are cut in half must not become the end of a line.
+    The samples of `fault_injection` keep their streams: where they are cut must not become the end of a line.
     """
     if "/fault_injection/" in sys._getframe(1).f_code.co_filename:
         return _default_rng(seed)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -26,11 +25,9 @@ from tests.fault_injection.small_recording import (
     NAMES,
     WIDTH,
     picture,
-    pixels_on,
     points_file,
     position,
     scene_file,
-    seen_on,
     tum_line,
     wall,
     write_bytes,
@@ -140,46 +137,6 @@ def _write_run(folder: Path) -> None:
     (folder / "out" / "config.yaml").write_text((folder / "scene.yaml").read_text())
 
 
-def _write_weights(folder: Path) -> None:
-    import torch
-
-    write_colmap_text(folder)
-    torch.save({"lin0.model.1.weight": torch.ones(1, 4, 1, 1)}, folder / "weights.pth")
-    older = {"lin0.model.1.weight": torch.ones(1, 4, 1, 1), "more": torch.zeros(3)}
-    torch.save(older, folder / "older.pth", _use_new_zipfile_serialization=False)
-
-
-def _message(kind: int, payload: bytes = b"") -> bytes:
-    return struct.pack("<4sHHII", b"MODP", 1, kind, len(payload), 0) + payload
-
-
-def wire() -> bytes:
-    """Return a tracker's messages to the tracker server: three frames, a late pose and a correction."""
-    lens = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, *[0.0] * 8]
-    data = _message(1, struct.pack("<IIII12d", WIDTH, HEIGHT, 1, 0, *lens) + b"a tracker")
-    poses = []
-    for i in range(FRAMES):
-        T = np.eye(4)
-        T[0, 3] = -position(i)
-        poses.append(T)
-        late = i == 1
-        matrix = np.zeros((4, 4)) if late else T
-        points = b"".join(struct.pack("<q5d", n, *wall()[n], *pixels_on(i)[n]) for n in seen_on(i)[:5])
-        image = cv2.imencode(".jpg", picture(i))[1].tobytes()
-        head = struct.pack("<IId16d", i, 0 if late else 1, i / 30, *matrix.ravel())
-        block = b"" if late else points
-        data += _message(2, head + struct.pack("<II", len(block) // 48, len(image)) + block + image)
-        if late:
-            head = struct.pack("<IId16dII", i, 1, 0.0, *T.ravel(), len(points) // 48, 0)
-            data += _message(3, head + points)
-    moved = struct.pack("<IIII16d", 1, 1, 0, 0, *poses[0].ravel()) + struct.pack("<q3d", 1, 0.0, 0.0, 3.0)
-    return data + _message(4, moved) + _message(5)
-
-
-def _write_tracker_server(folder: Path) -> None:
-    write_bytes(folder, "wire", wire())
-
-
 def _write_capture(kind: str, folder: Path) -> None:
     """Write the recording as a capture, Record3D's in an archive."""
     views = []
@@ -273,8 +230,6 @@ SAMPLES: dict[str, tuple[Sample, Callable[[Path], None]]] = {
         (Sample("mask", (f"masks/{NAMES[1]}", "vignette.png")), _write_mask),
         (Sample("video", ("room.mp4",)), _write_video),
         (Sample("run", ("out/splats.ply", "out/trajectory.txt", "out/frames.json", *RUN_MODEL), EXPORT), _write_run),
-        (Sample("weights", ("weights.pth", "older.pth")), _write_weights),
-        (Sample("tracker_server", ("wire",), ()), _write_tracker_server),
         *((Sample(kind, files), partial(_write_capture, kind)) for kind, files in CAPTURES.items()),
         *((Sample(f"bag_{form}", (BAGS[form],)), partial(_write_bag, form)) for form in FORMS),
         (Sample("bag_depth", (BAGS["mcap"],)), _write_bag_with_depths),

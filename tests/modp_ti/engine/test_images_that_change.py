@@ -17,7 +17,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.engine import session
 from modp_ti.engine.observer import Observer
 from modp_ti.files.errors import InputError
-from tests.fault_injection.stream import write_recording
+from tests.fault_injection.recordings import write_recording
 
 FRAMES, PLACE = 12, 3
 KEEP = ["export.images=true", "source.prefetch=2"]

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.fault_injection.stream import write_recording
+from tests.fault_injection.recordings import write_recording
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.patience import PATIENCE
 from tests.room import Room, RoomRecording, pinhole, walk
