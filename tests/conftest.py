@@ -6,13 +6,13 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from filelock import FileLock
 
 from fields.runtime.backend import initialise
-from fields.runtime.engine import engine
+from fields.runtime.engine import engine, running_program, ti
 
 if TYPE_CHECKING:
     from tests.room import Room, RoomRecording
@@ -55,10 +55,29 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         )
 
 
+_empty: object | None = None  # the engine's program that has no fields yet, as this file has started it
+_finalise = ti.FieldsBuilder._finalize
+
+
+def _finalised(*arguments: Any, **named: Any) -> Any:
+    global _empty
+    _empty = None
+    return _finalise(*arguments, **named)
+
+
+ti.FieldsBuilder._finalize = _finalised
+
+
 @pytest.fixture(autouse=True, scope="module")
 def taichi_on_the_cpu() -> None:
-    """Free the fields of earlier modules: Taichi 1.7.4 writes out of bounds once fields fill its first GB."""
-    initialise("cpu")
+    """Free the fields of earlier modules: Taichi 1.7.4 writes out of bounds once fields fill its first GB.
+
+    Most modules make none, and a start takes 0.2 s.
+    """
+    global _empty
+    if _empty is None or _empty is not running_program():
+        initialise("cpu")
+        _empty = running_program()
 
 
 @pytest.fixture
