@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from modp_ti.config.comparison import differing_keys
+from modp_ti.config.keys import differing_keys
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files import read_json

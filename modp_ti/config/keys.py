@@ -1,10 +1,11 @@
-"""Documentation of a configuration model: name, type, default and meaning of each key, and the page of all keys."""
+"""The keys of a settings model: type, default and meaning of each, the nearest right one, and what differs."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from operator import attrgetter
 from pathlib import Path
 from types import NoneType
@@ -18,29 +19,16 @@ from modp_ti.files.urls import shown_url
 __all__ = [
     "KeyDoc",
     "as_yaml",
+    "differing_keys",
     "documented_keys",
     "documented_values",
-    "markdown_of_keys",
-    "sections_of",
+    "dotted_keys",
+    "leaves",
+    "suggestion",
     "variants_of",
 ]
 
 TYPE_NAMES = {int: "integer", float: "number", str: "text", bool: "true or false", Path: "path", NoneType: "empty"}
-
-INTRODUCTION = """\
-# Settings
-
-This page lists every key of `scene.yaml`. Only `tracker.kind` and `output` are required, and `source.path`
-for most trackers. Relative paths are relative to the scene file. An unknown key is an error that names the
-nearest right one. Units are in square brackets. To override a key on the command line, use `--set`, whose paths are
-relative to the folder where the command is typed; `--fast` and `--best` set several at once ([Presets](#presets)):
-
-```sh
-modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000
-modp-ti run scene.yaml --fast
-```
-
-The tables are generated: `python -m modp_ti.config > docs/configuration.md`."""
 
 
 def as_yaml(value: Any) -> str:
@@ -86,7 +74,7 @@ def documented_keys(
     for name, info in model.model_fields.items():
         kinds = variants_of(info)
         selecting = str(info.discriminator) if kinds else ""
-        sections = list(kinds.items()) or [(variant, section) for section in sections_of(info.annotation)]
+        sections = list(kinds.items()) or [(variant, section) for section in _sections_of(info.annotation)]
         for tag, section in sections:
             yield from documented_keys(section, f"{prefix}{name}.", tag, selecting)
         if not sections:
@@ -113,19 +101,19 @@ def variants_of(info: FieldInfo) -> dict[str, type[BaseModel]]:
         return {}
     return {
         str(tag): model
-        for model in sections_of(info.annotation)
+        for model in _sections_of(info.annotation)
         for tag in get_args(model.model_fields[info.discriminator].annotation)
     }
 
 
-def sections_of(annotation: Any) -> list[type[BaseModel]]:
+def _sections_of(annotation: Any) -> list[type[BaseModel]]:
     """The models that a field accepts: one for `Section` and `Section | None`, none for a plain value."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     arguments = get_args(annotation)
     if get_origin(annotation) in (list, tuple, dict):
         return []
-    return [model for argument in arguments for model in sections_of(argument)]
+    return [model for argument in arguments for model in _sections_of(argument)]
 
 
 def _type_name(annotation: Any) -> str:
@@ -143,31 +131,52 @@ def _type_name(annotation: Any) -> str:
     return getattr(annotation, "__name__", str(annotation))
 
 
-def markdown_of_keys(model: type[BaseModel]) -> str:
-    """Format the reference of all keys as Markdown, with one table per section, or per kind of a section."""
-    sections: dict[str, dict[str, list[KeyDoc]]] = {}
-    for entry in documented_keys(model):
-        sections.setdefault(entry.key.rpartition(".")[0], {}).setdefault(entry.variant, []).append(entry)
-    text = [INTRODUCTION]
-    for section, variants in sections.items():
-        text += ["", f"## {f'`{section}`' if section else 'Top level'}", ""]
-        if "" in variants:
-            text += _table(variants[""])
-            continue
-        selecting = [entry for entries in variants.values() for entry in entries if entry.selects]
-        key = selecting[0].key
-        text += [f"Its keys depend on `{key}`, which is required:", "", f"| `{key}` | meaning |", "|---|---|"]
-        for entry in selecting:
-            text.append(f"| [`{entry.variant}`](#{section}-of-kind-{entry.variant}) | {entry.description} |")
-        for variant, entries in variants.items():
-            text += ["", f"### `{section}` of kind `{variant}`", "", *_table(entries)]
-    return "\n".join(text) + "\n"
+def suggestion(model: type[BaseModel], key: str, kind: str = "") -> str:
+    """Return what to write instead of an unknown dotted key, as the end of an error message.
+
+    Args:
+        model: The settings model.
+        key: The key.
+        kind: The kind of its section, if that has several.
+    """
+    entries = list(documented_keys(model))
+    if of := list(dict.fromkeys(entry.variant for entry in entries if entry.key == key and entry.variant)):
+        return f"it is for {key.partition('.')[0]}.kind: {', '.join(of)}, not {kind}; take it out"
+    section, _, name = key.rpartition(".")
+    known = dotted_keys(entry for entry in entries if not kind or entry.variant in ("", kind))
+    inside = {each.rpartition(".")[2]: each for each in known if each.rpartition(".")[0] == section}
+    namesakes = [each for each in dotted_keys(entries) if each.rpartition(".")[2] == name]
+    for word, words, cutoff in ((name, inside, 0.6), (key, namesakes, 0.0), (key, dotted_keys(entries), 0.6)):
+        if found := get_close_matches(word, words, n=1, cutoff=cutoff):
+            return f"did you mean `{inside.get(found[0], found[0])}`?"
+    return f"{'this section has' if section else 'the keys are'} {', '.join(inside.values())}"
 
 
-def _table(entries: list[KeyDoc]) -> list[str]:
-    lines = ["| key | type | default | meaning |", "|---|---|---|---|"]
-    for entry in entries:
-        default = "required" if entry.default is None else f"`{entry.default}`" if entry.default else "empty"
-        cells = [f"`{entry.key}`", entry.type, default, entry.description]
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return lines
+def dotted_keys(entries: Iterable[KeyDoc]) -> dict[str, None]:
+    """Return the dotted names of settings and of the sections that they lie in, in order."""
+    parts = (entry.key.split(".") for entry in entries)
+    return dict.fromkeys(".".join(names[:end]) for names in parts for end in range(1, len(names) + 1))
+
+
+def leaves(settings: Mapping[str, Any], start: str = "") -> dict[str, Any]:
+    """Flatten nested settings to values by dotted key."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        flat |= leaves(value, f"{start}{key}.") if isinstance(value, Mapping) else {f"{start}{key}": value}
+    return flat
+
+
+def differing_keys(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence[str]) -> list[str]:
+    """Return the dotted keys whose values differ between two scenes' plain settings.
+
+    Args:
+        before: Nested settings.
+        now: Nested settings, whose order the result follows.
+        free: Keys and sections that may differ.
+    """
+    old, new = leaves(before), leaves(now)
+    return [
+        key
+        for key in new | old
+        if old.get(key) != new.get(key) and not any(key == name or key.startswith(f"{name}.") for name in free)
+    ]

@@ -1,26 +1,22 @@
-"""Reading of `scene.yaml` with overrides, and writing of the resolved settings."""
+"""Reading of `scene.yaml` with overrides and a preset, and writing of the resolved settings."""
 
 from __future__ import annotations
 
 import difflib
 import json
 import os
-from collections.abc import Iterable, Mapping
-from itertools import islice
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import yaml
 from pydantic import BaseModel, ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from modp_ti.config.comparison import differing_keys
-from modp_ti.config.keys import as_yaml, documented_keys, sections_of, variants_of
-from modp_ti.config.old_settings import refuse_removed_kind, without_leftovers
-from modp_ti.config.presets import with_preset
+from modp_ti.config.keys import as_yaml, differing_keys, documented_keys, dotted_keys, suggestion
+from modp_ti.config.presets import PRESETS, with_defaults
 from modp_ti.config.settings import WITH_SECRETS, SceneConfig
-from modp_ti.config.unknown_keys import refuse_unknown_keys
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
@@ -31,6 +27,9 @@ from modp_ti.files.yaml_text import parse_yaml
 __all__ = ["dump_scene", "load_scene", "scene_from_data"]
 
 M = TypeVar("M", bound=BaseModel)
+
+# Limits of common file systems: bytes of a name and of a path.
+MAX_NAME, MAX_PATH = 255, 4095
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
@@ -69,9 +68,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
             f"{file}: a scene file has keys such as `source:`, `tracker:` and `output:`; this one holds none"
         )
     where = {key: f"{file}:{line}" for key, line in lines.items()}
-    config = _resolved(data, where, str(file), overrides, preset)
-    typed = frozenset(key for key, origin in where.items() if origin.startswith("--set "))
-    return _with_absolute_paths(config, file.resolve().parent, typed)
+    return _Given(data, str(file), where).scene(overrides, preset, file.resolve().parent)
 
 
 def scene_from_data(
@@ -81,8 +78,7 @@ def scene_from_data(
 
     Overrides, preset and errors are as for `load_scene`. Relative paths are resolved against the working directory.
     """
-    data = json.loads(json.dumps(data))
-    return _with_absolute_paths(_resolved(data, {}, name, overrides, preset), Path.cwd())
+    return _Given(json.loads(json.dumps(data)), name, {}).scene(overrides, preset, Path.cwd())
 
 
 def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
@@ -96,6 +92,115 @@ def dump_scene(config: SceneConfig, path: str | os.PathLike[str]) -> None:
         )
     text += yaml.safe_dump(written, sort_keys=False, allow_unicode=True)
     replace_text(path, text)
+
+
+class _Given:
+    """Settings as plain data before their validation, with the file and line, or the override, that set each."""
+
+    def __init__(self, data: dict[str, Any], name: str, where: dict[str, str]) -> None:
+        self.data, self.name, self.where = data, name, where
+
+    def scene(self, overrides: Iterable[str], preset: str | None, base: Path) -> SceneConfig:
+        """Apply overrides, fill in the preset, validate, and resolve paths against `base`."""
+        for override in overrides:
+            self._override(override)
+        typed = frozenset(key for key, origin in self.where.items() if origin.startswith("--set "))
+        if preset is not None:
+            if preset not in PRESETS:
+                raise InputError(f"there is no preset {preset}: use {' or '.join(PRESETS)}")
+            self.data = with_defaults(self.data, PRESETS[preset].settings)
+        try:
+            # Strict JSON mode rejects `scale: "0.5"` and `holdout: true` as numbers, but still accepts text as a path.
+            config = SceneConfig.model_validate_json(json.dumps(self.data), strict=True)
+        except ValidationError as error:
+            raise InputError(self._message(error.errors())) from None
+        return _with_absolute_paths(config, base, typed)
+
+    def _override(self, override: str) -> None:
+        """Write one "section.key=value" into the data."""
+        key, equals, text = override.partition("=")
+        key, origin = key.strip(), f"--set {key}{equals}{shown_url(text.strip())}"
+        if not equals or not key:
+            raise InputError(f"{origin}: write it as section.key=value, for example source.scale=0.5")
+        if key not in dotted_keys(documented_keys(SceneConfig)):
+            raise InputError(f"{origin}: unknown key `{key}`; {suggestion(SceneConfig, key)}")
+        *sections, last = key.split(".")
+        section = self.data
+        for part in sections:
+            if not isinstance(section.get(part), dict):
+                section[part] = {}
+            section = section[part]
+        section[last] = parse_yaml(text, origin, {})
+        for known in [k for k in self.where if k.startswith(key + ".")]:
+            del self.where[known]
+        self.where[key] = origin
+
+    def _message(self, problems: list[ErrorDetails]) -> str:
+        """What is wrong, in one line, from pydantic's errors: unknown keys first, which may be why others miss."""
+        problems = sorted(problems, key=lambda problem: problem["type"] != "extra_forbidden")
+        first, place = problems[0], self._place(problems[0])
+        same = [problem for problem in problems if self._place(problem) == place]
+        text = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "extra_forbidden":
+            section = self.data.get(place.partition(".")[0])
+            kind = section.get("kind", "") if isinstance(section, dict) else ""
+            text = f"unknown key `{place}`; {suggestion(SceneConfig, place, str(kind))}"
+        elif first["type"].startswith("union_tag"):  # the section's kind is missing or unknown
+            place += "." + first.get("ctx", {})["discriminator"].strip("'")
+            text = _no_such_kind(place, first)
+        elif first["type"] == "missing":
+            text = f"{place} is missing: {_description(place) or 'it has no default'}"
+        elif first["type"] != "value_error":
+            text = f"{place}: {_expected(same)}, not {as_yaml(first['input'])}"
+        elif not place:  # of the whole scene, beginning with a key
+            place = text.split(" ")[0].rstrip(":")
+        others = len(problems) - len(same)
+        while place not in self.where and "." in place:
+            place = place.rpartition(".")[0]
+        return f"{self.where.get(place, self.name)}: {text}{f' (and {others} more)' if others else ''}"
+
+    def _place(self, problem: ErrorDetails) -> str:
+        """The dotted key of an error, whose location also contains the kind of a section or the type of a value."""
+        node, parts = cast(Any, self.data), []
+        for part in problem["loc"]:
+            with suppress(LookupError, TypeError):
+                node = node[part]
+                parts.append(str(part))
+        if problem["type"] == "missing":
+            parts.append(str(problem["loc"][-1]))
+        return ".".join(parts)
+
+
+def _expected(problems: list[ErrorDetails]) -> str:
+    """What a value must be, from the errors of all types that it may have: "must be 'auto' or a valid number"."""
+    # A word is no advice for a value that is not text: 7 should be less, not 'auto'.
+    types = [problem for problem in problems if problem["type"] != "literal_error"]
+    meant = problems if isinstance(problems[0]["input"], str) or not types else types
+    texts = [problem["msg"].replace("Input should be", "must be") for problem in meant]
+    return " or ".join([texts[0], *(text.removeprefix("must be ") for text in texts[1:])])
+
+
+def _no_such_kind(key: str, error: ErrorDetails) -> str:
+    """The message for a section whose discriminator `key` is missing or unknown, from pydantic's error."""
+    if error["type"] == "union_tag_not_found":
+        return f"{key} is missing: {_description(key)}"
+    given = error["input"][key.rpartition(".")[2]]
+    kinds = [entry.variant for entry in documented_keys(SceneConfig) if entry.key == key]
+    near = difflib.get_close_matches(str(given), kinds, n=1, cutoff=0.6)
+    hint = f"; did you mean `{near[0]}`?" if near else ""
+    return f"{key}: must be one of {', '.join(kinds)}, not {as_yaml(given)}{hint}"
+
+
+def _description(key: str) -> str:
+    """The meaning of a key; for a section, its required keys."""
+    keys = list(documented_keys(SceneConfig))
+    found = [entry for entry in keys if entry.key == key]
+    if found and found[0].selects:
+        return "one of " + ", ".join(f"`{entry.variant}` ({entry.description})" for entry in found)
+    if found:
+        return f"{found[0].description} ({found[0].type})"
+    needed = dict.fromkeys(entry.key for entry in keys if entry.key.startswith(key + ".") and entry.default is None)
+    return f"it needs {', '.join(needed)}" if needed else ""
 
 
 def _with_absolute_paths(model: M, base: Path, typed: frozenset[str] = frozenset(), section: str = "") -> M:
@@ -124,121 +229,3 @@ def _absolute_path(value: Path, base: Path, name: str) -> Path:
         return path
     except (RuntimeError, OSError) as error:  # no such user (`~name`), or a loop of symbolic links
         raise InputError(f"{name}: {value}: is no path: {error}") from None
-
-
-def _resolved(
-    data: dict[str, Any], where: dict[str, str], name: str, overrides: Iterable[str], preset: str | None = None
-) -> SceneConfig:
-    """Apply overrides to the raw data, fill in the preset and validate the result.
-
-    `where` maps each dotted key to the file and line, or the override, that set it. Overrides update it.
-    """
-    for override in overrides:
-        _apply_override(data, override, where)
-    # After the overrides, since one may change `tracker.kind`, on which the keys of the section depend.
-    refuse_removed_kind(data, where, name)
-    data = without_leftovers(data)
-    refuse_unknown_keys(data, SceneConfig, where, name)
-    return _validated(with_preset(data, preset) if preset else data, where, name)
-
-
-def _validated(data: dict[str, Any], where: Mapping[str, str], name: str) -> SceneConfig:
-    try:
-        # Strict JSON mode rejects `scale: "0.5"` and `holdout: true` as numbers, but still accepts text as a path.
-        return SceneConfig.model_validate_json(json.dumps(data), strict=True)
-    except ValidationError as error:
-        problems = error.errors()
-        first = problems[0]
-        place = _place(first["loc"])
-        same = [problem for problem in problems if _place(problem["loc"]) == place]
-        text = first["msg"].removeprefix("Value error, ")
-        if first["type"].startswith("union_tag"):  # the section's kind is missing or unknown
-            place += "." + first.get("ctx", {})["discriminator"].strip("'")
-            text = _no_such_kind(place, first)
-        elif first["type"] == "missing":
-            text = f"{place} is missing: {_description(place) or 'it has no default'}"
-        elif place and first["type"] != "value_error":
-            text = f"{place}: {_expected(same)}, not {as_yaml(first['input'])}"
-        others = len(problems) - len(same)
-        more = f" (and {others} more)" if others else ""
-        raise InputError(f"{where.get(place, name)}: {text}{more}") from None
-
-
-def _expected(problems: list[ErrorDetails]) -> str:
-    """What a value must be, from the errors of all types that it may have: "must be 'auto' or a valid number"."""
-    # A word is no advice for a value that is not text: 7 should be less, not 'auto'.
-    types = [problem for problem in problems if problem["type"] != "literal_error"]
-    meant = problems if isinstance(problems[0]["input"], str) or not types else types
-    texts = [problem["msg"].replace("Input should be", "must be") for problem in meant]
-    return " or ".join([texts[0], *(text.removeprefix("must be ") for text in texts[1:])])
-
-
-def _place(location: tuple[int | str, ...]) -> str:
-    """The dotted key of a pydantic error, whose location also contains the kind of a section or the type of a value."""
-    parts: list[str] = []
-    fields: Mapping[str, FieldInfo] = SceneConfig.model_fields
-    remaining = iter(location)
-    for part in remaining:
-        info = fields.get(str(part))
-        if info is None:
-            parts += [str(part)] if isinstance(part, int) or not parts else []
-            fields = {}
-            continue
-        parts.append(str(part))
-        variants = variants_of(info)
-        sections = [variants[str(tag)] for tag in islice(remaining, 1)] if variants else sections_of(info.annotation)
-        fields = sections[0].model_fields if sections else {}
-    return ".".join(parts)
-
-
-def _no_such_kind(key: str, error: ErrorDetails) -> str:
-    """The message for a section whose discriminator `key` is missing or unknown, from pydantic's error."""
-    if error["type"] == "union_tag_not_found":
-        return f"{key} is missing: {_description(key)}"
-    given = error["input"][key.rpartition(".")[2]]
-    kinds = [entry.variant for entry in documented_keys(SceneConfig) if entry.key == key]
-    near = difflib.get_close_matches(str(given), kinds, n=1, cutoff=0.6)
-    hint = f"; did you mean `{near[0]}`?" if near else ""
-    names = ", ".join(f"'{kind}'" for kind in kinds[:-1])
-    return f"{key}: must be {names} or '{kinds[-1]}', not {as_yaml(given)}{hint}"
-
-
-# Limits of common file systems: bytes of a name and of a path.
-MAX_NAME, MAX_PATH = 255, 4095
-
-
-def _apply_override(data: dict[str, Any], override: str, where: dict[str, str]) -> None:
-    """Write one "section.key=value" into the raw data."""
-    key, equals, text = override.partition("=")
-    key, origin = key.strip(), f"--set {key}{equals}{shown_url(text.strip())}"
-    if not equals or not key:
-        raise InputError(f"{origin}: write it as section.key=value, for example source.scale=0.5")
-    value = parse_yaml(text, origin, {})
-
-    parts = key.split(".")
-    nested: dict[str, Any] = {parts[-1]: value}
-    for part in reversed(parts[:-1]):
-        nested = {part: nested}
-    refuse_unknown_keys(nested, SceneConfig, {}, origin, whole_key=key)
-
-    section = data
-    for part in parts[:-1]:
-        if not isinstance(section.get(part), dict):
-            section[part] = {}
-        section = section[part]
-    section[parts[-1]] = value
-    for known in [k for k in where if k == key or k.startswith(key + ".")]:
-        del where[known]
-    where[key] = origin
-
-
-def _description(key: str) -> str:
-    """The meaning of a key; for a section, its required keys."""
-    keys = list(documented_keys(SceneConfig))
-    found = [entry for entry in keys if entry.key == key]
-    if found and found[0].selects:
-        return "one of " + ", ".join(f"`{entry.variant}` ({entry.description})" for entry in found)
-    if found:
-        return f"{found[0].description} ({found[0].type})"
-    needed = dict.fromkeys(entry.key for entry in keys if entry.key.startswith(key + ".") and entry.default is None)
-    return f"it needs {', '.join(needed)}" if needed else ""

@@ -14,8 +14,8 @@ from pydantic import Field, SerializationInfo, field_serializer, field_validator
 
 from fields.runtime.parallel import available_cores
 from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
+from modp_ti.config.combinations import refuse_exclusions
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
-from modp_ti.config.tracker_base_settings import GivenPosesSettings
 from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
 from modp_ti.files.urls import shown_url
@@ -184,34 +184,9 @@ class SourceSettings(StrictModel):
         return colour
 
     @model_validator(mode="after")
-    def _one_place(self) -> SourceSettings:
+    def _is_complete(self) -> SourceSettings:
         if self.stream is None and self.kind == "live":
             raise ValueError("source.stream is missing: set it to a camera number or a URL for `source.kind: live`")
-        if self.stream is not None and self.kind not in ("auto", "live"):
-            raise ValueError(f"source.stream is for `source.kind: live`, not {self.kind}; remove one of them")
-        if self.stream is not None and self.path is not None:
-            raise ValueError("source.path and source.stream cannot both be set; remove one of them")
-        if self.stream is not None and self.realtime:
-            raise ValueError("source.realtime is for source.path, a stream always sets the pace; remove it")
-        return self
-
-    @model_validator(mode="after")
-    def _panoramas_are_plain(self) -> SourceSettings:
-        if not self.panorama.given:
-            return self
-        for key, wanted in (
-            ("stream", self.stream is not None),
-            ("realtime", self.realtime),
-            ("intrinsics", self.intrinsics.given),
-            ("masks", self.masks is not None),
-            ("vignette", self.vignette is not None),
-        ):
-            if wanted:
-                raise ValueError(f"source.{key} is not for panoramas (source.panorama); remove one of them")
-        return self
-
-    @model_validator(mode="after")
-    def _range_is_not_empty(self) -> SourceSettings:
         if self.stop is not None and self.stop <= self.start:
             raise ValueError(f"source.stop ({self.stop}) must be larger than source.start ({self.start})")
         if self.part is not None and self.part[1] <= self.part[0]:
@@ -331,89 +306,8 @@ class SceneConfig(StrictModel):
         return self.model_copy(update={"source": source, "mapping": mapping})
 
     @model_validator(mode="after")
-    def _tracker_places_panoramas(self) -> SceneConfig:
-        if not self.source.panorama.given:
-            return self
-        if not self.tracker.places_panoramas:
-            raise ValueError(
-                f"source.panorama: tracker.kind: {self.tracker.kind} has no poses of panoramas; take klt, transforms, "
-                "tum, orbslam3, matrices or tanksandtemples"
-            )
-        if self.tracker.kind == "klt" and (self.tracker.loops or self.tracker.maps != "first"):
-            raise ValueError("source.panorama: klt follows panoramas in one map, without loops; remove loops and maps")
-        if isinstance(self.tracker, GivenPosesSettings) and self.tracker.adjusts:
-            raise ValueError("source.panorama: tracker.adjust would move the faces apart; set it to false")
-        for key, wanted in (
-            ("onto", self.onto is not None),
-            ("parts", self.parts is not None),
-            ("source.part", self.source.part is not None),
-            ("mapping.pace: realtime", self.is_realtime),
-        ):
-            if wanted:
-                raise ValueError(f"{key} is not for panoramas (source.panorama); remove one of them")
-        return self
-
-    @model_validator(mode="after")
-    def _snapshots_are_of_use(self) -> SceneConfig:
-        if self.snapshot_every and not self.can_be_resumed:
-            if self.parts is not None:
-                return self  # it is for the runs of the parts
-            if self.mode != "online":
-                raise ValueError(f"snapshot_every is for mode: online, not {self.mode}; remove it")
-            if not self.is_live:
-                raise ValueError("snapshot_every is for `mapping.pace: complete`; remove one of them")
-            raise ValueError("snapshot_every: live frames cannot be read again; record them, or remove the key")
-        return self
-
-    @model_validator(mode="after")
-    def _goes_on_with_another_run(self) -> SceneConfig:
-        if self.onto is None:
-            return self
-        if self.mode != "online":
-            raise ValueError(f"onto is for mode: online, not {self.mode}; remove one of them")
-        if self.is_live or self.is_realtime or self.source.realtime:
-            raise ValueError("onto needs frames that wait while they are located: record them, or remove onto")
-        if self.tracker.kind == "klt" and self.tracker.maps == "all":
-            raise ValueError("onto goes on with one map: set tracker.maps to first, largest or a number")
-        return self
-
-    @model_validator(mode="after")
-    def _recording_can_be_cut(self) -> SceneConfig:
-        key = "parts" if self.parts is not None else "source.part" if self.source.part is not None else None
-        if key is None:
-            return self
-        if self.tracker.follows_streams or self.tracker.is_live:
-            raise ValueError(
-                f"{key} needs the poses of all frames beforehand, and tracker.kind: {self.tracker.kind} finds them "
-                "while it maps: take tracker.kind: sfm, or another program's poses"
-            )
-        if self.mode != "online" or self.is_realtime or self.source.realtime:
-            raise ValueError(f"{key} is for mode: online and frames that wait; remove it")
-        if self.parts is not None and self.onto is not None:
-            raise ValueError("parts makes a new map, and onto goes on with one: remove one of them")
-        if self.parts is not None and self.source.part is not None:
-            raise ValueError("parts cuts the whole recording: remove source.part")
-        return self
-
-    @model_validator(mode="after")
-    def _source_and_tracker_fit(self) -> SceneConfig:
-        source, tracker = self.source, self.tracker
-        if source.path is None and source.stream is None and tracker.needs_source:
+    def _can_be_run(self) -> SceneConfig:
+        if self.source.path is None and self.source.stream is None and self.tracker.needs_source:
             raise ValueError(NO_PATH)
-        if source.intrinsics.given and tracker.brings_cameras:
-            raise ValueError(f"tracker.kind: {tracker.kind} provides the cameras; remove source.intrinsics")
-        if source.realtime and not tracker.follows_streams:
-            raise ValueError(
-                f"tracker.kind: {tracker.kind} does not follow the images as they arrive; remove source.realtime, or "
-                "take tracker.kind: klt"
-            )
-        if source.follows_clock and tracker.kind == "klt" and tracker.maps != "first":
-            raise ValueError(
-                f"tracker.maps: {tracker.maps} needs all images before the first is mapped; remove it, or record the "
-                "images first"
-            )
-        if source.stream is not None and not tracker.follows_streams:
-            raise ValueError(
-                f"tracker.kind: {tracker.kind} cannot use source.stream, it needs recorded images; set source.path"
-            )
+        refuse_exclusions(self)
         return self

@@ -9,9 +9,7 @@ from pathlib import Path
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.comparison import differing_keys, leaves
-from modp_ti.config.keys import as_yaml
-from modp_ti.config.old_settings import without_leftovers
+from modp_ti.config.keys import as_yaml, differing_keys, leaves
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
@@ -85,14 +83,13 @@ def continued(config: SceneConfig, snapshot: Snapshot) -> SceneConfig:
     Raises:
         InputError: If a setting that the map depends on has changed.
     """
-    settings = without_leftovers(snapshot.settings)
-    before = leaves(settings)
+    before = leaves(snapshot.settings)
     scale = before.get("source.scale")
     if isinstance(scale, float):  # the run's number, which `auto` in the scene file became
         config = config.resolved(scale)
     now = config.model_dump(mode="json")
     after = leaves(now)
-    for key in differing_keys(settings, now, FREE):
+    for key in differing_keys(snapshot.settings, now, FREE):
         if key not in before or key not in after:
             raise of_another_program(snapshot.path, snapshot.program, f"only one of them has the setting {key}")
         raise InputError(

@@ -135,7 +135,7 @@ def test_a_name_that_no_folder_can_have_is_shortened(folder):
             "--stream and --replay need no scene file and no --resume: give one of them",
         ),
         (["room.mp4", "--resume", "out"], "room.mp4: --resume has the recording already; leave it out"),
-        (["--stream", "0", "--set", "tracker.kind=colmap"], "colmap cannot use source.stream"),
+        (["--stream", "0", "--set", "tracker.kind=colmap"], "source.stream cannot be combined with"),
         (["room.mp4", "--set", "source.scal=1"], "unknown key `source.scal`; did you mean `source.scale`?"),
         (["room.mp4", "--set", "output=room.mp4"], "(output)"),
         (["room.mp4", "--fast", "--best"], "--fast and --best are two presets: give one of them"),

@@ -114,16 +114,11 @@ def test_camera_that_is_not_known_is_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("{kind: live}", "source.stream is missing: set it to a camera number or a URL"),
-        ("{kind: video, stream: 0}", "source.stream is for `source.kind: live`, not video"),
-        ("{path: a, stream: 0}", "source.path and source.stream cannot both be set"),
-        ("{path: a, intrinsics: {fx: 500}}", "tracker.kind: colmap provides the cameras; remove source.intrinsics"),
         ("{path: a, intrinsics: {cx: 500}}", "source.intrinsics.fx is missing"),
         ("{path: a, intrinsics: {fx: 500, k4: 0.1}}", "source.intrinsics.k4 is only for `fisheye: true`"),
         ("{path: a, intrinsics: {fx: 500, p1: 0.1, fisheye: true}}", "OpenCV's fisheye model has no p1 and p2"),
         ("{path: a, intrinsics: {fx: 500, width: 640}}", "set both width and height, or neither"),
         ("{path: a, kind: film}", "source.kind: must be 'auto', 'images', 'video'"),
-        ("{stream: 0}", "tracker.kind: colmap cannot use source.stream"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused_by_line(tmp_path, source, message):

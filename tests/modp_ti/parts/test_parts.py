@@ -106,10 +106,7 @@ def test_two_parts_make_one_map(scene: Path, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--set", "tracker={kind: klt}"], "parts needs the poses of all frames beforehand, and tracker.kind: klt"),
-        (["--set", "mode=offline"], "parts is for mode: online"),
-        (["--set", "source.part=[2, 9]"], "parts cuts the whole recording: remove source.part"),
-        (["--onto", "out"], "parts makes a new map, and onto goes on with one"),
+        (["--set", "tracker={kind: klt}"], "parts cannot be combined with tracker.kind: klt"),
         (["--address", "here:1"], "--address is for --engine ray"),
         (["--parts", "5"], "the recording has 16 frames, too few for 5 parts: take at most 2 parts"),
     ],

@@ -258,19 +258,3 @@ def test_a_folder_without_a_snapshot_says_what_to_do(tmp_path: Path) -> None:
         load_resumed(tmp_path / "gone", None, [])
     with pytest.raises(InputError, match="there is no snapshot; start the run from its scene"):
         load_resumed(tmp_path, None, [])
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ("tracker.kind=socket", "live frames cannot be read again"),
-        ("mode=offline", "snapshot_every is for mode: online"),
-    ],
-)
-def test_what_cannot_be_resumed_is_said_at_once(tmp_path: Path, settings: str, said: str) -> None:
-    from modp_ti.config.scene_file import load_scene
-
-    text = "source: {path: images}\ntracker: {kind: colmap}\noutput: out\nsnapshot_every: 3\n"
-    (tmp_path / "scene.yaml").write_text(text)
-    with pytest.raises(InputError, match=said):
-        load_scene(tmp_path / "scene.yaml", [settings])

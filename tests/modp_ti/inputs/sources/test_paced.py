@@ -117,22 +117,6 @@ def test_the_setting_opens_it_with_the_camera_and_the_scale(folder):
     assert (source.intrinsics.camera.fx, source.scale, source.frame_size) == (15.0, 0.5, (16, 12))
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"source": {"path": "x", "realtime": True}, "tracker": {"kind": "colmap"}}, "take tracker.kind: klt"),
-        ({"source": {"stream": 0, "realtime": True}, "tracker": {"kind": "klt"}}, "a stream always sets the pace"),
-        (
-            {"source": {"path": "x", "realtime": True}, "tracker": {"kind": "klt"}, "snapshot_every": 5},
-            "snapshot_every is for `mapping.pace: complete`",
-        ),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        SceneConfig.model_validate({"output": "out", **settings})
-
-
 def test_a_scene_can_be_read_without_its_clock():
     settings = {"source": {"path": "x", "realtime": True}, "tracker": {"kind": "klt"}, "output": "out"}
     config = SceneConfig.model_validate(settings)

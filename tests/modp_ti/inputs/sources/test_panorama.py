@@ -172,9 +172,6 @@ def test_panoramas_have_their_shape_and_one_size(folder: Path) -> None:
     ("keys", "said"),
     [
         ({"panorama": {"faces": 6}}, "source.panorama.projection is missing"),
-        ({"masks": "masks"}, "source.masks is not for panoramas"),
-        ({"intrinsics": {"fx": 100}}, "source.intrinsics is not for panoramas"),
-        ({"realtime": True}, "source.realtime is not for panoramas"),
     ],
 )
 def test_settings_that_do_not_fit_panoramas_are_refused(keys: dict, said: str) -> None:
