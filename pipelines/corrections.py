@@ -17,7 +17,7 @@ from fields.map.gaussian_motion import GaussianMotion
 from fields.map.gaussians import NO_ANCHOR
 from fields.map.keyframe import NO_MOTION, Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.blocks.paging import Paging
+from pipelines.companions.paging import Paging
 from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation
 from pipelines.settings import CorrectionSettings

@@ -2,56 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
-from fields.runtime.tenancy import in_engine
-from pipelines import finished_map, online_state
-from pipelines.corrections import CorrectionReport
-from pipelines.finished_map import FinishedMap
-from pipelines.online_map import OnlineMap
-from pipelines.pipeline import FrameReport
-from pipelines.refinement import Schedule, refine
-from pipelines.select.views import global_probabilities
-from pipelines.settings import RefineSettings
-from pipelines.state import MapState
+from fields.map.keyframes import KeyframeStore
+from fields.map.trajectory import Trajectory
+from fields.runtime.tenancy import in_engine, settled
+from fields.voxels.sparse_bricks import SparseBricks
+from pipelines.companions.companion import Companion
+from pipelines.companions.hidden_gaussians import HiddenGaussians
+from pipelines.companions.other_places import OtherPlaces
+from pipelines.companions.pace import CompletePace, Pace
+from pipelines.companions.paging import Paging
+from pipelines.companions.transients import TransientSweep
+from pipelines.corrections import CorrectionReport, MapCorrector
+from pipelines.densify.contribution import Contribution
+from pipelines.densify.densifier import Densifier
+from pipelines.densify.depth import DepthEstimator, build_depth
+from pipelines.optimise.map_optimiser import MapOptimiser
+from pipelines.optimise.safeguards import Safeguards
+from pipelines.pipeline import FrameReport, Pipeline
+from pipelines.refinement import finish
+from pipelines.render.renderer import Renderer
+from pipelines.select.gate import FrameGate
+from pipelines.select.keyframes import KeyframeSelector
+from pipelines.select.views import LocalGlobalViews, ViewSelection, global_probabilities
+from pipelines.settings import MappingSettings
+from pipelines.stopwatch import Stopwatch
 from pipelines.warm_up import warm_up
 
 __all__ = ["OnlineMapper"]
 
-# Factor on all rates at the end of `finish`. 0.2 and 0.1 differ by less than 0.1 dB on five recordings; 1 is 0.4 to
-# 1.0 dB worse.
-LAST_RATE = 0.2
-GOLDEN_RATIO = (5**0.5 - 1) / 2
 
-
-@dataclass(frozen=True)
-class LastPart:
-    """A part of the passes of `OnlineMapper.finish`.
-
-    Attributes:
-        places: Places of its keyframes in the store.
-        first: Number of views before it.
-        end: Number of views after it.
-        before: Number of views in the passes before its own.
-    """
-
-    places: NDArray[np.int64]
-    first: int
-    end: int
-    before: int
-
-
-@in_engine("compile", "process", "optimise", "optimise_further", "correct", "finish", "refine", "go_on_with")
-@in_engine("state", "restore")
-class OnlineMapper(OnlineMap):
+@in_engine("compile", "process", "optimise", "optimise_further", "correct", "finish")
+@in_engine("prune", "all_gaussians", "begin_passes", "caught")
+class OnlineMapper(Pipeline):
     """Builds a Gaussian map from a stream of `TrackedFrame`s.
+
+    Functions continue with a map: `pipelines.refinement.refine`, `pipelines.state.save_state` and `restore_state`,
+    `pipelines.whole.finished_map.go_on`, `pipelines.whole.merge.merge`.
 
     Args:
         settings: Settings of the mapping.
@@ -63,11 +59,57 @@ class OnlineMapper(OnlineMap):
         pace: How much work a frame gets; None for all of the settings.
         folder: Folder for the parts of the map that go to disk; None for a temporary one.
 
+    Attributes:
+        frame_count: Number of frames processed so far.
+        settled: Number of views that `finish` has optimised since the last frame.
+        companions: Paging, places, hidden Gaussians, masks: what the loop calls at fixed places, in order.
+
     Example:
         mapper = modp_ti.OnlineMapper(modp_ti.MappingSettings(), max_width=640, max_height=480, seed=0)
         for frame in frames:  # of class `TrackedFrame`
             report = mapper.process(frame)
     """
+
+    def __init__(
+        self,
+        settings: MappingSettings,
+        max_width: int,
+        max_height: int,
+        seed: int = 0,
+        depth: DepthEstimator | None = None,
+        views: ViewSelection | None = None,
+        pace: Pace | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        self.settings = settings
+        self.rng = np.random.default_rng(seed)
+        self.stopwatch = Stopwatch()
+        with settled(nodes=4 + SparseBricks.NODES) as self.tenancy:
+            self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
+            self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
+            self.companions: list[Companion] = []  # filled below: some need the optimiser
+            self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings, self.companions)
+            self.loss = self.optimiser.loss
+            self.trajectory = Trajectory()
+            self.keyframes = KeyframeStore(
+                len(settings.levels.probabilities), settings.levels.min_side, self.trajectory
+            )
+            self.gate = FrameGate(settings.gate, self.trajectory)
+            self.selector = KeyframeSelector(settings.keyframes, self.trajectory)
+            depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
+            self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
+            self.budget = self.densifier.budget
+            self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
+            contribution = Contribution(self.gaussians, self.renderer)
+            self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
+            self.companions += [self.paging, OtherPlaces(self.densifier), self.hidden]
+            if settings.transients:
+                self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
+                self.companions.append(self.transients)
+            self.pace = pace or CompletePace(settings)
+            self.views = views or LocalGlobalViews(settings.views, self.rng)
+            self.corrector = MapCorrector(self.keyframes, self.densifier, self.paging)
+        self.frame_count = self.settled = 0
 
     def compile(self) -> None:
         warm_up(self)
@@ -213,79 +255,53 @@ class OnlineMapper(OnlineMap):
         return CorrectionReport(around, moved=len(moved) > 0)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
-        """Finish the map after the last frame: passes over all keyframes, then a final pruning.
+        return finish(self, progress)
 
-        While frames arrive, all rates are constant, and large enough for few steps. Here they decay, so that each
-        Gaussian comes to rest. In a pass, every keyframe is a view once; views that follow each other are far apart.
-        The pace may end the passes early. After an interruption, `finish` goes on where it was.
+    @property
+    def near(self) -> float:
+        """Depth [scene units] below which nothing is drawn."""
+        return self.settings.near * self.keyframes.scene_depth
 
-        Args:
-            progress: Called after every step with (views done, number of Gaussians, mean PSNR of the step's views).
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Number of keyframes and of frames so far, as `Pace.plan` takes them."""
+        return len(self.keyframes.selected), self.frame_count
+
+    @property
+    def gaussian_count(self) -> int:
+        return self.paging.count
+
+    def all_gaussians(self) -> dict[str, NDArray]:
+        return self.paging.to_numpy()
+
+    def prune(self) -> int:
+        """Remove Gaussians whose opacity is below `densify.prune_opacity`.
 
         Returns:
-            Mean PSNR of the last step; None if nothing was optimised.
+            Number of Gaussians removed.
         """
-        if self.settled == 0:
-            self.paging.plan()
-        total = self.pace.last_views(len(self.keyframes)) if self.gaussian_count else 0
-        psnr = None
-        for part in self._last_parts(total):
-            if self.settled < part.end or total == 0:
-                psnr = self._settle(part, total, progress)
-        return psnr
+        return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
 
-    def _last_parts(self, total: int) -> list[LastPart]:
-        """Divide the views of `finish` into parts. Each pass visits the groups of keyframes in turn."""
-        groups, count = self.paging.groups(), len(self.keyframes)
-        if len(groups) == 1:
-            return [LastPart(groups[0], 0, total, 0)]
-        parts, first = [], 0
-        for before in range(0, total, max(count, 1)):
-            seen = 0
-            for places in groups:
-                seen += len(places)
-                end = before + min(count, total - before) * seen // count
-                parts.append(LastPart(places, first, end, before))
-                first = end
-        return parts
+    def begin_passes(self, places: NDArray[np.int64]) -> None:
+        """Let the companions look at keyframes before passes over them, see `Companion.before_passes`.
 
-    def _settle(self, part: LastPart, total: int, progress: Callable[[int, int, float], None] | None) -> float | None:
-        """Make a part of the passes of `finish`."""
-        places = part.places
-        if self.settled == part.first:
-            self.begin_passes(places)
-        views = np.resize(places[np.argsort(places * GOLDEN_RATIO % 1.0)], part.end - part.first)
-        count, psnr = self.settings.views.per_step, None
-        while self.settled < part.end:
-            done = self.settled - part.first
-            slower = LAST_RATE ** ((part.before + done * len(self.keyframes) / len(places)) / total)
-            rates = self.optimiser.rates(self.keyframes.scene_depth, slower, slower, slower)
-            batch = views[done : done + count].tolist()
-            with self.stopwatch.measure("optimise"):
-                psnr = self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
-            self.settled += len(batch)
-            if progress is not None:
-                progress(self.settled, self.gaussian_count, psnr)
-        with self.stopwatch.measure("optimise"):
-            psnr = self.optimiser.settle() if psnr is not None else None
-        self.prune()
-        return psnr
+        Args:
+            places: Places (N,) of the keyframes in the store.
+        """
+        with self.stopwatch.measure("remove"):
+            for companion in self.companions:
+                companion.before_passes(places, self.near)
 
-    def refine(
-        self,
-        settings: RefineSettings,
-        progress: Callable[[int, float], None] | None = None,
-        done: int = 0,
-        schedule: Schedule | None = None,
-    ) -> None:
-        refine(self, settings, progress, done, schedule)
+    def caught(self) -> Safeguards:
+        """Return the safeguards' counts so far. Waits for the device."""
+        return self.optimiser.caught()
 
-    def go_on_with(self, finished: FinishedMap) -> None:
-        """Put a finished map into this new one, see `pipelines.finished_map`."""
-        finished_map.go_on_with(self, finished)
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self.gate.refused
 
-    def state(self) -> MapState:
-        return online_state.state_of(self)
+    def takes_observations(self, count: int) -> bool:
+        return self.budget.takes_observations(count)
 
-    def restore(self, state: MapState, frames: Iterable[TrackedFrame]) -> None:
-        online_state.restore(self, state, frames)
+    def count_beside(self, nbytes: int) -> None:
+        self.budget.beside = nbytes

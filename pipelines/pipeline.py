@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 from numpy.typing import NDArray
 
@@ -15,14 +14,12 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
 from fields.runtime.tenancy import Tenancy
+from pipelines.companions.transients import TransientSweep
 from pipelines.corrections import CorrectionReport
 from pipelines.optimise.losses import PhotometricLoss
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.renderer import Renderer
-from pipelines.settings import RefineSettings
-from pipelines.state import MapState
 from pipelines.stopwatch import Stopwatch
-from pipelines.transients.sweep import TransientSweep
 
 __all__ = ["FrameReport", "NothingToMapError", "Pipeline"]
 
@@ -55,12 +52,8 @@ class FrameReport:
 class Pipeline(ABC):
     """Builds a map of Gaussians from frames that are processed one by one.
 
-    Operations that only the online mapper supports have defaults here, which `OfflineMapper` uses: it rejects no frame,
-    has no memory budget, and cannot be refined or resumed.
+    What only the online mapper does has defaults here, for `OfflineMapper`: it rejects no frame and has no budget.
     """
-
-    can_be_refined: ClassVar[bool] = False
-    """Whether `refine` may be called after `finish`."""
 
     gaussians: GaussianField
     keyframes: KeyframeStore
@@ -112,7 +105,7 @@ class Pipeline(ABC):
         """Finish the map after the last frame.
 
         Args:
-            progress: Callback of an offline map, see `OfflineMapper.optimise`.
+            progress: Callback of the steps, see `pipelines.refinement.finish` and `OfflineMapper.optimise`.
 
         Raises:
             NothingToMapError: If there are no points to start from.
@@ -133,41 +126,3 @@ class Pipeline(ABC):
 
     def count_beside(self, nbytes: int) -> None:  # noqa: B027 - a pipeline without a budget has nothing to count
         """Set the bytes that are kept outside the map and count towards its memory budget."""
-
-    def refine(
-        self,
-        settings: RefineSettings,
-        progress: Callable[[int, float], None] | None = None,
-        done: int = 0,
-        schedule: Callable[[int], float | None] | None = None,
-    ) -> None:
-        """Optimise the finished map on all keyframes, see `pipelines.refinement.refine`.
-
-        Raises:
-            ValueError: If the map cannot be refined: an offline map is optimised on all frames from the start.
-        """
-        raise ValueError("this map cannot be refined")
-
-    def state(self) -> MapState:
-        """Return everything that the next frame or step depends on, except the keyframes' images.
-
-        Call it between two steps.
-
-        Raises:
-            ValueError: For an offline map.
-        """
-        raise ValueError("an offline map has no state between two frames")
-
-    def restore(self, state: MapState, frames: Iterable[TrackedFrame]) -> None:
-        """Restore a saved state into a new pipeline with the same settings.
-
-        Args:
-            state: Result of `state`.
-            frames: The frames that the saved pipeline had processed, without held-out ones. The keyframes take their
-                images from them.
-
-        Raises:
-            KeyError, TypeError, ValueError: If the state does not fit, and for an offline map. The pipeline is then
-                unusable.
-        """
-        raise ValueError("an offline map cannot be resumed")

@@ -1,14 +1,24 @@
-"""`MapState`: the state of a mapper between two steps, as plain arrays and numbers."""
+"""`MapState`: the state of an online map between two steps as plain arrays and numbers, saved and restored."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MapState"]
+from fields.frames.tracked_frame import TrackedFrame
+from fields.map.keyframe import Keyframe
+from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
+from pipelines.densify.densifier import Anchor
+from pipelines.online import OnlineMapper
+
+__all__ = ["MapState", "restore_state", "save_state"]
+
+# Number of keyframes whose images go to disk together, in one file, while they are read again.
+STORED_TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -33,3 +43,99 @@ class MapState:
         """Return the arrays of a group by name; empty if there is no such group."""
         start = group + "."
         return {name[len(start) :]: array for name, array in self.arrays.items() if name.startswith(start)}
+
+
+def save_state(mapper: OnlineMapper) -> MapState:
+    """Return everything that the next frame or step depends on, except the keyframes' images.
+
+    Call it between two steps.
+    """
+    mapper.optimiser.settle()
+    anchors, voxels = mapper.densifier.anchors, mapper.densifier.voxels
+    place = {view.index: row for row, view in enumerate(mapper.keyframes)}
+    groups = {
+        "gaussians": mapper.gaussians.to_numpy() | mapper.gaussians.history(),
+        "keyframes": keyframe_arrays(mapper.keyframes),
+        "tracked": mapper.trajectory.state(),
+        "anchors": {
+            "keyframe": np.array([place[anchor.keyframe.index] for anchor in anchors], dtype=np.int64),
+            "spacing": np.array([anchor.spacing for anchor in anchors]),
+        },
+    }
+    numbers: dict[str, Any] = {
+        "frames": mapper.frame_count,
+        "settled": mapper.settled,
+        "sweep_due": mapper.hidden.due,
+        "view_renders": mapper.renderer.view_renders,
+        "random": mapper.rng.bit_generator.state,
+        "gate": mapper.gate.state(),
+        "guards": mapper.optimiser.caught().counts(),
+    }
+    if voxels is not None:
+        groups["voxels"] = dict(zip(("places", "words", "resting"), voxels.marks(), strict=True))
+        numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
+    if len(mapper.paging.away):
+        groups["blocks"] = mapper.paging.away.state()
+        numbers["most_missing"] = mapper.keyframes.most_missing
+    if mapper.settled:
+        groups["settling"] = {"group": mapper.paging.group}
+    if mapper.selector.previous is not None:
+        groups["previous"] = {"index": np.array(mapper.selector.previous)}
+    return MapState.of(groups, numbers)
+
+
+def restore_state(mapper: OnlineMapper, state: MapState, frames: Iterable[TrackedFrame]) -> None:
+    """Restore a saved state into a new map with the same settings.
+
+    Args:
+        mapper: The new map.
+        state: Result of `save_state`.
+        frames: The frames that the saved map had processed, without held-out ones. The keyframes take their images
+            from them.
+
+    Raises:
+        KeyError, TypeError, ValueError: If the state does not fit. The map is then unusable.
+    """
+    mapper.trajectory.restore(state.group("tracked"))
+    rows = KeyframeRows(state.group("keyframes"))
+    blocks = state.group("blocks")
+    on_disk = set(blocks["images"].tolist()) if blocks else ()
+    read: list[Keyframe] = []  # images that go to disk
+    for frame in frames:
+        if frame.index in rows.rows:
+            rows.put(frame, mapper.keyframes)
+            if frame.index in on_disk:
+                read.append(mapper.keyframes[-1])
+        if len(read) == STORED_TOGETHER:
+            mapper.paging.away.store_keyframes(read)
+            read = []
+    mapper.paging.away.store_keyframes(read)
+    if len(mapper.keyframes) != len(rows.rows):
+        raise ValueError(f"{len(mapper.keyframes)} of the {len(rows.rows)} keyframes are among the frames")
+    mapper.keyframes.take_in_depths()
+    mapper.gaussians.restore(state.group("gaussians"))
+    if blocks:
+        mapper.paging.away.restore(blocks)
+        mapper.keyframes.most_missing = int(state.numbers["most_missing"])
+    if settling := state.group("settling"):
+        mapper.paging.group = settling["group"]
+    anchors = state.group("anchors")
+    pairs = zip(anchors["keyframe"].tolist(), anchors["spacing"].tolist(), strict=True)
+    mapper.densifier.anchors = [Anchor(mapper.keyframes[row], spacing) for row, spacing in pairs]
+    if len(mapper.gaussians) and mapper.gaussians.anchors().max() >= len(mapper.densifier.anchors):
+        raise ValueError("a Gaussian has an anchor that the state does not contain")
+    if mapper.densifier.voxels is not None:
+        coarsest, origin = state.numbers["coarsest"], np.array(state.numbers["origin"])
+        mapper.densifier.voxels.settle(coarsest, origin)
+        mapper.densifier.voxels.restore(**state.group("voxels"))
+    previous = state.group("previous")
+    mapper.selector.previous = int(previous["index"]) if previous else None
+    if previous and mapper.selector.previous not in mapper.trajectory:
+        raise ValueError(f"frame {mapper.selector.previous} has no tracked pose")
+    mapper.frame_count = int(state.numbers["frames"])
+    mapper.settled = int(state.numbers.get("settled", 0))  # absent in snapshots of earlier commits
+    mapper.hidden.due = int(state.numbers.get("sweep_due", mapper.hidden.due))  # absent likewise
+    mapper.renderer.view_renders = int(state.numbers["view_renders"])
+    mapper.rng.bit_generator.state = state.numbers["random"]
+    mapper.gate.restore(state.numbers["gate"])
+    mapper.optimiser.safeguards.restore(state.numbers["guards"])

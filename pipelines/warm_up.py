@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
 from pipelines.densify.growth import grow, tracked_seeds
-from pipelines.online_map import OnlineMap
 from pipelines.render.cpu.photometric_model import IDENTITY
+
+if TYPE_CHECKING:
+    from pipelines.online import OnlineMapper
 
 __all__ = ["warm_up"]
 
 
-def warm_up(mapper: OnlineMap) -> None:
+def warm_up(mapper: OnlineMapper) -> None:
     """Run every kernel of an empty map once, on two views of four Gaussians, and leave the map empty."""
     camera = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
     pixels = np.array([[4.0, 4.0], [12.0, 4.0], [4.0, 12.0], [12.0, 12.0]])

@@ -66,7 +66,7 @@ class Keyframe:
         transient: Weights (h, w) uint8 of the parts of the image that move, on a coarse grid: 0 where the image shows
             something that moves, 255 elsewhere. None if nothing moves. `rgba` and `pyramid` contain them.
         unmasked: The pyramid without these weights; empty if nothing moves.
-        missing: Number of Gaussians in blocks on disk that it sees, see `pipelines.blocks`.
+        missing: Number of Gaussians in blocks on disk that it sees, see `pipelines.companions.away`.
     """
 
     index: int

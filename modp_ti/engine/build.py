@@ -20,7 +20,7 @@ from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ALL_HELD_OUT
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.parts.merged_parts import MergedParts
-from pipelines.pace import CompletePace, Pace
+from pipelines.companions.pace import CompletePace, Pace
 
 __all__ = ["EXPECTED", "build_mapper", "open_conductor", "open_earlier_map", "open_observer"]
 

@@ -14,7 +14,7 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.live_status import LiveStatus
-from pipelines.pace import Pace
+from pipelines.companions.pace import Pace
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, in_seconds
 from pipelines.settings import RefineSettings

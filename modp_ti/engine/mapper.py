@@ -23,19 +23,19 @@ from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.formats.colmap_model import image_names
 from modp_ti.outputs.formats.map_folder import NOT_ALWAYS, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
-from pipelines.blocks.block_files import BlockError
-from pipelines.finished_map import FinishedMap
-from pipelines.merging.merge import MappedPart, merge
+from pipelines.companions.block_files import BlockError
+from pipelines.companions.changes import ChangeSweep, EarlierVisit
+from pipelines.companions.pace import Pace
 from pipelines.offline import OfflineMapper
 from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
-from pipelines.pace import Pace
 from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
-from pipelines.refinement import Schedule
+from pipelines.refinement import Schedule, refine
 from pipelines.render.renderer import RenderedView
 from pipelines.settings import MappingSettings, RefineSettings
-from pipelines.state import MapState
-from pipelines.transients.changes import EarlierVisit
+from pipelines.state import MapState, restore_state, save_state
+from pipelines.whole.finished_map import FinishedMap, go_on
+from pipelines.whole.merge import MappedPart, merge
 
 __all__ = ["Mapper"]
 
@@ -43,7 +43,7 @@ __all__ = ["Mapper"]
 @in_engine(
     "add", "take", "optimise_further", "correct", "finish", "refine", "restore", "go_on_with", "watch_changes", "merge"
 )
-@in_engine("trajectory", "render", "version", "save")
+@in_engine("state", "trajectory", "render", "version", "save")
 class Mapper(Tenant):
     """Maps frames of up to `width` x `height` pixels as they arrive.
 
@@ -202,17 +202,25 @@ class Mapper(Tenant):
         """
         if operator.index(steps) < 0:
             raise ValueError(f"a refinement has 0 steps or more, not {steps}")
-        if not self.pipeline.can_be_refined:
-            raise ValueError("an offline map is not refined: give its settings more steps")
+        pipeline = self._online("is not refined: give its settings more steps")
         self.finish()
         settings = RefineSettings() if settings is None else settings
-        self.pipeline.refine(settings.model_copy(update={"steps": steps, "seconds": None}), progress, done, schedule)
+        settings = settings.model_copy(update={"steps": steps, "seconds": None})
+        refine(pipeline, settings, progress, done, schedule)
+
+    def state(self) -> MapState:
+        """Return everything that the next frame or step depends on, for `restore`, see `pipelines.state`.
+
+        Raises:
+            ValueError: If the map is an offline one.
+        """
+        return save_state(self._online("has no state between two frames"))
 
     def restore(self, state: MapState, frames: DeliveredFrames, again: Iterable[TrackedFrame], finished: bool) -> None:
         """Restore the state of another mapper with the same settings.
 
         Args:
-            state: The other mapper's `pipeline.state()`.
+            state: The other mapper's `state()`.
             frames: The other mapper's `frames`, with the trajectory of this mapper's pipeline.
             again: The frames that it processed, without the held-out ones.
             finished: The other mapper's `finished`.
@@ -220,8 +228,9 @@ class Mapper(Tenant):
         Raises:
             KeyError, TypeError, ValueError: If the state does not fit this mapper.
         """
+        pipeline = self._online("cannot be resumed")
         self.frames.origin = frames.origin
-        self.pipeline.restore(state, map(self._near, again))
+        restore_state(pipeline, state, map(self._near, again))
         if list(self.pipeline.trajectory) != frames.index:
             raise ValueError("the frames differ from those with tracked poses")
         self.frames = frames
@@ -229,32 +238,36 @@ class Mapper(Tenant):
         self.finished = finished
 
     def go_on_with(self, finished: FinishedMap) -> None:
-        """Go on with a finished map in this new mapper. More frames may follow.
+        """Continue with a finished map in this new mapper. More frames may follow.
 
         Raises:
             ValueError: If the map does not fit the settings of this mapper, or this mapper is for offline maps.
         """
-        if not isinstance(self.pipeline, OnlineMapper):
-            raise ValueError("an offline map cannot go on with a finished one")
-        self.pipeline.go_on_with(replace(finished, frames=self._noted(finished.frames)))
+        pipeline = self._online("cannot go on with a finished one")
+        go_on(pipeline, replace(finished, frames=self._noted(finished.frames)))
         self.finished = True
 
     def watch_changes(self, earlier: EarlierVisit) -> None:
         """Mask from now on, in the keyframes of an earlier visit, what has changed since."""
-        assert isinstance(self.pipeline, OnlineMapper), "`go_on_with` refuses other maps"
-        self.pipeline.watch_changes(earlier)
+        map_ = self._online("cannot go on with a finished one")
+        changes = ChangeSweep(earlier, map_.gaussians, map_.keyframes, map_.renderer, map_.paging)
+        map_.companions.append(changes)
 
     def merge(self, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
-        """Put the maps of the parts of a recording into this new mapper, see `pipelines.merging.merge`.
+        """Put the maps of the parts of a recording into this new mapper, see `pipelines.whole.merge`.
 
         Raises:
             ValueError: If the maps do not fit the settings of this mapper, or this mapper is for offline maps.
         """
-        if not isinstance(self.pipeline, OnlineMapper):
-            raise ValueError("an offline map is not made of parts")
-        kept = merge(self.pipeline, parts, self._noted(frames))
+        kept = merge(self._online("is not made of parts"), parts, self._noted(frames))
         self.finished = True
         return kept
+
+    def _online(self, refused: str) -> OnlineMapper:
+        """The online mapper; ValueError if this one is for offline maps, which `refused` completes."""
+        if not isinstance(self.pipeline, OnlineMapper):
+            raise ValueError(f"an offline map {refused}")
+        return self.pipeline
 
     def _noted(self, frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
         """Yield the frames near the map's origin, and keep their metadata."""

@@ -21,7 +21,7 @@ from modp_ti.engine.recording import FILE, SessionRecorder
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.outputs.live_status import LiveStatus
-from pipelines.pace import RealtimePace
+from pipelines.companions.realtime_pace import RealtimePace
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings

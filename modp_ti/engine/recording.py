@@ -31,7 +31,8 @@ from modp_ti.files.reading import reading
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.listed_images import decoded_as
-from pipelines.pace import Plan, RecordedPace
+from pipelines.companions.pace import Plan
+from pipelines.companions.realtime_pace import RecordedPace
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings
 

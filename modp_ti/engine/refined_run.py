@@ -34,8 +34,9 @@ from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.run_pictures import kept_images, run_settings
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord
-from pipelines.finished_map import FinishedMap
 from pipelines.online import OnlineMapper
+from pipelines.refinement import refine
+from pipelines.whole.finished_map import FinishedMap, go_on
 
 __all__ = ["refine_run"]
 
@@ -103,7 +104,7 @@ def _refined(run: FinishedRun, config: SceneConfig, metrics: dict[str, Any], lin
     began, before = time.perf_counter(), mapper.renderer.view_renders
     line.start("refining", config.refine.steps)
     try:
-        mapper.refine(config.refine, lambda step, psnr: line.step(step, psnr))
+        refine(mapper, config.refine, lambda step, psnr: line.step(step, psnr))
     finally:
         line.stop()
     seconds = round(time.perf_counter() - began, 3)
@@ -156,7 +157,7 @@ def _mapper_of(run: FinishedRun, config: SceneConfig, line: ProgressLine) -> Onl
         masks=read_masks(run.folder / "masks"),
     )
     try:
-        mapper.go_on_with(finished)
+        go_on(mapper, finished)
     except ValueError as error:
         raise InputError(f"{run.folder}: its map cannot be refined: {error}") from None
     return mapper

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from pipelines.companions.pace import CompletePace
 from pipelines.online import OnlineMapper
-from pipelines.pace import CompletePace
 from pipelines.pipeline import Pipeline
 
 __all__ = ["remarks"]

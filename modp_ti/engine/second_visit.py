@@ -32,8 +32,8 @@ from modp_ti.outputs.locating.world_alignment import (
 from modp_ti.outputs.playback.finished_frames import FinishedFrames
 from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.progress import ProgressLine
-from pipelines.finished_map import FinishedMap
-from pipelines.transients.changes import EarlierVisit
+from pipelines.companions.changes import EarlierVisit
+from pipelines.whole.finished_map import FinishedMap
 
 __all__ = ["SecondVisit"]
 

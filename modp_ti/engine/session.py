@@ -46,8 +46,8 @@ from modp_ti.outputs.progress import ProgressLine, StageProgress
 from modp_ti.outputs.report.record import RunRecord, StepNote
 from modp_ti.outputs.retention import mapped_psnr, retention
 from modp_ti.outputs.time_left import TimeAfterMapping
-from pipelines.blocks.block_files import BlockError
-from pipelines.pace import CompletePace
+from pipelines.companions.block_files import BlockError
+from pipelines.companions.pace import CompletePace
 from pipelines.settings import RefineSettings
 from pipelines.stopwatch import breakdown_percent
 

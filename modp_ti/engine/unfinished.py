@@ -13,7 +13,7 @@ from modp_ti.engine.snapshots import Checkpointer
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers import Tracker
 from modp_ti.outputs.evaluation import MapVersion
-from pipelines.blocks.block_files import BlockError
+from pipelines.companions.block_files import BlockError
 
 __all__ = ["Unfinished"]
 

@@ -15,9 +15,9 @@ from fields.map.keyframe import Keyframe
 from modp_ti.outputs.detail import explained_detail
 from modp_ti.outputs.lpips import Lpips
 from modp_ti.outputs.still_scores import StillScore, StillScorer
-from pipelines.blocks.shown_map import ShownMap
 from pipelines.optimise.losses import LossValues
 from pipelines.pipeline import Pipeline
+from pipelines.whole.shown_map import ShownMap
 
 __all__ = [
     "FrameScore",

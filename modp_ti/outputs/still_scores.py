@@ -11,11 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from pipelines.blocks.shown_map import ShownMap
+from pipelines.companions.transients import (
+    CoarseView,
+    coarse_view,
+    compared,
+    moving,
+    neighbours,
+    place_of,
+    soft_mask,
+    without,
+)
 from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import RenderedView
-from pipelines.transients.evidence import CoarseView, coarse_view, moving, soft_mask
-from pipelines.transients.sweep import compared, neighbours, place_of, without
+from pipelines.whole.shown_map import ShownMap
 
 __all__ = ["StillScore", "StillScorer"]
 

@@ -20,8 +20,8 @@ from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.parts.cutting import Part
 from modp_ti.parts.part_scenes import part_config, parts_of, steps_in_part
-from pipelines.merging.merge import MappedPart
 from pipelines.settings import RefineSettings
+from pipelines.whole.merge import MappedPart
 
 __all__ = ["MergedParts"]
 

@@ -13,7 +13,7 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.async_readback import AsyncReadback
-from pipelines.companions import Companion
+from pipelines.companions.companion import Companion
 from pipelines.optimise.adam import Adam, LearningRates
 from pipelines.optimise.exposure import ExposureRefinement
 from pipelines.optimise.gpu_losses import photometric_loss

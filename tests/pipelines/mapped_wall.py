@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fields.runtime.backend import initialise
-from pipelines.finished_map import FinishedMap
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
+from pipelines.whole.finished_map import FinishedMap
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import NO_ANCHOR
-from pipelines.finished_map import FinishedMap, placed_by
 from pipelines.online import OnlineMapper
+from pipelines.whole.finished_map import FinishedMap, go_on, placed_by
 from tests.pipelines.mapped_wall import finished_map, finished_mapper, fresh_mapper
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
@@ -42,7 +42,7 @@ def finished() -> Finished:
 
 def gone_on(finished: Finished) -> OnlineMapper:
     mapper = fresh_mapper()
-    mapper.go_on_with(finished.map)
+    go_on(mapper, finished.map)
     return mapper
 
 
@@ -64,7 +64,7 @@ def test_what_the_finished_run_has_masked_stays_masked(finished: Finished) -> No
     mask[4:8] = 0
     masked = list(finished.map.keyframes)[1]
     mapper = fresh_mapper()
-    mapper.go_on_with(replace(finished.map, masks={masked: mask}))
+    go_on(mapper, replace(finished.map, masks={masked: mask}))
     for view in mapper.keyframes:
         assert (view.transient is mask) == (view.index == masked)
         rows = (view.rgba[..., 3] == 0).all(axis=1)

@@ -137,7 +137,7 @@ class Checkpointer:
 
     def _snapshot(self, position: Position) -> Snapshot:
         version, frames = version_state(self.online), frames_state(self._mapper.frames)
-        of_map, record = self._mapper.pipeline.state(), record_state(self._record)
+        of_map, record = self._mapper.state(), record_state(self._record)
         numbers = {
             "map": of_map.numbers,
             "frames": frames.numbers,

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from fields.map.blocks import Boxes, extent_of
 from modp_ti.files.atomic import replace_file
 from modp_ti.outputs.formats.splat_packing import morton_order, opacities, smallest_three, to_bits, unit_quaternions
-from pipelines.blocks.hierarchy import LEVELS, Hierarchy, Level
+from pipelines.whole.hierarchy import LEVELS, Hierarchy, Level
 
 __all__ = ["sog_bytes", "write_sog", "write_sog_lod"]
 

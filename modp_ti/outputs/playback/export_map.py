@@ -28,7 +28,7 @@ from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
 from modp_ti.outputs.splat_page.flight import level, moved, viewer_settings
 from modp_ti.outputs.splat_page.page import write_splat_page, write_streaming_page
-from pipelines.blocks.hierarchy import Hierarchy
+from pipelines.whole.hierarchy import Hierarchy
 
 __all__ = ["DEFAULT_NAMES", "export_map"]
 

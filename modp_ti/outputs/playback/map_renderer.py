@@ -13,8 +13,8 @@ from fields.runtime.backend import on_gpu
 from fields.runtime.engine import engine
 from fields.runtime.tenancy import ensure_started, in_engine, settled
 from modp_ti.files.errors import InputError
-from pipelines.blocks.shown_map import ShownMap
 from pipelines.render.renderer import RenderedView, Renderer
+from pipelines.whole.shown_map import ShownMap
 
 __all__ = ["MAX_SIDE", "MapRenderer", "start_device"]
 

@@ -25,7 +25,7 @@ from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
 from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from modp_ti.outputs.viewer.splats import splats_of
-from pipelines.blocks.hierarchy import Hierarchy
+from pipelines.whole.hierarchy import Hierarchy
 
 __all__ = ["FinishedViewer"]
 

@@ -6,7 +6,7 @@ import pytest
 
 from fields.runtime.backend import initialise
 from modp_ti.engine.mapper import Mapper
-from pipelines.blocks.block_files import BlockError
+from pipelines.companions.block_files import BlockError
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
 from tests.pipelines.blocks.long_wall import frame

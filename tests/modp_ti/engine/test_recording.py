@@ -17,7 +17,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.engine.recording import FILE, RecordedSession, SessionRecorder
 from modp_ti.files.errors import InputError
-from pipelines.pace import Plan
+from pipelines.companions.pace import Plan
 from tests.modp_ti.runs import run
 from tests.pipelines.wall import CAMERA, frame
 

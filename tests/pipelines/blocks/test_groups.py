@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.blocks.groups import grouped
+from pipelines.companions.paging import grouped
 
 
 def test_a_group_ends_before_it_would_see_more_than_fits() -> None:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipelines.blocks.hierarchy import LEVELS, Hierarchy
+from pipelines.whole.hierarchy import LEVELS, Hierarchy
 from tests.pipelines.blocks.test_merging import some
 
 FOCAL = 300.0

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipelines.blocks.merging import MOST_OPAQUE, merged
+from pipelines.whole.hierarchy import MOST_OPAQUE, merged
 
 
 def some(count: int, opacity: float = -3.0) -> dict[str, NDArray[np.float32]]:

@@ -14,10 +14,12 @@ from fields.runtime import disk_room
 from fields.runtime.backend import initialise
 from fields.voxels.occupancy import OccupancyVoxels
 from modp_ti.outputs.formats.splats_ply import write_splats
-from pipelines.blocks.block_files import BlockError
-from pipelines.densify import densifier, hidden_gaussians
+from pipelines.companions import hidden_gaussians
+from pipelines.companions.block_files import BlockError
+from pipelines.densify import densifier
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
+from pipelines.state import restore_state, save_state
 from tests.pipelines.blocks.long_wall import frame
 
 pytestmark = pytest.mark.slow
@@ -109,14 +111,14 @@ def test_voxels_that_rest_change_nothing(taichi_on_the_cpu: None, monkeypatch: p
 def test_a_restored_map_goes_on_as_the_saved_one(taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hidden_gaussians, "FIRST_SWEEP", 4)
     mapper = walk(mapper_of(), end=15)
-    state = mapper.state()
+    state = save_state(mapper)
     assert len(mapper.paging.away) > 0
     assert mapper.hidden.due <= 22  # so that the next sweep comes before the end
     arrays = {name: np.array(array) for name, array in state.arrays.items()}
     walk(mapper, 15, 22).finish()
     expected = mapper.all_gaussians()
     again = mapper_of()
-    again.restore(type(state)(arrays, state.numbers), (frame(i, STEPS[i]) for i in range(15)))
+    restore_state(again, type(state)(arrays, state.numbers), (frame(i, STEPS[i]) for i in range(15)))
     walk(again, 15, 22).finish()
     assert again.hidden.due == mapper.hidden.due
     assert again.densifier.voxels.nbytes == mapper.densifier.voxels.nbytes

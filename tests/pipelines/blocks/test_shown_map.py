@@ -6,8 +6,8 @@ import pytest
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
-from pipelines.blocks.shown_map import ShownMap
 from pipelines.render.renderer import Renderer
+from pipelines.whole.shown_map import ShownMap
 from tests.pipelines.wall import CAMERA
 
 

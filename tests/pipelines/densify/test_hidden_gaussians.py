@@ -9,9 +9,9 @@ import numpy as np
 
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
-from pipelines.densify.hidden_gaussians import HiddenGaussians
+from pipelines.companions.hidden_gaussians import HiddenGaussians
+from pipelines.companions.pace import CompletePace, Plan
 from pipelines.online import OnlineMapper
-from pipelines.pace import CompletePace, Plan
 from pipelines.settings import MappingSettings
 from tests.pipelines.two_walls import APART, moved
 from tests.pipelines.wall import frame

@@ -15,7 +15,7 @@ from pipelines.offline import OfflineMapper
 from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
-from pipelines.state import MapState
+from pipelines.state import MapState, restore_state, save_state
 from tests.pipelines.wall import frame
 
 # Few steps: a software driver takes a quarter of a second for a view. The draw of views must not follow the errors,
@@ -84,12 +84,12 @@ def test_the_state_of_one_device_is_restored_on_the_other(on_both: Callable) -> 
         mapper = OnlineMapper(SETTINGS, 64, 48, seed=1)
         mapper.compile()
         if saved:
-            mapper.restore(saved[0], [frame(0), frame(1)])
+            restore_state(mapper, saved[0], [frame(0), frame(1)])
         else:
             for i in range(2):
                 mapper.process(frame(i))
-            saved.append(mapper.state())
-        return mapper.state(), mapper.process(frame(2)).psnr
+            saved.append(save_state(mapper))
+        return save_state(mapper), mapper.process(frame(2)).psnr
 
     (_, psnr), (state, gpu_psnr) = on_both(resumed)
     assert state.numbers == saved[0].numbers

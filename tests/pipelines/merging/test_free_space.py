@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, inverse_se3
-from pipelines.merging.free_space import BEFORE, FreeSpace, ShownSurface
 from pipelines.render.renderer import Renderer
+from pipelines.whole.free_space import BEFORE, FreeSpace, ShownSurface
 from tests.pipelines import reference
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.map.gaussians import SH_C0
-from pipelines.merging.merge import colour_changes, exposed_in, recoloured
+from pipelines.whole.merge import colour_changes, exposed_in, recoloured
 
 
 def transform(rng: np.random.Generator) -> NDArray[np.float64]:

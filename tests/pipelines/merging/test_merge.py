@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.merging.merge import MappedPart, merge
+from pipelines.whole.merge import MappedPart, merge
 from tests.pipelines.mapped_wall import finished_mapper, fresh_mapper
 from tests.pipelines.wall import frame
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.merging.merge import Shown, owned
+from pipelines.whole.merge import Shown, owned
 
 EDGE = 0.5
 

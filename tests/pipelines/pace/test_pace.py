@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.pace import CompletePace, Plan, RecordedPace
+from pipelines.companions.pace import CompletePace, Plan
+from pipelines.companions.realtime_pace import RecordedPace
 from pipelines.settings import CorrectionSettings, MappingSettings, OptimiseSettings
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pipelines.pace import Plan, RealtimePace, RecordedPace
+from pipelines.companions.pace import Plan
+from pipelines.companions.realtime_pace import RealtimePace, RecordedPace
 from pipelines.settings import MappingSettings, OptimiseSettings
 
 SETTINGS = MappingSettings()

@@ -13,6 +13,7 @@ from fields.geometry.se3 import exp_se3
 from fields.runtime.backend import initialise
 from pipelines.online import OnlineMapper
 from pipelines.settings import GateSettings
+from pipelines.state import save_state
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame, pose
 
@@ -90,10 +91,10 @@ def test_a_camera_that_jumps_with_its_picture_passes(mapper: OnlineMapper) -> No
 
 
 def test_refused_frames_leave_the_map_and_the_chance_alone(mapper: OnlineMapper) -> None:
-    before, frames, gate = mapper.state(), mapper.frame_count, mapper.gate.state()
+    before, frames, gate = save_state(mapper), mapper.frame_count, mapper.gate.state()
     try:
         report = mapper.process(replace(walk(12), image=np.zeros((48, 64, 3), np.float32)))
-        after = mapper.state()
+        after = save_state(mapper)
         assert (report.is_keyframe, report.psnr) == (False, None)
         assert after.numbers["random"] == before.numbers["random"]
         assert mapper.gate.refused == {"blank": 1, "repeated": 0, "jumped": 0}

@@ -9,10 +9,10 @@ import pytest
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.se3 import exp_se3
-from pipelines.finished_map import FinishedMap
+from pipelines.companions.changes import ChangeSweep, EarlierVisit
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
-from pipelines.transients.changes import EarlierVisit
+from pipelines.whole.finished_map import FinishedMap, go_on
 from tests.pipelines.mapped_wall import fresh_mapper
 from tests.room import Room, RoomRecording, pinhole, walk
 
@@ -77,9 +77,11 @@ class SecondVisit:
 
 def mapped_on(earlier: FinishedMap, frames: list[TrackedFrame], boxes: list[np.ndarray], watches: bool) -> SecondVisit:
     mapper = fresh_mapper(SETTINGS, size=(CAMERA.width, CAMERA.height))
-    mapper.go_on_with(earlier)
+    go_on(mapper, earlier)
     if watches:
-        mapper.watch_changes(EarlierVisit(earlier.gaussians, FRAMES))
+        visit = EarlierVisit(earlier.gaussians, FRAMES)
+        sweep = ChangeSweep(visit, mapper.gaussians, mapper.keyframes, mapper.renderer, mapper.paging)
+        mapper.companions.append(sweep)
     for frame in frames:
         if not is_held_out(frame):
             mapper.process(frame)

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from pipelines.companions.transients import CoarseView, coarse_view, moving, votes
 from pipelines.render.renderer import RenderedView
-from pipelines.transients.evidence import CoarseView, coarse_view, moving, votes
 
 CAMERA = PinholeCamera(150.0, 150.0, 80.0, 60.0, 160, 120)
 DEPTH = 2.0

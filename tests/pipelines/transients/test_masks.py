@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from pipelines.transients.evidence import soft_mask
+from pipelines.companions.transients import soft_mask
 
 NOTHING = np.zeros((60, 80), dtype=bool)
 

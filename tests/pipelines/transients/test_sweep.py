@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.transients.sweep import neighbours
+from pipelines.companions.transients import neighbours
 
 
 def test_neighbours_are_other_keyframes_near_and_far() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
+from pipelines.state import restore_state, save_state
 from tests.pipelines.mapped_wall import fresh_mapper
 from tests.pipelines.walked_wall import FRAMES, SETTINGS, still, walked, walker
 
@@ -66,9 +67,9 @@ def test_a_restored_map_has_its_masks() -> None:
     for i in range(FRAMES):
         mapper.process(walked(i))
     mapper.finish()
-    state, views = mapper.state(), list(mapper.keyframes)
+    state, views = save_state(mapper), list(mapper.keyframes)
     again = fresh_mapper(MappingSettings(**SETTINGS, transients=True))
-    again.restore(state, [walked(i) for i in range(FRAMES)])
+    restore_state(again, state, [walked(i) for i in range(FRAMES)])
     assert any(view.transient is not None for view in views)
     for old, new in zip(views, again.keyframes, strict=True):
         np.testing.assert_array_equal(old.rgba, new.rgba)

@@ -24,7 +24,7 @@ from modp_ti.outputs.formats.splats_ply import check_splats, read_splats, write_
 from modp_ti.outputs.formats.spz import write_spz
 from modp_ti.outputs.formats.web_splat import write_web_splat
 from modp_ti.outputs.playback.splat_file import open_splats
-from pipelines.blocks.hierarchy import LEVELS, Hierarchy
+from pipelines.whole.hierarchy import LEVELS, Hierarchy
 from tests.modp_ti.outputs.formats.splat_readers import READERS, read_sog
 from tests.pipelines.reference import sh_basis
 

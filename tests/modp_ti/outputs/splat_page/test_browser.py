@@ -24,7 +24,7 @@ from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.splat_page.flight import TO_VIEWER, level, moved, viewer_settings
-from pipelines.blocks.hierarchy import LEVELS
+from pipelines.whole.hierarchy import LEVELS
 from tests.patience import PATIENCE
 
 if screenshot.missing():

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.densify.depth.misplacement import misplacement
+from pipelines.densify.depth.estimate import misplacement
 from tests.pipelines.densify.test_growth import sideways, view
 
 

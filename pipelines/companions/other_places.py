@@ -8,7 +8,7 @@ import numpy as np
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import FAR, centres_of
 from fields.runtime.engine import ti
-from pipelines.companions import Companion
+from pipelines.companions.companion import Companion
 from pipelines.densify.densifier import Densifier
 
 __all__ = ["OtherPlaces"]

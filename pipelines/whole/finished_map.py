@@ -1,4 +1,4 @@
-"""Going on with a finished map: its Gaussians and its frames become the state of a new online map."""
+"""Continuing with a finished map: its Gaussians and its frames become the state of a new online map."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from fields.map.gaussians import NO_ANCHOR
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.densify.densifier import Anchor
-from pipelines.online_map import OnlineMap
+from pipelines.online import OnlineMapper
 from pipelines.render.cpu.photometric_model import IDENTITY
 
-__all__ = ["FinishedMap", "go_on_with", "placed_by", "take_in_frames", "take_in_gaussians"]
+__all__ = ["FinishedMap", "go_on", "placed_by", "take_in_frames", "take_in_gaussians"]
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class FinishedMap:
     masks: Mapping[int, NDArray[np.uint8]] = field(default_factory=dict)
 
 
-def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
-    """Put a finished map into a new online map, so that it can go on with more frames.
+def go_on(mapper: OnlineMapper, finished: FinishedMap) -> None:
+    """Put a finished map into a new online map, so that more frames can follow.
 
     The finished map keeps no optimiser state and no voxels. The moments of Adam start at zero. The voxels are marked
     again from the Gaussians, each at the voxel size of the first keyframe that has it in its image, which becomes its
@@ -62,7 +62,7 @@ def go_on_with(mapper: OnlineMap, finished: FinishedMap) -> None:
     take_in_gaussians(mapper, finished.gaussians)
 
 
-def take_in_frames(mapper: OnlineMap, finished: FinishedMap) -> None:
+def take_in_frames(mapper: OnlineMapper, finished: FinishedMap) -> None:
     """Take the frames of a finished map into a new one: their poses, and the keyframes as views.
 
     Raises:
@@ -88,7 +88,7 @@ def take_in_frames(mapper: OnlineMap, finished: FinishedMap) -> None:
     mapper.keyframes.take_in_depths()
 
 
-def take_in_gaussians(mapper: OnlineMap, gaussians: Mapping[str, NDArray]) -> None:
+def take_in_gaussians(mapper: OnlineMapper, gaussians: Mapping[str, NDArray]) -> None:
     """Take the Gaussians of a finished map into a new one that has its frames, with anchors, voxels and errors.
 
     Raises:
@@ -103,7 +103,7 @@ def take_in_gaussians(mapper: OnlineMap, gaussians: Mapping[str, NDArray]) -> No
             view.error = values.l1
 
 
-def _view_of(mapper: OnlineMap, frame: TrackedFrame, is_keyframe: bool) -> Keyframe | None:
+def _view_of(mapper: OnlineMapper, frame: TrackedFrame, is_keyframe: bool) -> Keyframe | None:
     """Add a frame as the view that it was, or None if it was none or the memory budget has no room for it."""
     if is_keyframe:
         return mapper.keyframes.append(frame) if mapper.budget.takes_keyframe(frame) else None
@@ -112,7 +112,7 @@ def _view_of(mapper: OnlineMap, frame: TrackedFrame, is_keyframe: bool) -> Keyfr
     return mapper.keyframes.append(frame, is_between=True) if mapper.budget.takes_between(frame) else None
 
 
-def _restore_anchors(mapper: OnlineMap, position: NDArray[np.float64]) -> None:
+def _restore_anchors(mapper: OnlineMapper, position: NDArray[np.float64]) -> None:
     """Anchor the Gaussians, and mark the voxels of the map."""
     settings, first = mapper.settings.voxels, mapper.keyframes[0]
     mapper.densifier.anchors = [Anchor(view, settings.target * view.view_scale) for view in mapper.keyframes]

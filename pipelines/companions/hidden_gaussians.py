@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from fields.map.keyframe import Keyframe
-from pipelines.blocks.paging import Paging
-from pipelines.companions import Companion
+from pipelines.companions.companion import Companion
+from pipelines.companions.pace import FIRST_SWEEP
+from pipelines.companions.paging import Paging
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
-from pipelines.pace.pace import FIRST_SWEEP
 
 __all__ = ["HiddenGaussians"]
 

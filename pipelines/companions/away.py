@@ -13,7 +13,7 @@ from fields.map.blocks import Boxes, box_of, extent_of, planes_of, seen
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.blocks.block_files import BlockError, BlockFiles, StoredBlock, records_of, state_of
+from pipelines.companions.block_files import BlockError, BlockFiles, StoredBlock, records_of, state_of
 
 __all__ = ["CHUNK", "BlockOnDisk", "BlocksOnDisk", "planes_of_views"]
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.gaussians import SH_C0
-from pipelines.finished_map import FinishedMap, take_in_frames, take_in_gaussians
-from pipelines.merging.free_space import FreeSpace, ShownSurface
-from pipelines.online_map import OnlineMap
+from pipelines.online import OnlineMapper
 from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.whole.finished_map import FinishedMap, take_in_frames, take_in_gaussians
+from pipelines.whole.free_space import FreeSpace, ShownSurface
 
 __all__ = ["MappedPart", "Shown", "colour_changes", "exposed_in", "merge", "owned", "recoloured"]
 
@@ -150,12 +150,12 @@ class MappedPart:
     view_renders: int
 
 
-def merge(mapper: OnlineMap, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
+def merge(mapper: OnlineMapper, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
     """Put the maps of the parts of a recording into a new online map.
 
     Every frame has the pose and the exposure that the part has found that it belongs to, and every Gaussian comes from
-    the part that owns its place, see `pipelines.merging.merge`. What floats where another part sees free space is
-    left out, see `pipelines.merging.free_space`.
+    the part that owns its place, see `pipelines.whole.merge`. What floats where another part sees free space is
+    left out, see `pipelines.whole.free_space`.
 
     Args:
         mapper: The new map, without frames.
@@ -176,7 +176,7 @@ def merge(mapper: OnlineMap, parts: Sequence[MappedPart], frames: Iterable[Track
     return [int(own.sum()) for own in kept]
 
 
-def _kept(mapper: OnlineMap, parts: Sequence[MappedPart]) -> list[NDArray[np.bool_]]:
+def _kept(mapper: OnlineMapper, parts: Sequence[MappedPart]) -> list[NDArray[np.bool_]]:
     """Return which Gaussians (N,) of each part are kept: what it owns, and no keyframe of another part sees through."""
     space, contribution = FreeSpace(mapper.renderer, mapper.near), mapper.hidden.contribution
     shown: list[Shown] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from pipelines.pace.pace import FIRST_SWEEP, Plan
+from pipelines.companions.pace import FIRST_SWEEP, Plan
 from pipelines.settings import MappingSettings, OptimiseSettings
 
 __all__ = ["Costs", "RealtimePace", "RecordedPace", "bounded_last_views"]

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.blocks.paging import Paging
-from pipelines.companions import Companion
+from pipelines.companions.companion import Companion
+from pipelines.companions.paging import Paging
+from pipelines.companions.transients import EVERY, SAME_DEPTH, YOUNG, CoarseView, compared, latest, soft_mask, votes
 from pipelines.render.renderer import Renderer
-from pipelines.transients.evidence import SAME_DEPTH, CoarseView, soft_mask, votes
-from pipelines.transients.sweep import EVERY, YOUNG, compared, latest
 
 __all__ = ["ChangeSweep", "EarlierVisit"]
 

@@ -1,1 +1,0 @@
-"""Merging: the maps of the parts of a recording become one map."""

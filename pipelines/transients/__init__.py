@@ -1,1 +1,0 @@
-"""What moves: parts of images that the map, made of all views, contradicts."""

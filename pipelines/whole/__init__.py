@@ -1,0 +1,1 @@
+"""Whole maps: continuing with finished ones, merging maps of parts, and levels of detail."""
