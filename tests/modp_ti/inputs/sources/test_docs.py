@@ -47,17 +47,6 @@ DATA = {
         (194, 194),
     ),
     "TUM RGB-D": (lambda at: listing(at / "rgbd_dataset_freiburg1_desk"), "rgb/1.png", (640, 480)),
-    "Replica": (lambda at: image(at / "room0/results/frame000000.jpg", 1200, 680), "frame000000.jpg", (1200, 680)),
-    "7-Scenes": (
-        lambda at: image(at / "redkitchen/seq-01/frame-000000.color.png", 640, 480),
-        "frame-000000.color.png",
-        (640, 480),
-    ),
-    "The paper's Aria sequences": (
-        lambda at: image(at / "room0_release/rectified/0.png", 800, 800),
-        "0.png",
-        (800,) * 2,
-    ),
     "Your own intrinsics": (lambda at: image(at / "images/a.png", 640, 480), "a.png", (640, 480)),
 }
 WITHOUT_DATA = {"A camera or a stream", "Project Aria recordings"}
@@ -65,9 +54,6 @@ WITHOUT_DATA = {"A camera or a stream", "Project Aria recordings"}
 WITH_CAMERA = {
     "Panoramas: images that see all round",
     "TUM RGB-D",
-    "Replica",
-    "7-Scenes",
-    "The paper's Aria sequences",
     "Your own intrinsics",
 }
 

@@ -1,8 +1,7 @@
-"""The senders of docs/tracker_server.md run as written, in processes of their own, and what they send is taken."""
+"""The senders of docs/examples run as written, in processes of their own, and what they send is taken."""
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import sys
@@ -16,7 +15,7 @@ from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.inputs.tracker_server import open_tracker_server
 from tests.patience import PATIENCE
 
-PAGE = (Path(__file__).parents[4] / "docs" / "tracker_server.md").read_text()
+EXAMPLES = Path(__file__).parents[4] / "docs" / "examples"
 
 
 def received(command: list[str]) -> list:
@@ -31,8 +30,7 @@ def received(command: list[str]) -> list:
 
 
 def test_the_python_sender() -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    frames = received([sys.executable, "-c", code])
+    frames = received([sys.executable, str(EXAMPLES / "sender.py")])
     assert len(frames) == 10
     for i, frame in enumerate(frames):
         assert frame.timestamp == i / 30
@@ -49,10 +47,8 @@ def test_the_c_sender(tmp_path: Path) -> None:
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("no C++ compiler")
-    (code,) = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
-    (tmp_path / "tracker.cpp").write_text(code)
     program = str(tmp_path / "tracker")
-    build = [compiler, "-std=c++17", "-Wall", "-Wextra", "-Werror", str(tmp_path / "tracker.cpp"), "-o", program]
+    build = [compiler, "-std=c++17", "-Wall", "-Wextra", "-Werror", str(EXAMPLES / "sender.cpp"), "-o", program]
     subprocess.run(build, check=True, timeout=PATIENCE)
     frames = received([program])
     assert [int(f.rgba[3, 3, 0]) for f in frames] == [20 * i for i in range(10)]
