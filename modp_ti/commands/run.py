@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -22,9 +22,6 @@ from modp_ti.commands.shared import (
     progress_console,
 )
 from modp_ti.files.errors import InputError
-
-if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig
 
 __all__ = ["EXAMPLES", "run"]
 
@@ -108,18 +105,16 @@ def run(
     with outcome(as_json) as result:
         if scene is not None and any("=" not in word for word in more or []):
             raise InputError("one recording at a time: `modp-ti batch` maps several; of pictures, name their folder")
-        options = {"view.enabled=true": view, "force=true": force}
-        overrides = [*(option for option, given in options.items() if given), *(set_ or []), *(more or [])]
+        settled = {"--onto": onto, "--parts": parts} | ({} if scene else {"--fast": fast, "--best": best})
+        for option, value in settled.items():
+            if value and (resume is not None or replay is not None):
+                raise InputError(f"{option} is for a scene: a run that is resumed or repeated has its settings already")
+        overrides = [*(["view.enabled=true"] * view), *(["force=true"] * force), *(set_ or []), *(more or [])]
         if onto is not None:
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
         if parts is not None:
             overrides.append(f"parts={parts}")
-        for option, given in (("onto", onto), ("parts", parts)):
-            if given is not None and (resume is not None or replay is not None):
-                raise InputError(
-                    f"--{option} is for a scene: a run that goes on or is repeated has its settings already"
-                )
-        preset = _preset(resume or replay, scene, fast, best)
+        preset = chosen_preset(fast, best)
         if len(sources) > 1 and (stream is not None or replay is not None):
             raise InputError("--stream and --replay need no scene file and no --resume: give one of them")
         if replay is not None:
@@ -133,14 +128,6 @@ def run(
             result.data = {"output": str(folder), "metrics": metrics}
 
 
-def _preset(resume: Path | None, scene: Path | None, fast: bool, best: bool) -> str | None:
-    """Return the name of the preset that was asked for. Raises InputError if it is not clear or has no effect."""
-    preset = chosen_preset(fast, best)
-    if preset is not None and scene is None and resume is not None:
-        raise InputError(f"--{preset} is for a scene file: a run that goes on has its settings already")
-    return preset
-
-
 def _run(
     scene: Path | None,
     stream: str | None,
@@ -152,8 +139,9 @@ def _run(
 ) -> Path:
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.files.run_folder import require_usable
-    from modp_ti.inputs.bare_recording import base_of, is_recording
+    from modp_ti.inputs.bare_recording import base_of, is_recording, named_scene, streamed_scene
     from modp_ti.inputs.scene_paths import refuse_output_in_input
+    from modp_ti.outputs.progress import ProgressLine
 
     snapshot = None
     if resume is not None:
@@ -163,7 +151,11 @@ def _run(
             raise InputError(f"{scene}: --resume has the recording already; leave it out")
         config, snapshot = load_resumed(resume, scene, overrides, preset)
     else:
-        config = _new_scene(scene, stream, overrides, preset, quiet)
+        if stream is not None:
+            config = streamed_scene(stream, overrides, preset)
+        else:
+            assert scene is not None, "run() asks for one of them"
+            config = named_scene(scene, overrides, preset, say=ProgressLine(progress_console(quiet)).note)
         refuse_output_in_input(config, Path.cwd() if scene is None else base_of(scene))
         require_usable(config.output)  # once more in the run: here, before Taichi is loaded
     if config.parts is not None:
@@ -179,19 +171,6 @@ def _run(
     if resume is not None:
         discard(folder)
     return folder
-
-
-def _new_scene(
-    scene: Path | None, stream: str | None, overrides: list[str], preset: str | None, quiet: bool
-) -> SceneConfig:
-    """Return the settings of a scene file, of a recording, or of a stream."""
-    from modp_ti.inputs.bare_recording import named_scene, streamed_scene
-    from modp_ti.outputs.progress import ProgressLine
-
-    if stream is not None:
-        return streamed_scene(stream, overrides, preset)
-    assert scene is not None, "run() asks for one of them"
-    return named_scene(scene, overrides, preset, say=ProgressLine(progress_console(quiet)).note)
 
 
 def _replay(recorded: Path, overrides: list[str], quiet: bool) -> Path:
