@@ -43,7 +43,7 @@ def check(
         from modp_ti.files.terminal import CleanConsole
         from modp_ti.inputs.bare_recording import base_of, named_scene
         from modp_ti.inputs.inspection import report as reports
-        from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
+        from modp_ti.inputs.inspection.findings import Finding, Severity, verdict
         from modp_ti.inputs.scene_paths import refuse_output_in_input
         from modp_ti.outputs.progress import ProgressLine
 
@@ -63,10 +63,9 @@ def check(
 
 def inspect_scene(config: SceneConfig, console: Console) -> Report:
     """Iterate over a scene's tracker once and judge its frames. Raises InputError if the input cannot be read."""
+    from modp_ti.inputs.inspection.findings import judge_scale, judge_sequence, measure_scale
     from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
-    from modp_ti.inputs.inspection.pictures import judge_sequence
     from modp_ti.inputs.inspection.report import Report
-    from modp_ti.inputs.inspection.scale import judge_scale, measure_scale
     from modp_ti.inputs.inspection.survey import survey
     from modp_ti.inputs.trackers import open_tracker
     from modp_ti.outputs.progress import ProgressLine

@@ -36,7 +36,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import run_folder
 from modp_ti.files.urls import without_secrets
 from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
-from modp_ti.inputs.inspection.first_look import require_fitting
+from modp_ti.inputs.inspection.geometry import require_fitting
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.trackers import Tracker, open_tracker

@@ -12,10 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from modp_ti.inputs.inspection.conventions import CONVENTIONS
-from modp_ti.inputs.inspection.finding import Finding, Severity, verdict
+from modp_ti.inputs.inspection.findings import Finding, Scale, Severity, blurred, duplicates, time_gaps, verdict
 from modp_ti.inputs.inspection.geometry import Geometry
-from modp_ti.inputs.inspection.pictures import blurred, duplicates, time_gaps
-from modp_ti.inputs.inspection.scale import Scale
 from modp_ti.inputs.inspection.survey import FrameRecord
 
 __all__ = ["Report", "as_json", "print_report"]

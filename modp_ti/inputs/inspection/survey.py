@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, Convention
-from modp_ti.inputs.inspection.epipolar import MatchedPair, matched_pair
-from modp_ti.inputs.multiview.features import Features, detect_features
+from modp_ti.inputs.multiview.features import Features, detect_features, match_anywhere
+from modp_ti.inputs.multiview.reprojection import estimated
 from pipelines.select.gate import sharpness
 
-__all__ = ["FrameRecord", "Survey", "survey"]
+__all__ = ["FrameRecord", "MatchedPair", "Survey", "matched_pair", "survey"]
 
 # At PLACES frames of the sequence, features are matched with the frames of the same view GAPS times further on.
 GAPS = (1, 2, 4)
@@ -24,6 +24,28 @@ PLACES = 8
 # Distance between these places if the number of frames is unknown.
 LIVE_SPACING = 25
 THUMBNAIL = 64  # [px] longer side
+# Fewest matches of a pair, and the threshold of RANSAC in px of the image used for detection.
+FEWEST_MATCHES = 30
+RANSAC_BAND = 1.5
+
+
+@dataclass(frozen=True)
+class MatchedPair:
+    """Matches of two images that are consistent with a common epipolar geometry.
+
+    Attributes:
+        a: Index of the first frame.
+        b: Index of the second frame.
+        pixels_a: (M, 2) features in the first image.
+        pixels_b: (M, 2) features in the second image.
+        pixel: Pixel size of the images used for detection, in pixels of the mapped image.
+    """
+
+    a: int
+    b: int
+    pixels_a: NDArray[np.float64]
+    pixels_b: NDArray[np.float64]
+    pixel: float
 
 
 @dataclass(frozen=True)
@@ -158,3 +180,30 @@ def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def matched_pair(a: int, features_a: Features, b: int, features_b: Features) -> MatchedPair | None:
+    """Match two images without using their poses.
+
+    Args:
+        a: Index of the first frame.
+        features_a: Its features.
+        b: Index of the second frame.
+        features_b: Its features.
+
+    Returns:
+        The matches that are inliers of a fundamental matrix; None if there are too few.
+    """
+    pairs = match_anywhere(features_a, features_b).pairs
+    if len(pairs) < FEWEST_MATCHES:
+        return None
+    pixels_a, pixels_b = features_a.pixels[pairs[:, 0]], features_b.pixels[pairs[:, 1]]
+    pixel = max(features_a.pixel, features_b.pixel)
+    cv2.setRNGSeed(0)
+    band = RANSAC_BAND * pixel
+    found = estimated(cv2.findFundamentalMat, pixels_a, pixels_b, cv2.USAC_MAGSAC, band, 0.999, 5000)
+    inlier = None if found is None else found[1]
+    if inlier is None or inlier.sum() < FEWEST_MATCHES:
+        return None
+    kept = inlier.ravel() > 0
+    return MatchedPair(a, b, pixels_a[kept], pixels_b[kept], pixel)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from fields.geometry.se3 import exp_se3
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.inspection.first_look import require_fitting
+from modp_ti.inputs.inspection.geometry import require_fitting
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers import open_tracker
 

@@ -13,10 +13,9 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, STATED, Convention
-from modp_ti.inputs.inspection.epipolar import MatchedPair, epipolar_score, matched_pair
-from modp_ti.inputs.inspection.finding import Severity, verdict
-from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
-from modp_ti.inputs.inspection.survey import survey
+from modp_ti.inputs.inspection.findings import Severity, verdict
+from modp_ti.inputs.inspection.geometry import epipolar_score, judge_geometry, measure_geometry
+from modp_ti.inputs.inspection.survey import MatchedPair, matched_pair, survey
 from modp_ti.inputs.multiview.features import Features
 
 CAMERA = PinholeCamera(300.0, 305.0, 161.0, 118.0, 320, 240)
