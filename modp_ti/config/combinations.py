@@ -37,11 +37,11 @@ EXCLUSIONS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     (
         "source.panorama",
         (NO_PANORAMAS,),
-        "it has no poses of panoramas; take klt, transforms, tum, orbslam3, matrices or tanksandtemples",
+        "it has no poses of panoramas; take sfm, transforms, tum, orbslam3, matrices or tanksandtemples",
     ),
     (
         "source.panorama",
-        ("tracker.loops", "tracker.maps", "tracker.adjust", "onto", "parts", "source.part", CLOCK[-1]),
+        ("tracker.adjust", "onto", "parts", "source.part", CLOCK[-1]),
         "the faces of a panorama keep together, in one map",
     ),
     ("snapshot_every", ("mode: offline", *CLOCK), "a run resumes by reading its frames again; record them"),
@@ -73,7 +73,6 @@ def used_settings(scene: SceneConfig) -> dict[str, str]:
         "source.vignette": source.vignette is not None,
         "source.panorama": source.panorama.given,
         "source.part": source.part is not None,
-        "tracker.loops": getattr(tracker, "loops", False),
         "tracker.maps": maps != "first" and f"tracker.maps: {maps}",
         "tracker.maps: all": maps == "all",
         "tracker.adjust": adjusts,

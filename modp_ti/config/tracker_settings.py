@@ -80,7 +80,6 @@ class KltSettings(TrackerSettings):
     """The built-in tracker, which needs only the images."""
 
     follows_streams: ClassVar[bool] = True
-    places_panoramas: ClassVar[bool] = True
 
     kind: Literal["klt"] = Field(default="klt", description="the built-in tracker, which uses only the images")
     loops: bool = Field(
@@ -107,6 +106,8 @@ class KltSettings(TrackerSettings):
 
 class SfmSettings(TrackerSettings):
     """Structure from motion on the images, before the first frame is mapped."""
+
+    places_panoramas: ClassVar[bool] = True
 
     kind: Literal["sfm"] = Field(
         default="sfm",

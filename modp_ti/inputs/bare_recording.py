@@ -149,7 +149,7 @@ def recorded_scene(
         with suppress(UnreadableImageError):
             if is_panoramic(ListedImages(images, first, [0.0]), first[0]):
                 say(f"{images}: the images see all round: source.panorama.projection=equirectangular")
-                return settings({"kind": "klt"}, "source.panorama.projection=equirectangular")
+                return settings({"kind": "sfm"}, "source.panorama.projection=equirectangular")
     return config
 
 

@@ -86,7 +86,7 @@ def require_pinhole(images: ImageSource, source: SourceSettings, name: str) -> N
     if not source.panorama.model_fields_set and is_panoramic(images, name):
         raise InputError(
             f"{images.path}: the images see all round: set source.panorama.projection=equirectangular with "
-            "tracker.kind=klt, or =none if a common lens took them"
+            "tracker.kind=sfm, or =none if a common lens took them"
         )
 
 

@@ -12,7 +12,6 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.landmark_map import Keyframe
-from modp_ti.inputs.klt.rig_tracking import RigTracking
 from modp_ti.inputs.klt.tracking import Tracking, View
 from modp_ti.inputs.multiview.reprojection import ray_errors
 from modp_ti.inputs.replay import points_inside
@@ -53,7 +52,7 @@ class DeliveredTrajectory:
         frames: The delivered frames in order.
     """
 
-    def __init__(self, tracking: Tracking | RigTracking, undistorter: Undistorter) -> None:
+    def __init__(self, tracking: Tracking, undistorter: Undistorter) -> None:
         self.frames: list[DeliveredFrame] = []
         self._tracking = tracking
         self._map = tracking.map
@@ -131,7 +130,6 @@ class DeliveredTrajectory:
         Args:
             undistorter: Undistortion of the delivered images with the new camera.
         """
-        assert isinstance(self._tracking, Tracking), "the camera of a rig is known"
         revision, self._undistorter = undistorter.revising(self._undistorter), undistorter
         for frame in self.frames:
             self._tracking.relocalise(frame.view)

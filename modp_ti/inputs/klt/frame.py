@@ -15,6 +15,22 @@ __all__ = ["WANTED", "Frame", "LocalisedFrame", "corners", "describe", "flow"]
 
 WANTED = 450  # features that are tracked
 DESCRIBED_SIDE = 400  # longer side at which SIFT features are detected: 60 % of the time that 640 px take
+WINDOW = (21, 21)
+LEVELS = 4  # pyramid levels above the image itself, at most
+# Levels above the image, forwards and backwards, where the predicted motion is at most SLOW px in the median. The way
+# back starts where it should end. All levels are used if a smaller share of the points than PREDICTED_SHARE is tracked.
+SLOW = 12.0
+SLOW_LEVELS, RETURN_LEVELS = 2, 1
+PREDICTED_SHARE = 0.85
+# Largest forward-backward error [px].
+ROUND_TRIP = 0.7
+# Smallest minimum eigenvalue of a corner's structure tensor, as a share of the best corner's.
+QUALITY = 0.002
+BORDER = 8  # px from the edge, where windows would be cut off
+# Bands of rows and strips of columns whose brightness is compared. The bands are lit apart if the logarithm of their
+# change deviates by UNEVEN between them, and by twice as much as between the strips.
+BANDS, STRIPS = 60, 4
+UNEVEN = 0.04
 
 
 @dataclass
@@ -75,24 +91,6 @@ class LocalisedFrame(Frame):
 def describe(grey: NDArray[np.uint8]) -> Features:
     """SIFT features of a tracked image (H, W) uint8."""
     return detect_features(np.repeat(grey[..., None], 3, axis=2), side=DESCRIBED_SIDE)
-
-
-WINDOW = (21, 21)
-LEVELS = 4  # pyramid levels above the image itself, at most
-# Levels above the image, forwards and backwards, where the predicted motion is at most SLOW px in the median. The way
-# back starts where it should end. All levels are used if a smaller share of the points than PREDICTED_SHARE is tracked.
-SLOW = 12.0
-SLOW_LEVELS, RETURN_LEVELS = 2, 1
-PREDICTED_SHARE = 0.85
-# Largest forward-backward error [px].
-ROUND_TRIP = 0.7
-# Smallest minimum eigenvalue of a corner's structure tensor, as a share of the best corner's.
-QUALITY = 0.002
-BORDER = 8  # px from the edge, where windows would be cut off
-# Bands of rows and strips of columns whose brightness is compared. The bands are lit apart if the logarithm of their
-# change deviates by UNEVEN between them, and by twice as much as between the strips.
-BANDS, STRIPS = 60, 4
-UNEVEN = 0.04
 
 
 def flow(

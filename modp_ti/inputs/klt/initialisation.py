@@ -24,6 +24,8 @@ LEAST_ANGLE = 2.5
 PATIENCE = 90  # frames
 BETWEEN = 3  # keyframes between the two views
 LONGEST = 400  # frames in memory
+MAX_ERROR = 1.5  # px, RANSAC threshold
+FEWEST_PLACED = 40  # points with parallax
 
 
 class Initialisation:
@@ -164,10 +166,6 @@ class Initialisation:
             known = landmarks.known[keyframe.ids]
             errors.append(ray_errors(keyframe.T_camera_world, landmarks.xyz[keyframe.ids[known]], keyframe.rays[known]))
         return bool(np.median(np.concatenate(errors)) * landmarks.lens.focal < 1.0)
-
-
-MAX_ERROR = 1.5  # px, RANSAC threshold
-FEWEST_PLACED = 40  # points with parallax
 
 
 @dataclass(frozen=True)

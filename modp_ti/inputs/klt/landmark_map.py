@@ -78,13 +78,9 @@ class LandmarkMap:
 
     Args:
         lens: The camera.
-        mounts: (C, 4, 4) T_camera_rig of a rig of such cameras; None for a single camera. The keyframes then come in
-            groups of C, the views of a place of the rig in the order of its cameras, and keep their poses relative to
-            each other.
 
     Attributes:
         lens: The camera.
-        mounts: As the argument.
         keyframes: The keyframes in order.
         count: Number of ids that were given.
         xyz: (C, 3) positions in the world.
@@ -98,9 +94,8 @@ class LandmarkMap:
         unsolved: Number of adjustments for which Ceres found no usable solution.
     """
 
-    def __init__(self, lens: Lens, mounts: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, lens: Lens) -> None:
         self.lens = lens
-        self.mounts = mounts
         self.keyframes: list[Keyframe] = []
         self.unsolved = 0
         self.count = 0
@@ -264,8 +259,7 @@ class LandmarkMap:
             return float("inf")
         poses = {k: self.keyframes[k].T_camera_world for k in views}
         solve = adjusted_apart if apart else adjusted_bundle
-        camera, mounts = self.lens.camera, self.mounts
-        bundle = solve(camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined, mounts=mounts)
+        bundle = solve(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
         if bundle is None:
             self.unsolved += 1
             return float("inf")
@@ -286,7 +280,7 @@ class LandmarkMap:
 
     def copy(self) -> LandmarkMap:
         """A copy that can change by itself. The images and SIFT features of the keyframes are shared."""
-        other = LandmarkMap(self.lens, self.mounts)
+        other = LandmarkMap(self.lens)
         other.count, other.unsolved = self.count, self.unsolved
         for name in LANDMARKS:
             setattr(other, name, getattr(self, name).copy())

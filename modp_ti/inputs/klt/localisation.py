@@ -31,6 +31,14 @@ MAX_ERROR = 3.0  # landmarks with a larger reprojection error [px] are no longer
 SIGMA = 1.0  # px, scale of the robust loss
 FEWEST = 20  # fewest landmarks for a pose
 SEARCHED = 300  # landmarks of the map that are searched for in a keyframe, at most
+TILE = 40  # side [px] of a patch with its search area
+COMPARED = 13  # side [px] of the compared window
+COLUMNS = 16
+# Smallest correlation of matching patches.
+ALIKE = 0.75
+# Largest change of scale, and of viewing direction [degrees], between a patch and the current view.
+LARGEST_ZOOM = 1.8
+LARGEST_TURN = 40.0
 
 
 def localised(landmarks: LandmarkMap, frame: Frame, T_guess: NDArray[np.float64], seed: int) -> LocalisedFrame | None:
@@ -85,15 +93,12 @@ def predicted_pixels(
     return np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, last.pixels)
 
 
-def searched(
-    landmarks: LandmarkMap, frame: LocalisedFrame, elsewhere: NDArray[np.int64] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def searched(landmarks: LandmarkMap, frame: LocalisedFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Search a frame for landmarks of the map that should be visible but are not tracked.
 
     Args:
         landmarks: The map.
         frame: The frame.
-        elsewhere: (K,) ids that are not searched for, because other views of the same time have them.
 
     Returns:
         Ids (M,) of the landmarks that were found, and their pixels (M, 2).
@@ -102,8 +107,6 @@ def searched(
     height, width = frame.grey.shape
     candidate = landmarks.known.copy()
     candidate[frame.ids] = False
-    if elsewhere is not None:
-        candidate[elsewhere] = False
     candidate &= (landmarks.looked < 4) | (landmarks.found > 0.25 * landmarks.looked)
     candidate = np.flatnonzero(candidate)
     at = landmarks.lens.pixels(landmarks.xyz[candidate] @ T[:3, :3].T + T[:3, 3])
@@ -149,16 +152,6 @@ def _spread(
     order = np.lexsort((np.arange(len(pixels)), -merit, of_cell))
     rank = np.arange(len(order)) - np.searchsorted(of_cell[order], of_cell[order])
     return order[np.lexsort((order, rank))[:count]]
-
-
-TILE = 40  # side [px] of a patch with its search area
-COMPARED = 13  # side [px] of the compared window
-COLUMNS = 16
-# Smallest correlation of matching patches.
-ALIKE = 0.75
-# Largest change of scale, and of viewing direction [degrees], between a patch and the current view.
-LARGEST_ZOOM = 1.8
-LARGEST_TURN = 40.0
 
 
 def reference_views(

@@ -32,6 +32,23 @@ EVERY = 5  # new keyframes that are compared together, at least
 # the larger the map is.
 GROWTH = 20
 NEAR_SHARED = 60  # landmarks that keyframes share whose relation a loop preserves
+YOUNGEST = 15  # keyframes between the two ends of a loop, at least
+SHARED = 10  # landmarks: keyframes that share more are connected
+NOTABLE = 5.0  # px: with less drift, the search for landmarks finds those of the other end
+# Radians. Directions drift by a few degrees over a recording. Opposite sides of a building that look alike make turns
+# of 180 degrees, which the check of the adjusted map has missed.
+LARGEST_TURN = 0.8
+CANDIDATES = 2  # keyframes with which a keyframe is compared
+# Cosine of the image descriptors from which keyframes are compared. It is 0.1 to 0.8 for overlapping pictures of
+# redkitchen, and below 0.07 for others.
+LEAST_LIKENESS = 0.05
+AGREEING = 3  # keyframes that must agree
+REMEMBERED = 12  # keyframes for which a recognition counts
+PAUSE = 5  # keyframes after a loop in which none is sought
+STEPS = 50  # of the pose graph
+# Uncertainties of a link in rotation [radians], place (relative to the scene's depth) and scale. Only their ratios
+# matter.
+SIGMA = 0.01
 
 
 @dataclass(frozen=True)
@@ -168,21 +185,6 @@ def _relation(found: Recognition) -> NDArray[np.float64]:
     return found.of.T_camera_world @ inverse_se3(found.T_camera_world) @ np.diag([s, s, s, 1.0])
 
 
-YOUNGEST = 15  # keyframes between the two ends of a loop, at least
-SHARED = 10  # landmarks: keyframes that share more are connected
-NOTABLE = 5.0  # px: with less drift, the search for landmarks finds those of the other end
-# Radians. Directions drift by a few degrees over a recording. Opposite sides of a building that look alike make turns
-# of 180 degrees, which the check of the adjusted map has missed.
-LARGEST_TURN = 0.8
-CANDIDATES = 2  # keyframes with which a keyframe is compared
-# Cosine of the image descriptors from which keyframes are compared. It is 0.1 to 0.8 for overlapping pictures of
-# redkitchen, and below 0.07 for others.
-LEAST_LIKENESS = 0.05
-AGREEING = 3  # keyframes that must agree
-REMEMBERED = 12  # keyframes for which a recognition counts
-PAUSE = 5  # keyframes after a loop in which none is sought
-
-
 class LoopDetection:
     """Finds the loops of a map while it grows.
 
@@ -250,12 +252,6 @@ def _offset(found: Recognition) -> tuple[float, float]:
     off = found.T_camera_world @ inverse_se3(found.by.T_camera_world)
     turn = float(np.arccos(np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
     return turn, float(np.linalg.norm(off[:3, 3])) / found.depth
-
-
-STEPS = 50
-# Uncertainties of a link in rotation [radians], place (relative to the scene's depth) and scale. Only their ratios
-# matter.
-SIGMA = 0.01
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,10 @@ ROUNDS = 2  # bundle adjustments, each without the outliers of the one before
 # The map contradicts a connection if the residuals of more of the connecting observations, or of the others, are those
 # of outliers after the adjustment.
 LARGEST_LOSS, LARGEST_DAMAGE = 0.5, 0.04
+CANDIDATES = 3  # keyframes of another map with which a keyframe is compared
+AGREEING = 3  # keyframes that must agree
+PAUSE = 5  # keyframes after a join that was refused in which none is sought
+MAX_ERROR = 5.0  # px
 
 
 def connected(landmarks: LandmarkMap, found: Sequence[Recognition], apart: bool = False) -> bool:
@@ -81,11 +85,7 @@ def _observations(landmarks: LandmarkMap) -> int:
     return sum(int(landmarks.known[keyframe.ids].sum()) for keyframe in landmarks.keyframes)
 
 
-CANDIDATES = 3  # keyframes of another map with which a keyframe is compared
-AGREEING = 3  # keyframes that must agree
-PAUSE = 5  # keyframes after a join that was refused in which none is sought
 MAX_ERROR_3D = 0.05  # of corresponding points, relative to their depth
-MAX_ERROR = 5.0  # px
 
 
 class MapJoining:

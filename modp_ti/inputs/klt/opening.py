@@ -36,6 +36,8 @@ __all__ = ["estimated_intrinsics", "open_klt"]
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
 DIAGONAL_35MM = 43.27  # mm
+# Further keyframes change the estimate little.
+ENOUGH = 60
 
 
 def open_klt(
@@ -135,9 +137,6 @@ def _estimated(reader: FrameReader, blank: Intrinsics, seed: int, progress: Prog
     found, used = estimated_intrinsics(images(), (width, height), guess.camera.fx, seed, progress, total)
     return (guess, note) if found is None else (found, estimation_note(found, used))
 
-
-# Further keyframes change the estimate little.
-ENOUGH = 60
 
 Image = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 

@@ -38,6 +38,16 @@ MAX_OFF_LINE = 3.0  # distance to the epipolar line
 NEIGHBOURHOOD = 40.0  # distance to landmarks from which a depth is interpolated
 FEWEST = 15  # fewest inlier matches of a pose
 THUMBNAIL = (32, 24)
+WORDS = 64
+TRAINED_ON = 20_000  # descriptors, at most
+ROUNDS = 12  # of k-means
+FEWEST_PLACED = 25  # matches with depth in both keyframes
+MAX_ERROR_BETWEEN = 8.0  # px, of a point of the one map in the keyframe of the other
+LEAST_SHARE = 0.6  # of the matches that must be that near
+LARGEST_SPREAD = 0.25  # median deviation of the ratio of depths, relative
+# Differences between two recognitions that agree: of a camera's place relative to the scene's depth, its direction
+# [radians], and the scale.
+SAME_PLACE, SAME_DIRECTION, SAME_SCALE = 0.06, 0.05, 0.1
 
 
 def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -160,11 +170,6 @@ def world_points(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float
     return xyz
 
 
-WORDS = 64
-TRAINED_ON = 20_000  # descriptors, at most
-ROUNDS = 12  # of k-means
-
-
 class PlaceIndex:
     """Image descriptors of keyframes.
 
@@ -214,15 +219,6 @@ def vocabulary(descriptors: NDArray[np.uint8], count: int, seed: int) -> NDArray
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
     _, _, centres = cv2.kmeans(data, count, labels, criteria, 1, cv2.KMEANS_USE_INITIAL_LABELS)
     return np.rint(np.asarray(centres, np.float32))
-
-
-FEWEST_PLACED = 25  # matches with depth in both keyframes
-MAX_ERROR_BETWEEN = 8.0  # px, of a point of the one map in the keyframe of the other
-LEAST_SHARE = 0.6  # of the matches that must be that near
-LARGEST_SPREAD = 0.25  # median deviation of the ratio of depths, relative
-# Differences between two recognitions that agree: of a camera's place relative to the scene's depth, its direction
-# [radians], and the scale.
-SAME_PLACE, SAME_DIRECTION, SAME_SCALE = 0.06, 0.05, 0.1
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,8 @@ FOLLOWED_SIDE = 640  # longer side [px] of the images in which features are trac
 
 def available(reader: FrameReader) -> Sequence[str]:
     """Names of the selected images that are available so far."""
-    source, images = reader.source, reader.images
-    names = images.whole.names[source.start : source.stop : source.step]
-    return names if images.whole is images else [view for name in names for view in images.views(name)]
+    source = reader.source
+    return reader.images.names[source.start : source.stop : source.step]
 
 
 def arriving(reader: FrameReader) -> Iterator[str]:

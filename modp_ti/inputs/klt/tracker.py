@@ -16,7 +16,6 @@ from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.klt.camera import WHILE_TRACKING, Lens, estimation_note, intrinsics_of
 from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
 from modp_ti.inputs.klt.odometry import Odometry
-from modp_ti.inputs.klt.rig_odometry import RigOdometry
 from modp_ti.inputs.klt.selected_images import arriving, available, followed_scale, read_image
 from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.live_counts import LiveCounts
@@ -81,19 +80,15 @@ class KltTracker(Tracker):
             self._lens = Lens.radial(followed.fx, 0.0, followed.width, followed.height)
         else:
             self._lens = Lens.pinhole(followed)
-        mounts = np.stack(reader.images.mounts)
-        if len(mounts) > 1:
-            self._odometry = RigOdometry(self._lens, mounts, seed)
-        else:
-            self._odometry = Odometry(
-                [self._lens],
-                seed,
-                WHILE_TRACKING if is_guess else None,
-                BEGINS_ANEW_AFTER,
-                loops,
-                waits=reader.images.arrivals is None,  # a live map begins with its first frames
-                place=place,
-            )
+        self._odometry = Odometry(
+            [self._lens],
+            seed,
+            WHILE_TRACKING if is_guess else None,
+            BEGINS_ANEW_AFTER,
+            loops,
+            waits=reader.images.arrivals is None,  # a live map begins with its first frames
+            place=place,
+        )
         self._estimated_from = 0  # images, 0 for a camera that has not been estimated
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable = Unreadable()

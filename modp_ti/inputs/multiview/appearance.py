@@ -17,6 +17,11 @@ __all__ = ["Appearance", "image_pairs", "nearest_words", "vlad"]
 WORDS = 32
 TRAINED_WITH = 20_000
 ITERATIONS = 15
+# Up to this number of images, all pairs are matched.
+ALL_PAIRS = 60
+# Images that look most like an image, which are matched with it: beside its neighbours in a sequence, where they close
+# loops, and alone.
+ALIKE_IN_SEQUENCE, ALIKE = 8, 30
 
 
 class Appearance:
@@ -58,14 +63,9 @@ def _clustered(described: NDArray[np.float32], seed: int) -> NDArray[np.float32]
     return np.round(np.asarray(centres, np.float32))
 
 
-# Up to this number of images, all pairs are matched.
-ALL_PAIRS = 60
-# Images that look most like an image, which are matched with it: beside its neighbours in a sequence, where they close
-# loops, and alone.
-ALIKE_IN_SEQUENCE, ALIKE = 8, 30
-
-
-def image_pairs(features: Sequence[Features], overlap: int | None, seed: int) -> list[tuple[int, int]]:
+def image_pairs(
+    features: Sequence[Features], overlap: int | None, seed: int, cameras: int = 1
+) -> list[tuple[int, int]]:
     """Choose the pairs of images that are matched.
 
     Args:
@@ -73,21 +73,25 @@ def image_pairs(features: Sequence[Features], overlap: int | None, seed: int) ->
         overlap: Number of next images in a sequence that an image is matched with, besides those 2, 4, 8, ... images
             later. None for images in no order.
         seed: Seed of the vocabulary.
+        cameras: Number of cameras of a rig, whose images follow one another. In a sequence, an image is then matched
+            with the next ones of its own camera, and with those of any that look alike.
 
     Returns:
         Ascending pairs (i, j) with i < j.
     """
     count = len(features)
+    index = np.arange(count)
+    apart = np.abs(index[:, None] // cameras - index // cameras)
     if count <= ALL_PAIRS:
-        return [(i, j) for i in range(count) for j in range(i + 1, count)]
+        return [(i, j) for i, j in np.argwhere(np.triu(apart > 0)).tolist()]
     pairs: set[tuple[int, int]] = set()
     if overlap is not None:
-        apart = sorted({*range(1, overlap + 1), *(1 << k for k in range(count.bit_length()))})
-        pairs |= {(i, i + step) for i in range(count) for step in apart if i + step < count}
+        steps = sorted({*range(1, overlap + 1), *(1 << k for k in range(count.bit_length()))})
+        pairs |= {(i, i + step * cameras) for i in range(count) for step in steps if i + step * cameras < count}
     likeness = Appearance(features, seed).likeness().astype(np.float64)
-    index = np.arange(count)
-    near = np.abs(index[:, None] - index) <= (0 if overlap is None else overlap)
-    likeness[near] = -np.inf  # neighbours would take the places of those that close a loop
+    # Neighbours would take the places of those that close a loop.
+    near = (apart == 0) | ((apart <= (overlap or 0)) & ((index[:, None] - index) % cameras == 0))
+    likeness[near] = -np.inf
     alike = np.argsort(-likeness, axis=1, kind="stable")[:, : ALIKE if overlap is None else ALIKE_IN_SEQUENCE]
     pairs |= {(min(i, int(j)), max(i, int(j))) for i in range(count) for j in alike[i] if not near[i, j]}
     return sorted(pairs)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3
 from modp_ti.files.child_environment import child_environment
 
 if TYPE_CHECKING:
@@ -23,6 +22,7 @@ __all__ = ["Bundle", "Refinable", "adjusted_apart", "adjusted_bundle", "main"]
 TOLERANCE = 1e-5  # relative change of the cost below which the optimisation stops
 
 Refinable = Literal["focal", "distortion"]
+CODE = "from modp_ti.inputs.multiview.bundle_adjustment import main; main()"
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,8 @@ def adjusted_bundle(
     steps: int,
     loss_width: float = 1.0,
     refined: Collection[Refinable] = (),
-    mounts: NDArray[np.float64] | None = None,
 ) -> Bundle | None:
     """Minimise the reprojection error under a Cauchy loss over poses and points.
-
-    With `mounts`, the views are those of a rig of C cameras: view k is of camera k % C at place k // C of the rig. The
-    views of a place keep their poses relative to each other, and are free or fixed together.
 
     Args:
         camera: Camera of all views, with camera_id 1.
@@ -74,7 +70,6 @@ def adjusted_bundle(
         steps: Levenberg-Marquardt steps at most.
         loss_width: Scale of the Cauchy loss [px].
         refined: Parts of the camera that are optimised too.
-        mounts: (C, 4, 4) T_camera_rig of the cameras of a rig, which are not optimised; None for single cameras.
 
     Returns:
         The optimised poses, camera and points, without those that only one view observes; None if Ceres finds no usable
@@ -83,18 +78,14 @@ def adjusted_bundle(
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
-    if mounts is None:
-        model.add_camera_with_trivial_rig(camera)
-    else:
-        _add_rig(model, config, camera, mounts, poses, free)
-    tracks = _add_views(model, config, poses, view, point, pixels, free, 1 if mounts is None else len(mounts))
+    model.add_camera_with_trivial_rig(camera)
+    tracks = _add_views(model, config, poses, view, point, pixels, free)
     # One ray constrains nothing, and COLMAP refuses it.
     names = {number: model.add_point3D(xyz[number], track) for number, track in tracks if track.length() > 1}
     if len(free) == len(poses):
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     if not refined:
-        for number in model.cameras:
-            config.set_constant_cam_intrinsics(number)
+        config.set_constant_cam_intrinsics(1)
 
     options = _options(steps, loss_width, refined)
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -109,40 +100,6 @@ def adjusted_bundle(
     return Bundle(_adjusted_poses(model, free), numbers[finite], places[finite], model.camera(1), float(cost))
 
 
-def _add_rig(
-    model: pycolmap.Reconstruction,
-    config: pycolmap.BundleAdjustmentConfig,
-    camera: pycolmap.Camera,
-    mounts: NDArray[np.float64],
-    poses: Mapping[int, NDArray[np.float64]],
-    free: Collection[int],
-) -> None:
-    """Add a rig of equal cameras, and the places where it was. Place n becomes frame n + 1."""
-    from modp_ti.files.quiet_pycolmap import pycolmap
-
-    count = len(mounts)
-    rig = pycolmap.Rig(rig_id=1)
-    sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number + 1) for number in range(count)]
-    for number, sensor in enumerate(sensors):
-        size = {"width": camera.width, "height": camera.height}
-        model.add_camera(pycolmap.Camera(camera_id=number + 1, model=camera.model, params=camera.params, **size))
-        if number == 0:
-            rig.add_ref_sensor(sensor)
-        else:
-            rig.add_sensor(sensor, pycolmap.Rigid3d((mounts[number] @ inverse_se3(mounts[0]))[:3]))
-    model.add_rig(rig)
-    for place in dict.fromkeys(k // count for k in poses):
-        frame = pycolmap.Frame(frame_id=place + 1, rig_id=1)
-        views = [k for k in poses if k // count == place]
-        for k in views:
-            frame.add_data_id(pycolmap.data_t(sensors[k % count], k + 1))
-        model.add_frame(frame)
-        T_rig_world = inverse_se3(mounts[views[0] % count] @ inverse_se3(mounts[0])) @ poses[views[0]]
-        model.frame(place + 1).rig_from_world = pycolmap.Rigid3d(T_rig_world[:3])
-        if views[0] not in free:
-            config.set_constant_rig_from_world_pose(place + 1)
-
-
 def _add_views(
     model: pycolmap.Reconstruction,
     config: pycolmap.BundleAdjustmentConfig,
@@ -151,9 +108,8 @@ def _add_views(
     point: NDArray[np.int64],
     pixels: NDArray[np.float64],
     free: Collection[int],
-    cameras: int,
 ) -> Iterator[tuple[int, pycolmap.Track]]:
-    """Add the views with their observations. View k becomes image k + 1, of the only camera or of one of a rig.
+    """Add the views with their observations. View k becomes image k + 1.
 
     Returns:
         Every observed point, in the order of their first observations, with its track.
@@ -162,15 +118,10 @@ def _add_views(
 
     mine = {k: np.flatnonzero(view == k) for k in poses}
     for k, T in poses.items():
-        number = k % cameras + 1
-        image = pycolmap.Image(name=str(k), keypoints=pixels[mine[k]], camera_id=number, image_id=k + 1)
-        if cameras == 1:
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
-        else:
-            image.frame_id = k // cameras + 1
-            model.add_image(image)
+        image = pycolmap.Image(name=str(k), keypoints=pixels[mine[k]], camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
         config.add_image(k + 1)
-        if cameras == 1 and k not in free:
+        if k not in free:
             config.set_constant_rig_from_world_pose(k + 1)
     images = np.repeat([k + 1 for k in mine], [len(rows) for rows in mine.values()])
     places = np.concatenate([np.arange(len(rows)) for rows in mine.values()])
@@ -208,9 +159,6 @@ def _options(steps: int, loss_width: float, refined: Collection[Refinable]) -> p
     solver.num_threads = 1  # with several threads, the order of summation and so the result would vary between runs
     solver.function_tolerance = TOLERANCE
     return options
-
-
-CODE = "from modp_ti.inputs.multiview.bundle_adjustment import main; main()"
 
 
 def adjusted_apart(*arguments: object, **keywords: object) -> Bundle | None:

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import estimated
 from modp_ti.inputs.protocol import Progress
@@ -50,17 +52,20 @@ def reconstructed(
     mapper: Literal["incremental", "global"],
     seed: int,
     progress: Progress,
+    mounts: Sequence[NDArray[np.float64]] = (),
 ) -> pycolmap.Reconstruction | None:
     """Match images, and reconstruct their poses and points.
 
     Images with equal intrinsics share a camera. Two runs give the same result: the reconstruction uses one thread.
 
     Args:
-        images: The images.
+        images: The images; those of a rig of C cameras in the order of its cameras, place after place.
         pairs: Pairs of their indices that are matched.
         mapper: Place the images one after the other, or all at once.
         seed: Seed of RANSAC.
         progress: Called while images are matched and placed.
+        mounts: (C, 4, 4) T_camera_rig of the cameras of a rig, whose images keep their poses relative to each other.
+            Fewer than two: every image has a pose of its own.
 
     Returns:
         The model with the most images, or None if fewer than three could be placed.
@@ -70,7 +75,7 @@ def reconstructed(
     with tempfile.TemporaryDirectory(prefix="modp-ti-sfm-") as place:
         folder = Path(place)
         database = folder / "database.db"
-        _write_features(database, images)
+        _write_features(database, images, mounts)
         _match(database, pairs, seed, progress)
         (folder / "models").mkdir()
         every_known = all(image.known for image in images)
@@ -88,29 +93,46 @@ def reconstructed(
         return best
 
 
-def _write_features(path: Path, images: Sequence[MatchedImage]) -> None:
+def _write_features(path: Path, images: Sequence[MatchedImage], mounts: Sequence[NDArray[np.float64]]) -> None:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-    cameras: dict[Intrinsics, tuple[pycolmap.Camera, int]] = {}  # with the rig of each
+    count = max(1, len(mounts))
+    rigs: dict[Intrinsics, tuple[int, list[pycolmap.Camera]]] = {}
     with pycolmap.Database.open(path) as database:
-        for number, image in enumerate(images):
-            if image.intrinsics not in cameras:
-                camera = _camera(image.intrinsics, image.known)
-                camera.camera_id = database.write_camera(camera)
-                rig = pycolmap.Rig()
-                rig.add_ref_sensor(camera.sensor_id)
-                cameras[image.intrinsics] = camera, database.write_rig(rig)
-            camera, rig_id = cameras[image.intrinsics]
-            # Numbers instead of names, which may hold blanks: these separate the names in a list of pairs.
-            record = pycolmap.Image(name=str(number), camera_id=camera.camera_id)
-            record.image_id = database.write_image(record)
+        for first in range(0, len(images), count):
+            views = images[first : first + count]
+            if views[0].intrinsics not in rigs:
+                rigs[views[0].intrinsics] = _write_rig(database, views, mounts)
+            rig_id, cameras = rigs[views[0].intrinsics]
             frame = pycolmap.Frame()
             frame.rig_id = rig_id
-            frame.add_data_id(record.data_id)
+            for number, (image, camera) in enumerate(zip(views, cameras, strict=True), first):
+                # Numbers instead of names, which may hold blanks: these separate the names in a list of pairs.
+                record = pycolmap.Image(name=str(number), camera_id=camera.camera_id)
+                record.image_id = database.write_image(record)
+                frame.add_data_id(record.data_id)
+                database.write_keypoints(record.image_id, image.features.pixels.astype(np.float32))
+                described = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, image.features.descriptors)
+                database.write_descriptors(record.image_id, described)
             database.write_frame(frame)
-            database.write_keypoints(record.image_id, image.features.pixels.astype(np.float32))
-            described = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, image.features.descriptors)
-            database.write_descriptors(record.image_id, described)
+
+
+def _write_rig(
+    database: pycolmap.Database, views: Sequence[MatchedImage], mounts: Sequence[NDArray[np.float64]]
+) -> tuple[int, list[pycolmap.Camera]]:
+    """Write the rig of one camera, or that of `mounts`. Returns its number and its cameras."""
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    rig, cameras = pycolmap.Rig(), []
+    for number, image in enumerate(views):
+        camera = _camera(image.intrinsics, image.known)
+        camera.camera_id = database.write_camera(camera)
+        cameras.append(camera)
+        if number == 0:
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d((mounts[number] @ inverse_se3(mounts[0]))[:3]))
+    return database.write_rig(rig), cameras
 
 
 def _camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
@@ -164,6 +186,7 @@ def _placed_in_turn(
     if every_known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.ba_refine_sensor_from_rig = False
     placed = 2
 
     def next_image() -> None:
@@ -184,4 +207,5 @@ def _placed_together(database: Path, folder: Path, every_known: bool, seed: int)
     if every_known:
         adjustment = options.mapper.bundle_adjustment
         adjustment.refine_focal_length = adjustment.refine_extra_params = False
+    options.mapper.refine_sensor_from_rig = False
     return pycolmap.global_mapping(database, folder, folder / "models", options)

@@ -18,7 +18,7 @@ from modp_ti.files.trajectory import FARTHEST, checked_pose
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, points_inside
-from modp_ti.inputs.sources import Distortion, Undistorter
+from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter
 from modp_ti.inputs.sources.distortion import colmap_intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
@@ -28,6 +28,8 @@ from modp_ti.inputs.trackers.given_poses import (
     PANORAMAS,
     checked_reader,
     matched_entries,
+    missing_frames_note,
+    selected_frames,
     sizes_note,
     solving,
     spread_points,
@@ -70,7 +72,10 @@ def open_colmap(
     stated = [(image.name, image) for image in model.images.values() if image.has_pose]
     if not stated:
         raise InputError(f"{folder}: the COLMAP model holds no image{' with a pose' if model.images else ''}")
-    posed, notes = matched_entries(images, source, stated, folder, str(folder), "images")
+    if len(images.mounts) > 1:
+        posed, notes = _posed_faces(images, source, dict(stated), folder)
+    else:
+        posed, notes = matched_entries(images, source, stated, folder, str(folder), "images")
     notes = [*others, *notes]
     stored = {i: _camera(camera, folder) for i, camera in model.cameras.items()}
     turns = dict.fromkeys(posed, AS_STORED)
@@ -111,6 +116,16 @@ def open_colmap(
             notes.append(f"the images of {folder} see none of its {len(positions)} points: triangulated instead")
             frames = triangulated_views(images, frames, solving(frames, source), progress)
     return ReplayedTracker(reader, frames, [*notes, *sizes_note(frames)])
+
+
+def _posed_faces(
+    images: ImageSource, source: SourceSettings, stated: dict[str, pycolmap.Image], folder: Path
+) -> tuple[dict[str, pycolmap.Image], list[str]]:
+    """Match the images of a model of faces with the selected panoramas, all of whose faces have a pose or none."""
+    selected = selected_frames(images, source)
+    posed = {face: stated[face] for name in selected for face in images.views(name) if face in stated}
+    whole = {name: None for name in selected if images.views(name)[0] in posed}
+    return posed, missing_frames_note(selected, whole, str(folder))
 
 
 def _model_folder(images: Path, given: Path | None) -> tuple[Path, list[str]]:

@@ -37,6 +37,8 @@ def open_sfm(
 ) -> ReplayedTracker:
     """Reconstruct the selected images, or take the model in `folder` if it was made of the same images and settings.
 
+    The faces of a panorama are placed together, as a rig.
+
     Args:
         source: Settings of the images.
         tracker: Settings of the reconstruction.
@@ -56,7 +58,8 @@ def open_sfm(
     kept = _kept(folder) == made_of
     if not kept:
         with appearing(folder.parent, (folder.name,)) as staged:
-            _reconstruct(reader, names, tracker, staged / folder.name, seed, progress or _silent)
+            views = [view for name in names for view in images.views(name)]
+            _reconstruct(reader, views, tracker, staged / folder.name, seed, progress or _silent)
             replace_text(staged / folder.name / MADE_OF, made_of)
     images.close()
     opened = open_colmap(source, ColmapSettings(path=folder), progress, upright=True)
@@ -71,8 +74,9 @@ def _reconstruct(
     """Write the model of the images to the folder."""
     matched = list(_described(reader, names, tracker, progress))
     overlap = tracker.overlap if tracker.order == "sequential" else None
-    pairs = image_pairs([image.features for image in matched], overlap, seed)
-    model = reconstructed(matched, pairs, tracker.mapper, seed, progress)
+    mounts = reader.images.mounts
+    pairs = image_pairs([image.features for image in matched], overlap, seed, len(mounts))
+    model = reconstructed(matched, pairs, tracker.mapper, seed, progress, mounts)
     if model is None:
         raise InputError(
             f"{reader.images.path}: structure from motion could not join three of the {len(matched)} images: they need "
@@ -114,7 +118,8 @@ def _fingerprint(
     stamps = [(file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
     if not stamps:  # a video
         stamps = [(images.path.stat().st_size, images.path.stat().st_mtime_ns)]
-    chosen = source.model_dump(mode="json", include={"kind", "intrinsics", "masks", "mask_colour", "mask_tolerance"})
+    kept = {"kind", "intrinsics", "masks", "mask_colour", "mask_tolerance", "panorama"}
+    chosen = source.model_dump(mode="json", include=kept)
     content = [METHOD, list(names), stamps, chosen, tracker.model_dump(mode="json"), seed]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 

@@ -278,14 +278,13 @@ WAYS = {
     "source.vignette": "source.vignette=light.png",
     "source.panorama": "source.panorama.projection=equirectangular",
     "source.part": "source.part=[0, 9]",
-    "tracker.loops": "tracker={kind: klt, loops: true}",
     "tracker.maps": "tracker={kind: klt, maps: largest}",
     "tracker.maps: all": "tracker={kind: klt, maps: all}",
     "tracker.adjust": "tracker={kind: tum, adjust: true}",
     "a tracker of images as they come": "tracker={kind: klt}",
     "a tracker of recordings": "tracker={kind: colmap}",
     "a tracker with cameras": "tracker={kind: colmap}",
-    "a tracker without panoramas": "tracker={kind: sfm}",
+    "a tracker without panoramas": "tracker={kind: klt}",
     "a live tracker": "tracker={kind: socket}",
     "mapping.pace: realtime": "mapping.pace=realtime",
     "mode: offline": "mode=offline",
@@ -300,7 +299,7 @@ def test_what_excludes_each_other_is_refused_with_both_and_each_alone_is_taken(s
     base = {"source.stream": "{stream: 0}"}.get(key, "{path: images}")
     given = sorted((WAYS[key], WAYS[other]), key=lambda way: way.startswith("tracker"))
     followed = key in ("source.stream", "source.realtime") or key.startswith("tracker.maps")
-    tracker = "klt" if followed or "panorama" in key else "tum"
+    tracker = "klt" if followed else "sfm" if "panorama" in key else "tum"
     file = scene(f"source: {base}\ntracker: {{kind: {tracker}}}\noutput: o\n")
     message = failure(file, *given)
     assert "cannot be combined" in message

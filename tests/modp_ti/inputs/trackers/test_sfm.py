@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import modp_ti.inputs.trackers.sfm as sfm
-from fields.geometry.se3 import camera_centres
+from fields.geometry.se3 import camera_centres, exp_se3, inverse_se3
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.config.tracker_settings import SfmSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.trackers.sfm import open_sfm
 from modp_ti.outputs.evaluation import umeyama
+from tests.panoramas import equirectangular_rays, panorama, stroll
 from tests.room import Room, RoomRecording, pinhole, walk
 
 CAMERA = pinhole(240, 180)
@@ -45,6 +46,35 @@ def test_the_frames_have_the_poses_and_points_of_the_room(source: SourceSettings
         # The points lie on the surfaces of the room.
         depth = room.depth(frame.camera, T, frame.points.pixels)
         assert np.median(np.abs(s * frame.points.depths(frame.T_camera_world) / depth - 1)) < 0.1
+
+
+def test_the_faces_of_panoramas_are_placed_as_a_rig(room: Room, tmp_path: Path) -> None:
+    """The third panorama is black, and its faces are left out."""
+    (tmp_path / "images").mkdir()
+    poses, rays = stroll(7, step=0.15), equirectangular_rays(256)
+    for i, T in enumerate(poses):
+        image = panorama(room, T, rays) * (i != 2)
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), image[..., ::-1])
+    settings = {"path": tmp_path / "images", "panorama": {"projection": "equirectangular", "faces": 4}, "holdout": 3}
+    source = SourceSettings.model_validate(settings)
+    opened = open_sfm(source, SfmSettings(), tmp_path / "sfm", 0)
+    frames, placed = list(opened), [T for i, T in enumerate(poses) if i != 2]
+    assert [int(frame.name[0]) for frame in frames[::4]] == [0, 1, 3, 4, 5, 6]
+    assert any("1 of 7 images have no pose" in note for note in opened.notes)
+    s, R, t = umeyama(camera_centres([frame.T_camera_world for frame in frames[::4]]), camera_centres(placed))
+    for group, T in zip((frames[i : i + 4] for i in range(0, len(frames), 4)), placed, strict=True):
+        assert len({frame.held_out for frame in group}) == 1
+        for number, frame in enumerate(group):
+            found, turn = frame.T_camera_world, exp_se3([0, 0, 0, 0, -np.pi / 2 * number, 0])
+            np.testing.assert_allclose(found @ inverse_se3(group[0].T_camera_world), turn, atol=1e-6)
+            np.testing.assert_allclose(s * R @ camera_centres([found])[0] + t, camera_centres([T])[0], atol=0.02)
+            turned = (found @ inverse_se3(frames[0].T_camera_world), turn @ T @ inverse_se3(placed[0]))
+            np.testing.assert_allclose(turned[0][:3, :3], turned[1][:3, :3], atol=0.01)
+            p = frame.points.xyz @ found[:3, :3].T + found[:3, 3]
+            off = np.linalg.norm(frame.camera.project(p) - frame.points.pixels, axis=1)
+            assert len(off) > 20 and np.median(off) < 0.7
+    again = SourceSettings.model_validate({**settings, "panorama": {**settings["panorama"], "fov": 95}})
+    assert not any("used again" in note for note in open_sfm(again, SfmSettings(), tmp_path / "sfm", 0).notes)
 
 
 def test_the_model_is_kept_until_images_or_settings_change(
