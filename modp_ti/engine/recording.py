@@ -29,8 +29,8 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.limits import BoundedZip, arrays_of
 from modp_ti.files.reading import reading
 from modp_ti.inputs.protocol import Tracker
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.listed_images import decoded_as
+from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.image_pixels import decoded_as
 from pipelines.companions.pace import Plan
 from pipelines.companions.realtime_pace import RecordedPace
 from pipelines.refinement import Schedule

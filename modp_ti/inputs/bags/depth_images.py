@@ -21,9 +21,9 @@ from modp_ti.inputs.captures.capture import DepthMap
 from modp_ti.inputs.captures.depth_maps import sampled_points
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, points_inside
-from modp_ti.inputs.sources.image_bounds import why_undecodable
+from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.listed_images import decoded_as
 
 __all__ = ["DepthTopic", "depth_metres", "depth_topics", "read_depth_topic", "with_depth_points"]
 

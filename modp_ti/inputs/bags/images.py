@@ -26,7 +26,7 @@ from modp_ti.inputs.bags.pictures import (
     stored_values,
     video_codec,
 )
-from modp_ti.inputs.sources.bit_depth import DEPTHS, used_bits
+from modp_ti.inputs.sources.image_pixels import DEPTHS, used_bits
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.video_file import VideoFile

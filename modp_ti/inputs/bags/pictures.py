@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.bags.bag import VIDEO
-from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.image_header import read_image_header
-from modp_ti.inputs.sources.listed_images import decoded
+from modp_ti.inputs.sources.image_header import read_image_header, why_undecodable
+from modp_ti.inputs.sources.image_pixels import DEPTHS, decoded, reduced
 
 __all__ = [
     "DEPTH_ENCODINGS",

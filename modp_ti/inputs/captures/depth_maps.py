@@ -12,8 +12,8 @@ from fields.geometry.se3 import inverse_se3
 from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.captures.capture import CapturedFrame, DepthMap
 from modp_ti.inputs.replay import PosedImage, points_inside
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.listed_images import decoded_as
+from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.undistortion import Undistorter
 

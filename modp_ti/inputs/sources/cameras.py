@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modp_ti.files import read_text
-from modp_ti.inputs.sources.listed_images import quiet_opencv
+from modp_ti.inputs.sources.image_pixels import quiet_opencv
 
 __all__ = ["Camera", "find_cameras"]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fields.runtime.disk_room import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_header import read_image_header
-from modp_ti.inputs.sources.listed_images import decoded
+from modp_ti.inputs.sources.image_pixels import decoded
 from modp_ti.inputs.sources.protocol import ImageSource
 
 __all__ = ["FrameStore", "StoredFrames", "kept_frames", "list_frames"]

@@ -1,12 +1,8 @@
-"""Size and completeness of an image file without decoding it, with Pillow in bounded memory.
+"""What an image file says about itself, read with Pillow without decoding its pixels, and whether it may be decoded.
 
 Decoders differ in what they do with a truncated file (older OpenCV versions fill the rest with grey), and a run should
 report it in its first second, not at frame 400. JPEG and PNG files are checked by their end markers, HEIC and AVIF
-files by the lengths of their boxes; other formats are left to the decoder. EXIF orientation, colour profile and alpha
-channel of PNG, WebP and TIFF files are found here too.
-
-Pillow keeps everything that it reads from a header, and thousands of TIFF or EXIF tags can refer to the same bytes:
-Pillow 12.3 allocates 1.8 GB for half a megabyte. Therefore it reads through a `bounded` file.
+files by the lengths of their boxes; other formats are left to the decoder.
 """
 
 from __future__ import annotations
@@ -15,38 +11,46 @@ import io
 import re
 import struct
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
-from PIL import ExifTags, ImageFile, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+from PIL import ExifTags, Image, JpegImagePlugin, TiffImagePlugin
 
 from modp_ti.files import open_file
-from modp_ti.inputs.sources.heif import is_heif, read_heif_header
-from modp_ti.inputs.sources.video_container import end_of_boxes
+from modp_ti.files.errors import InputError
+from modp_ti.files.reading import available_memory
 
 __all__ = [
     "HEADER_ERRORS",
+    "MAX_IMAGE_PIXELS",
     "ImageHeader",
-    "JpegHeader",
-    "bounded",
     "focal_length_35mm",
+    "heif_kind",
+    "open_heif",
     "read_image_header",
-    "read_tiff_directory",
+    "why_undecodable",
 ]
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_END = b"IEND\xaeB`\x82"
-JPEG_SIGNATURE = b"\xff\xd8"
-JPEG_END = b"\xff\xd9"
-TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-GPANO = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular")
-# A header may read HEADER_BYTES plus half of the file. Each call counts as CALL_BYTES in addition.
-HEADER_BYTES, CALL_BYTES = 1 << 23, 1 << 7
+MAX_IMAGE_PIXELS = 1 << 27
+"""Largest number of pixels of an image. The largest cameras have about 150 million; the map works on far fewer."""
 
-HEADER_ERRORS = (SyntaxError, OSError, LookupError, TypeError, ValueError, ArithmeticError, struct.error)
-"""Exceptions that Pillow raises for malformed headers."""
+# Memory per pixel during decoding: up to 16 bits per channel, and the copy in RGB order.
+DECODED_BYTES = 12
+PNG_SIGNATURE, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+# What the first box of a HEIC or AVIF file may name first.
+BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"mif2", b"msf1", b"miaf", b"avif", b"avis")
+FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "JPEG2000")
+GPANO = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular")
+
+HEADER_ERRORS = (
+    *(SyntaxError, OSError, LookupError, TypeError, ValueError, ArithmeticError, RuntimeError, EOFError, struct.error),
+    *(MemoryError, Image.DecompressionBombError),
+)
+"""Exceptions that Pillow raises for malformed files."""
 
 # Pillow warns of malformed tags. The filter is global because `warnings.catch_warnings` is not safe with threads.
 warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.TiffImagePlugin")
@@ -81,43 +85,12 @@ class ImageHeader:
     is_tiff: bool = False
 
 
-class _Bounded(io.BufferedIOBase):
-    """A file object that raises OSError once more data has been read than a valid header needs."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        here = file.tell()
-        self._left = HEADER_BYTES + file.seek(0, 2) // 2
-        file.seek(here)
-
-    def read(self, size: int | None = -1) -> bytes:
-        data = self._file.read(-1 if size is None else size)
-        self._left -= len(data) + CALL_BYTES
-        if self._left < 0:
-            raise OSError("the header is too long")
-        return data
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-
-def bounded(file: BinaryIO) -> IO[bytes]:
-    """Wrap a file so that reading more than a valid header needs raises OSError."""
-    # Pillow reads, seeks and tells only, but its stubs require every method of IO.
-    return _Bounded(file)  # pyright: ignore[reportReturnType]
-
-
-class JpegHeader(JpegImagePlugin.JpegImageFile):
-    """Pillow's JPEG reader. After construction the file is positioned at the first coded byte.
-
-    Raises `HEADER_ERRORS` for malformed headers.
-    """
-
-    def _read_dpi_from_exif(self) -> None:
-        """Disabled, because Pillow would unpack all of EXIF here, which costs memory."""
+def heif_kind(start: bytes) -> str | None:
+    """Return "AVIF" or "HEIF" for a file that starts with these bytes (64 or more), or None if it is neither."""
+    if start[4:8] != b"ftyp" or start[8:12] not in BRANDS:
+        return None
+    first = start[8 : int.from_bytes(start[:4], "big")]
+    return "AVIF" if b"avif" in first or b"avis" in first else "HEIF"
 
 
 def read_image_header(file: BinaryIO) -> ImageHeader | None:
@@ -126,145 +99,142 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
     Raises:
         InputError: If the package that reads HEIC or AVIF is missing.
     """
-    signature = file.read(12)
-    if is_heif(signature):
-        return _heif_header(file)
-    if signature.startswith(PNG_SIGNATURE):
-        return _png_header(file)
-    if signature[:4] == b"RIFF" and signature[8:] == b"WEBP":
-        return _header_by_pillow(file, WebPImagePlugin.WebPImageFile)
-    if signature[:4] in TIFF_SIGNATURES:
-        return _header_by_pillow(file, TiffImagePlugin.TiffImageFile)
-    if signature[:2] != JPEG_SIGNATURE:
+    start = file.read(64)
+    file.seek(0)
+    is_jpeg, is_png, is_tiff = start[:2] == JPEG_SIGNATURE, start[:8] == PNG_SIGNATURE, start[:4] in TIFF_SIGNATURES
+    is_heif = heif_kind(start) is not None
+    if not (is_jpeg or is_png or is_tiff or is_heif or (start[:4] == b"RIFF" and start[8:12] == b"WEBP")):
         return None
-    file.seek(0)
+    image = None
     try:
-        header = JpegHeader(bounded(file))
-    except HEADER_ERRORS:
-        file.seek(-min(2, file.seek(0, 2)), 2)
-        return ImageHeader(0, 0, complete=file.read() == JPEG_END)
-    # Coded data never holds FF D9 except as the end marker, so the first one after the scan's start is it.
-    complete = _ends_with(file, JPEG_END)
-    profile, xmp = header.info.get("icc_profile") or b"", header.info.get("xmp") or b""
-    return ImageHeader(*header.size, complete, _orientation(header), profile=profile, panorama=bool(GPANO.search(xmp)))
-
-
-def _heif_header(file: BinaryIO) -> ImageHeader:
-    file.seek(0)
-    data = file.read()
-    header = read_heif_header(data)
-    complete = end_of_boxes(file, len(data)) <= len(data)
-    if header is None:
-        return ImageHeader(0, 0, complete)
-    return ImageHeader(header.width, header.height, complete, header.orientation, profile=header.profile)
-
-
-def _png_header(file: BinaryIO) -> ImageHeader:
-    # The size is at a fixed offset.
-    file.seek(8)
-    chunk = file.read(17)
-    if len(chunk) < 17 or chunk[4:8] != b"IHDR":
-        return ImageHeader(0, 0, complete=False)
-    width, height = struct.unpack(">II", chunk[8:16])
-    header = ImageHeader(width, height, _ends_with(file, PNG_END), bits=chunk[16])
-    more = _header_by_pillow(file, PngImagePlugin.PngImageFile)
-    return header if more is None else replace(more, complete=header.complete, bits=header.bits)
-
-
-def _header_by_pillow(file: BinaryIO, form: type[ImageFile.ImageFile]) -> ImageHeader | None:
-    """Read the header of a PNG, WebP or TIFF file with Pillow; None if it is damaged, or has a form unknown to it."""
-    file.seek(0)
-    try:
-        image = form(bounded(file))
+        # As a class, which leaves the file at the first coded byte.
+        image = JpegImagePlugin.JpegImageFile(file) if is_jpeg else _opened(file, start)
+        complete = _is_complete(file, start)
         tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
-        orientation = tags.get(ExifTags.Base.Orientation, 1)
-        if not tags:
-            orientation = _exif_orientation(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))
         size = (TiffImagePlugin.IMAGEWIDTH, TiffImagePlugin.IMAGELENGTH)  # Pillow states that of the upright image
         return ImageHeader(
-            *([int(tags[tag]) for tag in size] if tags else image.size),
-            complete=None,
-            orientation=orientation,
-            bits=int(np.max(tags.get(TiffImagePlugin.BITSPERSAMPLE, 8))),
-            alpha=image.has_transparency_data,
-            grey=len(image.getbands()) == 1 and image.mode != "P",
+            *([int(tags[tag]) for tag in size] if is_tiff else image.size),
+            complete=complete,
+            orientation=_orientation(image),
+            bits=start[24] if is_png else int(np.max(tags.get(TiffImagePlugin.BITSPERSAMPLE, 8))),
+            alpha=not is_heif and image.has_transparency_data,
+            grey=(is_png or is_tiff) and len(image.getbands()) == 1 and image.mode != "P",
             profile=image.info.get("icc_profile") or b"",
-            is_tiff=bool(tags),
+            panorama=is_jpeg and bool(GPANO.search(image.info.get("xmp") or b"")),
+            is_tiff=is_tiff,
         )
-    except (*HEADER_ERRORS, EOFError, RuntimeError, MemoryError):
-        return None
-
-
-def read_tiff_directory(data: bytes, offset: int | None = None) -> TiffImagePlugin.ImageFileDirectory_v2:
-    """Read the tags of a directory in a TIFF structure. Raises `HEADER_ERRORS` for malformed data.
-
-    Args:
-        data: The TIFF structure.
-        offset: Offset of the directory [bytes]; the first directory if None.
-
-    Returns:
-        The tags. If the directory is damaged or too large, only those before that position.
-    """
-    file = bounded(io.BytesIO(data))
-    # The byte order is passed separately: Pillow recognises BigTIFF in little-endian order only.
-    start = b"II+\0" + data[4:16] if data[2:4] in (b"+\0", b"\0+") else b"II*\0" + data[4:8]
-    directory = TiffImagePlugin.ImageFileDirectory_v2(start, prefix=data[:2])
-    file.seek(directory.next if offset is None else offset)
-    directory.load(file)
-    return directory
-
-
-def _orientation(header: JpegHeader) -> int:
-    """Return the EXIF orientation that a JPEG file states, or 1."""
-    try:
-        return _exif_orientation(_tiff(header))
     except HEADER_ERRORS:
-        return 1
+        file.seek(0)
+        return ImageHeader(0, 0, _is_complete(file, start)) if is_jpeg or is_png or is_heif else None
 
 
-def _exif_orientation(tiff: bytes) -> int:
-    """Return the orientation in the TIFF structure of EXIF, or 1."""
-    if tiff[:4] not in TIFF_SIGNATURES:
+def _opened(file: BinaryIO, start: bytes) -> Image.Image:
+    """Open an image whose file starts with these bytes. Raises `HEADER_ERRORS`, or InputError without its package."""
+    kind = heif_kind(start)
+    return Image.open(file, formats=FORMATS) if kind is None else open_heif(file, kind)
+
+
+def open_heif(file: BinaryIO, kind: str) -> Image.Image:
+    """Open a file of a `heif_kind`. Raises `HEADER_ERRORS`, or InputError if the package that reads it is missing."""
+    if kind == "AVIF":
+        try:
+            from PIL import AvifImagePlugin  # noqa: F401 - whether there is one
+        except ImportError:
+            raise InputError("AVIF photographs need a newer package: pip install 'pillow>=11.3'") from None
+        return Image.open(file, formats=["AVIF"])
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        raise InputError("HEIC photographs need a package: pip install 'modp-ti[heic]'") from None
+    register_heif_opener()
+    return Image.open(file, formats=["HEIF"])
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation that is left to apply, or 1. The decoder of HEIC applies it."""
+    if image.format == "HEIF":
         return 1
     try:
-        value = read_tiff_directory(tiff)[ExifTags.Base.Orientation]
+        value = image.getexif().get(ExifTags.Base.Orientation)
     except HEADER_ERRORS:
         return 1
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
-def _tiff(header: JpegHeader) -> bytes:
-    """Return the TIFF structure of a JPEG file's EXIF. Raises `HEADER_ERRORS` if there is none."""
-    return header.info["exif"].removeprefix(b"Exif\0\0")
-
-
-def _ends_with(file: BinaryIO, marker: bytes) -> bool:
-    """Return whether the marker ends the file, or precedes data appended to it, as in motion photos."""
+def _is_complete(file: BinaryIO, start: bytes) -> bool | None:
+    """Return whether the end of a file is there, from the file's position on; None if only the decoder finds out."""
+    if heif_kind(start) is not None:
+        return _boxes_are_whole(file)
+    # Coded data never holds FF D9 except as the end marker, so the first one after the scan's start is it.
+    marker = JPEG_END if start[:2] == JPEG_SIGNATURE else PNG_END if start[:8] == PNG_SIGNATURE else None
+    if marker is None:
+        return None
     here = file.tell()
     file.seek(max(here, file.seek(0, 2) - len(marker)))
     if file.read() == marker:
         return True
     file.seek(here)
-    return marker in file.read()
+    return marker in file.read()  # data may be appended, as in motion photos
+
+
+def _boxes_are_whole(file: BinaryIO) -> bool:
+    """Return whether the boxes of a file end within it.
+
+    A box starts with 4 bytes of length and 4 of type. Length 1 means that 8 bytes of length follow, 0 that the box
+    extends to the end.
+    """
+    size, at = file.seek(0, 2), 0
+    while at < size:
+        file.seek(at)
+        head = file.read(16)
+        length = int.from_bytes(head[:4], "big")
+        if length == 0:
+            return len(head) >= 8
+        at += max(int.from_bytes(head[8:], "big") if length == 1 else length, 8)
+    return at == size
+
+
+def why_undecodable(data: bytes) -> str | None:
+    """Return why these bytes should not be decoded, or None if they may be.
+
+    Accepted are JPEG, PNG, BMP, TIFF, WebP, PNM, JPEG 2000, HEIC and AVIF images of at most `MAX_IMAGE_PIXELS` pixels
+    for which there is memory.
+
+    Raises:
+        InputError: If the package that reads HEIC or AVIF is missing.
+    """
+    try:
+        with _opened(io.BytesIO(data), data[:64]) as image:
+            width, height = image.size
+    except Image.UnidentifiedImageError:
+        if data[:4] in TIFF_SIGNATURES:
+            return "it is damaged, or a TIFF file of numbers that are not read: convert it to 16 bits"
+        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM, PGM, JPEG 2000, HEIC or AVIF)"
+    except Image.DecompressionBombError:
+        return f"its pixels are more than {MAX_IMAGE_PIXELS:,}"
+    except HEADER_ERRORS:
+        return "its header is damaged"
+    if width < 1 or height < 1:
+        return f"its header says {width}x{height} pixels"
+    if width * height > MAX_IMAGE_PIXELS:
+        return f"its {width}x{height} pixels are more than {MAX_IMAGE_PIXELS:,}"
+    needed, left = width * height * DECODED_BYTES, available_memory()
+    if needed > left:
+        return f"its {width}x{height} pixels take {needed >> 20} MB, and {left >> 20} MB are free: end other programs"
+    return None
 
 
 def focal_length_35mm(path: Path) -> float | None:
-    """Read the focal length in 35 mm equivalent [mm] from a JPEG, HEIC or AVIF file; None if it is not stated.
+    """Read the focal length in 35 mm equivalent [mm] from an image file's EXIF; None if it is not stated.
 
     Raises:
         InputError: If the package that reads HEIC or AVIF is missing.
     """
     try:
         with open_file(path) as file:
-            heif = is_heif(file.read(12))
+            start = file.read(64)
             file.seek(0)
-            if heif:
-                header = read_heif_header(file.read())
-                tiff = b"" if header is None else header.tiff
-            else:
-                tiff = _tiff(JpegHeader(bounded(file)))
-        inner = read_tiff_directory(tiff)[ExifTags.IFD.Exif]
-        value = read_tiff_directory(tiff, inner)[ExifTags.Base.FocalLengthIn35mmFilm]
-    except HEADER_ERRORS:  # also raised if EXIF or the tag is missing
+            value = _opened(file, start).getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
+    except HEADER_ERRORS:
         return None
     return float(value) if isinstance(value, int) and value > 0 else None

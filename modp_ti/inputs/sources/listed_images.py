@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import io
 import unicodedata
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import UnreadableImageError
-from modp_ti.files.terminal import quiet_libraries
-from modp_ti.inputs.sources.bit_depth import DEPTHS, reduced, used_bits
-from modp_ti.inputs.sources.colour_profile import in_srgb, way_to_srgb
-from modp_ti.inputs.sources.heif import decoded_heif, is_heif
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header
+from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header, why_undecodable
+from modp_ti.inputs.sources.image_pixels import (
+    DEPTHS,
+    alpha_of,
+    decoded,
+    decoded_as,
+    decoded_deep,
+    used_bits,
+    way_to_srgb,
+)
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turn_of_exif, turns_of
+from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turns_of
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 
-__all__ = ["ListedImages", "decoded", "decoded_as", "quiet_opencv"]
+__all__ = ["ListedImages"]
 
 SAMPLED = 16  # images of 16 bits per channel by which their depth is found
 
@@ -139,7 +143,7 @@ class ListedImages(ImageSource):
         """Return the pixels (H, W) whose alpha is at least half, turned upright; None if there is no alpha."""
         if name not in self._transparent:
             return None
-        alpha = _alpha(*self._checked(name))
+        alpha = alpha_of(*self._checked(name))
         return None if alpha is None else self.turn(name).image(alpha)
 
     def leave_out(self, names: Collection[str]) -> None:
@@ -191,7 +195,7 @@ class ListedImages(ImageSource):
         some = []
         for name in names[:: max(1, len(names) // SAMPLED)]:
             with suppress(UnreadableImageError):
-                alpha = _alpha(*self._checked(name))
+                alpha = alpha_of(*self._checked(name))
                 some.append(True if alpha is None else alpha)
         used = not some or any(map(np.any, some))
         if not all(map(np.all, some)):
@@ -247,74 +251,3 @@ def _grouped(names: Iterable[str], key: Callable[[str], str]) -> dict[str, list[
     for name in names:
         groups.setdefault(key(name), []).append(name)
     return groups
-
-
-def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = None) -> NDArray[np.uint8] | None:
-    """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation (HEIC upright); None if that fails.
-
-    Args:
-        data: The file's content.
-        bits: How many bits an image of 16 bits per channel uses.
-        header: The file's header, whose colour profile is applied; None to keep the colours as they are stored.
-    """
-    import cv2
-
-    profile = b"" if header is None else header.profile
-    if is_heif(data[:12]):
-        image = decoded_heif(data)
-        return None if image is None else in_srgb(image, profile)
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = decoded_as(data, flags) if bits == DEPTHS[-1] else decoded_deep(data)
-    if image is None:
-        return None
-    rgb = np.asarray(cv2.cvtColor(reduced(image, bits), cv2.COLOR_BGR2RGB), dtype=np.uint8)
-    return _as_stored(in_srgb(rgb, profile), header)
-
-
-def _as_stored(image: NDArray[Any], header: ImageHeader | None) -> NDArray[Any]:
-    """Undo what OpenCV does to the image of a TIFF file, which it turns as EXIF says."""
-    if header is None or not header.is_tiff or header.orientation == 1:
-        return image
-    return np.ascontiguousarray(turn_of_exif(header.orientation).stored(image))
-
-
-def _alpha(data: bytes, header: ImageHeader | None) -> NDArray[np.bool_] | None:
-    """Return where the alpha of an image file's content is at least half (H, W); None if it has no alpha."""
-    import cv2
-
-    image = decoded_as(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 3 or image.shape[2] != 4 or image.dtype not in (np.uint8, np.uint16):
-        return None
-    return _as_stored(image[..., 3] > np.iinfo(image.dtype).max // 2, header)
-
-
-def decoded_deep(data: bytes) -> NDArray | None:
-    """Decode an image file's bytes to (H, W, 3) BGR, uint8 or uint16 as it is stored; None if that fails."""
-    import cv2
-
-    image = decoded_as(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
-
-
-def decoded_as(data: bytes, flags: int) -> NDArray | None:
-    """Decode an image file's bytes with OpenCV's flags, BGR and silently; None if that fails."""
-    import cv2
-
-    with quiet_opencv():
-        try:
-            return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except cv2.error:
-            return None
-
-
-@contextmanager
-def quiet_opencv() -> Iterator[None]:
-    """Silence OpenCV and its libraries on the terminal within the block. Errors are reported by the caller."""
-    import cv2
-
-    log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        with quiet_libraries():
-            yield
-    finally:
-        cv2.utils.logging.setLogLevel(log_level)

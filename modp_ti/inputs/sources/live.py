@@ -22,7 +22,7 @@ from modp_ti.files.urls import shown_url
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
 from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import FrameStore, kept_frames
-from modp_ti.inputs.sources.listed_images import quiet_opencv
+from modp_ti.inputs.sources.image_pixels import quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
 
 __all__ = ["LiveSource"]

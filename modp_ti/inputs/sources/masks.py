@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from modp_ti.files import read_bytes, readable
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.sources.image_bounds import why_undecodable
 from modp_ti.inputs.sources.image_folder import ImageFolder
+from modp_ti.inputs.sources.image_header import why_undecodable
 from modp_ti.inputs.sources.listed_images import ListedImages, decoded_as
 from modp_ti.inputs.sources.undistortion import both_valid
 

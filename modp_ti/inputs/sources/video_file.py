@@ -1,10 +1,12 @@
-"""Source `video`: the frames of a video file, readable in any order."""
+"""Source `video`: the frames of a video file, decoded with PyAV (FFmpeg) from the first to the last."""
 
 from __future__ import annotations
 
+import math
 import os
-import zlib
+import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -13,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.orientation import AS_STORED
+from modp_ti.inputs.sources.image_header import MAX_IMAGE_PIXELS
+from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
-from modp_ti.inputs.sources.tone_mapping import PEAK, WHITE
-from modp_ti.inputs.sources.video_container import missing_bytes, require_true_index
+from modp_ti.inputs.sources.tone_mapping import PEAK, WHITE, ToneMapping, Transfer
 
 if TYPE_CHECKING:
-    from modp_ti.inputs.sources.video_decoder import VideoDecoder
-    from modp_ti.inputs.sources.video_picture import VideoForm
+    import av
 
 __all__ = ["VIDEO_SUFFIXES", "VideoFile", "is_video"]
 
@@ -30,23 +31,27 @@ VIDEO_SUFFIXES = (
     *(".gif", ".insv", ".lrv", ".qt", ".dav", ".y4m"),
 )
 
-# Frames up to this many ahead are reached by decoding, farther ones by seeking. A seek decodes from the previous
-# keyframe of the stream, usually at most 250 frames back.
-PASSED_OVER = 60
-# Margins before the wanted frame [s] for seeking. The next one is tried if a seek lands after the frame.
-SEEK_MARGINS = (0.0, 1.0, 10.0, 100.0)
+# FFmpeg's names of the accepted formats: video containers, but not playlists, which refer to other files.
+CONTAINERS = (
+    "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo,h264,hevc,vvc,m4v,mjpeg,asf,flv,ogg,"
+    "ivf,obu,av1,dv,gxf,mxf,nut,rm,wtv,yuv4mpegpipe,gif,apng,dhav"
+)
+LIMITS = {"max_pixels": str(MAX_IMAGE_PIXELS)}
+# Largest difference from a quarter turn that a display matrix may have [degrees].
+STRAIGHT = 1.0
+# Colour matrices by the number in H.273, as FFmpeg's filter numbers them. HDR with another matrix, or with none, is
+# taken to have that of BT.2020.
+MATRICES = {1: "ITU709", 5: "ITU601", 6: "ITU601"}
 
 
 class VideoFile(ImageSource):
     """An `ImageSource` of a video file. Frame n, from 0, is called `<file stem>_<n, six digits>`.
 
     The file is decoded once when it is opened, because only that gives the number of frames and their times. Frames are
-    turned as the file requests: phones store portrait videos in landscape. HDR is tone-mapped (`tone_mapping.py`), and
-    of interlaced frames one field is used.
+    turned as the file requests: phones store portrait videos in landscape. HDR is tone-mapped (`tone_mapping.py`).
 
-    A frame is the same whenever and in whatever order it is read. New frames come from a decoder that runs forward from
-    the first frame. Earlier frames come from a second decoder that seeks; each of its frames is compared with a
-    checksum from the first reading. Frames may be read from several threads.
+    A frame is the same whenever it is read. Reading goes forward: an earlier frame takes decoding from the first frame
+    on. Frames may be read from several threads.
 
     Args:
         path: The video file.
@@ -54,7 +59,7 @@ class VideoFile(ImageSource):
         stop: Number of frames to use; all if None.
 
     Raises:
-        InputError: If the file is missing, not a video, has no frames, or is truncated before `stop`.
+        InputError: If the file is missing, not a video, or has no frames.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float = 30.0, stop: int | None = None) -> None:
@@ -63,49 +68,27 @@ class VideoFile(ImageSource):
             raise InputError(f"{self.path}: no such video file (source.path)")
         if not self.path.is_file():
             raise InputError(f"{self.path}: a video must be a file, this is a folder or a pipe (source.kind)")
-        try:
-            missing = missing_bytes(self.path)
-            require_true_index(self.path)
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be opened: {error.strerror}") from None
         self._lock = Lock()
-        self._checksums: dict[int, int] = {}
-        self._seeks = True
-        self._form: VideoForm | None = None
-        self._front = self._decoder(missing, in_threads=True)
-        self._back: VideoDecoder | None = None
-
+        self._form: _Form | None = None
+        decoder = self._opened(in_threads=True)
         shown: list[float] = []
-        first, interlaced = None, 0
-        while (stop is None or len(shown) < stop) and self._front.advance():
-            shown.append(self._front.shown)
-            interlaced += self._front.interlaced
+        first = None
+        while (stop is None or len(shown) < stop) and decoder.advance():
+            shown.append(decoder.shown)
             if len(shown) == 1:
-                first, self._form = self._front.image(), self._front.form
-        cut_off = bool(missing) and (stop is None or len(shown) < stop)
+                first, self._form = decoder.image(), decoder.form
+        decoder.close()
         if first is None or self._form is None:
-            self.close()
-            raise self._useless(missing)
-        if cut_off:
-            self.close()
-            raise InputError(
-                f"{self.path}: the video is cut off, {missing} bytes are missing: copy it again, or set source.stop: "
-                f"{len(shown)} to use the frames that can be read"
-            )
-        self._shown = np.array(shown)
-        times, timed = _frame_times(self._shown, fps)
+            raise self._useless()
+        times, timed = _frame_times(np.array(shown), fps)
         super().__init__(self.path, [f"{self.path.stem}_{i:06d}" for i in range(len(shown))], times)
-
         height, width = first.shape[:2]
         self._size = (width, height)
-        if self._front.choice:
-            self.add_note(f"{self.path} {self._front.choice}")
-        for note in _form_notes(self._form, width, height, interlaced, len(shown)):
+        for note in (*decoder.notes, *self._form.notes(width, height)):
             self.add_note(f"{self.path} {note}")
         if not timed:
             self.add_note(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
-        self._front.close()
-        self._front = self._decoder(missing)
+        self._decoder = self._opened()
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """Decode a frame (H, W, 3) uint8 RGB.
@@ -115,120 +98,44 @@ class VideoFile(ImageSource):
         """
         with self._lock:
             index = self._position[name]
-            image = self._new(index) if index > self._front.index else self._old(index)
+            if index < self._decoder.index:
+                self._decoder.close()
+                self._decoder = self._opened()
+            while self._decoder.index < index and self._decoder.advance():
+                pass
+            image = self._decoder.image() if self._decoder.index == index else None
         if image is None:
             raise InputError(f"{self.path}: frame {index} cannot be decoded (any more); was the file changed?")
         return image
 
     def close(self) -> None:
         """Close the file."""
-        for decoder in (self._front, self._back):
-            if decoder is not None:
-                decoder.close()
+        self._decoder.close()
 
-    def _new(self, index: int) -> NDArray[np.uint8] | None:
-        """Decode a frame after the front decoder's position."""
-        if not self._front.advance_to(index):
-            return None
-        image = self._front.image()
-        if image is not None:
-            self._checksums[index] = _checksum(image)
-        return image
-
-    def _old(self, index: int) -> NDArray[np.uint8] | None:
-        """Decode a frame at or before the front decoder's position and compare it with its checksum, if known."""
-        known = self._checksums.get(index)
-        if self._back is None:
-            self._back = self._decoder()
-        ahead = index - self._back.index
-        if not 0 < ahead <= PASSED_OVER and known is not None and self._seeks and self._seek(index):
-            image = self._back.image()
-            if image is not None and _checksum(image) == known:
-                return image
-            self._seeks = False  # seeking by time does not work for this container
-        if index <= self._back.index or not self._seeks:
-            self._back.close()
-            self._back = self._decoder()
-        if not self._back.advance_to(index):
-            return None
-        image = self._back.image()
-        if image is None:
-            return None
-        if known is None:
-            self._checksums[index] = _checksum(image)
-        elif _checksum(image) != known and self._seeks:
-            self._seeks = False  # decoding after a seek has skipped frames
-            return self._old(index)
-        return image
-
-    def _seek(self, index: int) -> bool:
-        """Seek the second decoder to a frame by its time. Returns whether that succeeded."""
-        assert self._back is not None
-        for margin in SEEK_MARGINS:
-            landed = self._back.seek(float(self._shown[index]) - 1000.0 * margin)
-            found = [] if landed is None else np.flatnonzero(self._shown == landed)
-            if len(found) == 1 and found[0] <= index:
-                self._back.index = int(found[0])
-                return self._back.advance_to(index)
-        self._back.index = len(self.names)  # unknown position: the next read reopens the file
-        return False
-
-    def _decoder(self, missing: int | None = None, in_threads: bool = False) -> VideoDecoder:
-        from modp_ti.inputs.sources.video_decoder import VideoDecoder
-
+    def _opened(self, in_threads: bool = False) -> _Decoder:
         try:
-            return VideoDecoder(self.path, in_threads, self._form)
+            return _Decoder(self.path, in_threads, self._form)
         except OSError:
-            raise self._useless(missing) from None
+            raise self._useless() from None
 
-    def _useless(self, missing: int | None) -> InputError:
+    def _useless(self) -> InputError:
         if self.path.stat().st_size == 0:
             return InputError(f"{self.path}: the video file is empty")
-        if missing:
-            return InputError(f"{self.path}: the video is cut off, {missing} bytes are missing: copy it again")
         return InputError(
-            f"{self.path}: no video that FFmpeg can read, or without a frame: convert it, for example with "
-            "`ffmpeg -i in -c:v libx264 out.mp4`"
+            f"{self.path}: no video that FFmpeg can read, or without a frame; if it is cut off, copy it again; or "
+            "convert it, for example with `ffmpeg -i in -c:v libx264 out.mp4`"
         )
 
 
 def is_video(path: Path) -> bool:
     """Whether FFmpeg finds a video in a file, whatever its suffix. A single picture is none."""
-    from modp_ti.inputs.sources.video_decoder import VideoDecoder
-
     try:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             return False
-        VideoDecoder(path, in_threads=False).close()
+        _Decoder(path, in_threads=False).close()
     except OSError:
         return False
     return True
-
-
-def _form_notes(form: VideoForm, width: int, height: int, interlaced: int, count: int) -> Iterator[str]:
-    """Yield what is done to the frames.
-
-    Args:
-        form: What the frames have in common.
-        width: Width of the pictures [px].
-        height: Height of the pictures [px].
-        interlaced: Number of interlaced frames.
-        count: Number of frames.
-    """
-    if form.turn != AS_STORED:
-        yield f"asks to be {form.turn}, and is: its frames are {width}x{height}, and intrinsics are for that"
-    if form.slant:
-        yield f"asks to be turned clockwise by {form.slant} degrees more, which is not done: only quarter turns are"
-    if form.transfer is not None:
-        yield (
-            f"is HDR ({form.transfer.name}, BT.2020): its colours are converted to BT.709, and {PEAK:g} cd/m2 become a "
-            f"white of {WHITE:g} cd/m2 by the curve of BT.2390"
-        )
-    if interlaced:
-        yield (
-            f"is interlaced ({interlaced} of {count} frames): of such a frame, the upper field is used, and the lines "
-            "between are interpolated"
-        )
 
 
 def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.float64], bool]:
@@ -248,5 +155,174 @@ def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.flo
     return times, True
 
 
-def _checksum(image: NDArray[np.uint8]) -> int:
-    return zlib.crc32(np.ascontiguousarray(image).data)
+@dataclass(frozen=True)
+class _Form:
+    """What all frames of a video have in common; the first frame tells.
+
+    Attributes:
+        width: Stored width [px]. Frames of another size are scaled to it.
+        height: Stored height [px], likewise.
+        turn: How frames are turned upright.
+        slant: Rotation that the file asks for beyond `turn` [degrees clockwise], which is not done.
+        transfer: Transfer function of HDR video; None for ordinary video.
+        interlaced: Whether a frame is two pictures of different times, which is not undone.
+    """
+
+    width: int
+    height: int
+    turn: Turn = AS_STORED
+    slant: int = 0
+    transfer: Transfer | None = None
+    interlaced: bool = False
+
+    @classmethod
+    def of(cls, frame: av.VideoFrame) -> _Form:
+        transfer = next((each for each in Transfer if each.value == frame.color_trc), None)
+        return cls(frame.width, frame.height, *_turn(frame), transfer, frame.interlaced_frame)
+
+    def notes(self, width: int, height: int) -> Iterator[str]:
+        """Yield what is done to the frames, which become pictures of this width and height [px]."""
+        if self.turn != AS_STORED:
+            yield f"asks to be {self.turn}, and is: its frames are {width}x{height}, and intrinsics are for that"
+        if self.slant:
+            yield f"asks to be turned clockwise by {self.slant} degrees more, which is not done: only quarter turns are"
+        if self.transfer is not None:
+            yield (
+                f"is HDR ({self.transfer.name}, BT.2020): its colours are converted to BT.709, and {PEAK:g} cd/m2 "
+                f"become a white of {WHITE:g} cd/m2 by the curve of BT.2390"
+            )
+        if self.interlaced:
+            yield "is interlaced: convert it first, for example with `ffmpeg -i in -vf bwdif out.mp4`"
+
+
+def _turn(frame: av.VideoFrame) -> tuple[Turn, int]:
+    """Return how the display matrix turns a frame, and the rest of its rotation [degrees clockwise]."""
+    try:
+        # The stubs lack this key.
+        matrix = frame.side_data["DISPLAYMATRIX"]  # pyright: ignore[reportGeneralTypeIssues]
+        a, b, _, c, d, *_ = struct.unpack("=9i", bytes(matrix))
+    except (KeyError, ValueError, struct.error):  # ValueError: the frame has other data, unknown to PyAV
+        a, b, c, d = 1, 0, 0, 1
+    mirrored = a * d - b * c < 0
+    if a == b == 0:
+        return AS_STORED, 0
+    degrees = math.degrees(math.atan2(-b, -a) if mirrored else math.atan2(b, a))
+    quarters = round(degrees / 90)
+    slant = degrees - 90 * quarters
+    return Turn(quarters % 4, mirrored), round(slant) if abs(slant) > STRAIGHT else 0
+
+
+class _Decoder:
+    """Decodes a video stream of a file, frame by frame: as FFmpeg does, a default one before others, then the largest.
+
+    Args:
+        path: The video file.
+        in_threads: Decode in several threads. This is faster, but damaged parts look different each time.
+        form: Size, turn and colours that all frames have; the first frame's if None.
+
+    Attributes:
+        index: Index of the frame that was decoded last, -1 before the first.
+        form: As the argument; if None, it is set when the first image is converted.
+        notes: What there is to say about the file: which of several streams is decoded, and an error that ended it.
+
+    Raises:
+        OSError: FFmpeg does not recognise the file as a video.
+    """
+
+    def __init__(self, path: Path, in_threads: bool, form: _Form | None = None) -> None:
+        import av.error
+        from av.stream import Disposition
+        from av.video.reformatter import VideoReformatter
+
+        self._errors = (av.error.FFmpegError, OSError, ValueError, ArithmeticError, MemoryError)
+        options = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file", **LIMITS}
+        try:
+            self._container = av.open(f"file:{path}", options=options, metadata_errors="replace")
+        except self._errors:
+            raise OSError(str(path)) from None
+        # A stream without a context is of a codec unknown to FFmpeg. Thumbnails do not count.
+        streams = [
+            stream
+            for stream in self._container.streams.video
+            if stream.codec_context is not None and not stream.disposition & Disposition.attached_pic
+        ]
+        if not streams:
+            self._container.close()
+            raise OSError(str(path))
+        by_rank = lambda each: (bool(each.disposition & Disposition.default), each.width * each.height)  # noqa: E731
+        self._stream = max(streams, key=by_rank)
+        self.notes: list[str] = []
+        if len(streams) > 1:
+            sizes = ", ".join(f"{each.width}x{each.height}" for each in streams)
+            number = streams.index(self._stream) + 1
+            self.notes.append(f"holds {len(streams)} video streams ({sizes}): number {number} is used")
+        self._stream.codec_context.options = LIMITS
+        if in_threads:
+            self._stream.thread_type = "AUTO"
+        else:
+            self._stream.codec_context.thread_count = 1
+        self._unit = float(self._stream.time_base or 0)  # [s]
+        self._start = self._stream.start_time or 0
+        self._reformatter = VideoReformatter()  # reused, because a new one computes its tables again
+        self._tones: ToneMapping | None = None
+        self._frame: av.VideoFrame | None = None
+        self._frames = self._decoded()
+        self.form = form
+        self.index = -1
+
+    @property
+    def shown(self) -> float:
+        """Time stamp of the current frame [ms] from the start of the stream; 0 if the container has none."""
+        if self._frame is None or self._frame.pts is None:
+            return 0.0
+        return (self._frame.pts - self._start) * self._unit * 1000.0
+
+    def advance(self) -> bool:
+        """Decode the next frame. Returns False at the end."""
+        self._frame = next(self._frames, None)
+        self.index += self._frame is not None
+        return self._frame is not None
+
+    def image(self) -> NDArray[np.uint8] | None:
+        """Convert the frame that was decoded last to (H, W, 3) uint8 RGB, upright; None if that fails."""
+        if self._frame is None:
+            return None
+        if self.form is None:
+            self.form = _Form.of(self._frame)
+        try:
+            return np.ascontiguousarray(self.form.turn.image(self._rgb(self._frame, self.form)))
+        except self._errors:
+            return None
+
+    def close(self) -> None:
+        self._frame, self._frames = None, iter(())
+        self._container.close()
+
+    def _rgb(self, frame: av.VideoFrame, form: _Form) -> NDArray[np.uint8]:
+        from av.video.reformatter import Colorspace
+
+        if form.transfer is None:
+            # Conversion to BGR with this filter gives the same bits as OpenCV's reader. Direct RGB does not always.
+            shown = self._reformatter.reformat(frame, form.width, form.height, "bgr24", interpolation="BICUBIC")
+            return np.asarray(shown.to_ndarray(), dtype=np.uint8)[..., ::-1]
+        matrix = Colorspace[MATRICES.get(frame.colorspace, "BT2020")]
+        deep = self._reformatter.reformat(frame, form.width, form.height, "rgb48le", matrix, matrix, "BICUBIC")
+        if self._tones is None:
+            self._tones = ToneMapping(form.transfer)
+        return self._tones(np.asarray(deep.to_ndarray(), dtype=np.uint16))
+
+    def _decoded(self) -> Iterator[av.VideoFrame]:
+        """Yield the frames. Packets that cannot be decoded are skipped, as `ffmpeg` does."""
+        for packet in self._packets():
+            try:
+                yield from self._stream.decode(packet)
+            except self._errors:
+                continue
+
+    def _packets(self) -> Iterator[av.Packet | None]:
+        """Yield the packets. After a read error, None flushes the decoder."""
+        try:
+            yield from self._container.demux(self._stream)
+        except self._errors as error:
+            self.notes.append(f"is cut off or damaged, and mapped up to there ({str(error)[:80]})")
+            yield None

@@ -16,9 +16,8 @@ from fields.runtime.disk_room import has_room
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.image_header import read_image_header
-from modp_ti.inputs.sources.listed_images import decoded_as
+from modp_ti.inputs.sources.image_header import read_image_header, why_undecodable
+from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.tracker_server.messages import (
     FRAME,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from modp_ti.files import read_bytes, readable
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.listed_images import decoded_as
+from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.image_pixels import decoded_as
 
 __all__ = ["read_masks", "write_masks"]
 

@@ -15,8 +15,8 @@ from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import ViewSettings
 from modp_ti.files import read_bytes
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.image_bounds import why_undecodable
-from modp_ti.inputs.sources.listed_images import decoded
+from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.image_pixels import decoded
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
 from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun

@@ -1,0 +1,291 @@
+"""One image file of every format: its header without decoding, its pixels in upright sRGB, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import struct
+import sys
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image, ImageCms
+
+from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.inputs.sources import ImageFolder, image_header
+from modp_ti.inputs.sources.image_header import ImageHeader, focal_length_35mm, read_image_header, why_undecodable
+from modp_ti.inputs.sources.image_pixels import decoded, in_srgb
+from modp_ti.inputs.sources.tone_mapping import ToneMapping, Transfer
+
+pillow_heif = pytest.importorskip("pillow_heif")
+pillow_heif.register_heif_opener()
+
+PILLOW = {".jpg": "JPEG", ".png": "PNG", ".webp": "WEBP", ".tif": "TIFF", ".avif": "AVIF", ".heic": "HEIF"}
+OPENCV = [".png", ".jpg", ".bmp", ".tiff", ".webp", ".ppm", ".pgm", ".jp2"]
+NOISE = np.random.default_rng(0).integers(0, 255, (37, 53, 3), dtype=np.uint8)
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+RNG = np.random.default_rng(2)
+PATCHES = np.repeat(np.repeat(RNG.integers(0, 255, (3, 4, 3), dtype=np.uint8), 16, 0), 16, 1)
+RAMP = np.linspace(0.0, 1.0, 64).reshape(8, 8)
+HEIF = ["heic", "avif"]
+
+
+def encoded(suffix: str, *parameters: int, image: np.ndarray = NOISE) -> bytes:
+    image = image[..., 0] if suffix == ".pgm" and image.ndim == 3 else image
+    return cv2.imencode(suffix, image, parameters)[1].tobytes()
+
+
+def saved(suffix: str, image: np.ndarray = PATCHES, **options: object) -> bytes:
+    with io.BytesIO() as stream:
+        lossless = {"lossless": True} if suffix == ".webp" else {"quality": 95}
+        Image.fromarray(image).save(stream, PILLOW[suffix], **lossless, **options)
+        return stream.getvalue()
+
+
+def header_of(data: bytes) -> ImageHeader:
+    header = read_image_header(io.BytesIO(data))
+    assert header is not None
+    return header
+
+
+# ---- headers and limits ------------------------------------------------------------------------------------------
+
+WITH_END = {
+    "png": encoded(".png"),
+    "jpeg": encoded(".jpg"),
+    "progressive": encoded(".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restarts": encoded(".jpg", cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
+    "heic": saved(".heic"),
+    "avif": saved(".avif"),
+}
+
+
+@pytest.mark.parametrize("kind", WITH_END)
+def test_a_file_that_is_cut_off_anywhere_is_not_complete(kind: str) -> None:
+    data = WITH_END[kind]
+    header, image = header_of(data), decoded(data)
+    assert image is not None and header.complete
+    assert (header.width, header.height) == image.shape[1::-1]
+    for length in [*range(8, len(data), 97), len(data) - 2, len(data) - 1]:
+        header = read_image_header(io.BytesIO(data[:length]))
+        assert header is None or not header.complete, length
+    if kind not in HEIF:  # something may be appended, as in motion photos
+        assert header_of(data + b"video" * 100).complete
+
+
+def test_a_thumbnail_with_its_own_end_marker_does_not_hide_a_cut() -> None:
+    thumbnail = b"Exif\0\0" + WITH_END["jpeg"]
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    whole = WITH_END["jpeg"][:2] + segment + WITH_END["jpeg"][2:]
+    header = header_of(whole)
+    assert (header.width, header.height, header.complete) == (53, 37, True)
+    assert not header_of(whole[:-200]).complete
+
+
+@pytest.mark.parametrize("suffix", OPENCV)
+def test_the_size_that_is_judged_is_the_images(suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = encoded(suffix)
+    assert why_undecodable(data) is None
+    monkeypatch.setattr(image_header, "MAX_IMAGE_PIXELS", 53 * 37 - 1)
+    assert "53x37" in str(why_undecodable(data))
+    monkeypatch.undo()
+    monkeypatch.setattr(image_header, "available_memory", lambda: 1000)
+    assert "53x37" in str(why_undecodable(data))
+
+
+@pytest.mark.parametrize("suffix", OPENCV[:-1])
+def test_a_bomb_is_refused_without_its_memory(suffix: str, tmp_path: Path) -> None:
+    """An image that says to be of 60,000 x 60,000 pixels, where the format can say so."""
+    data, side = encoded(suffix), 60_000 if suffix != ".webp" else 16_383
+    at = {".png": 16, ".jpg": data.find(b"\xff\xc0") + 5, ".bmp": 18, ".webp": 26}.get(suffix, -1)
+    if at >= 0:
+        form = {".png": ">II", ".jpg": ">HH", ".bmp": "<ii", ".webp": "<HH"}[suffix]
+        data = data[:at] + struct.pack(form, side, side) + data[at + struct.calcsize(form) :]
+    elif suffix == ".tiff":
+        for tag, value in ((256, 53), (257, 37)):
+            data = data.replace(struct.pack("<HHII", tag, 3, 1, value), struct.pack("<HHII", tag, 4, 1, side))
+            data = data.replace(struct.pack("<HHII", tag, 4, 1, value), struct.pack("<HHII", tag, 4, 1, side))
+    else:
+        data = data.replace(b"53 37", b"%d %d" % (side, side), 1)
+    if suffix == ".png":
+        data = data[:29] + struct.pack(">I", zlib.crc32(data[12:29])) + data[33:]
+    (tmp_path / f"a{suffix}").write_bytes(data)
+    tracemalloc.start()
+    with pytest.raises(UnreadableImageError):
+        ImageFolder(tmp_path).read(f"a{suffix}")
+    assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("data", [b"", b"GIF89a" + bytes(60), b"\0" * 100, b"P7\nWIDTH 4\n", b"RIFF1234WAVEfmt "])
+def test_what_is_no_such_image_is_refused(data: bytes) -> None:
+    assert why_undecodable(data)
+
+
+# ---- EXIF --------------------------------------------------------------------------------------------------------
+
+
+def with_exif(order: str, *inner: bytes) -> bytes:
+    """A JPEG file whose EXIF, written out here byte by byte, has a directory with these entries."""
+    pointer = struct.pack(order + "HHII", 0x8769, 4, 1, 26)
+    tiff = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "IH", 8, 1) + pointer + bytes(4)
+    tiff += struct.pack(order + "H", len(inner)) + b"".join(inner) + bytes(4)
+    segment = b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff
+    return WITH_END["jpeg"][:2] + segment + WITH_END["jpeg"][2:]
+
+
+def test_the_focal_length_is_found_where_it_is_stated(tmp_path: Path) -> None:
+    def short(order: str, tag: int, value: int) -> bytes:
+        return struct.pack(order + "HHIHH", tag, 3, 1, value, 0)
+
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[0xA405] = 26
+    cases = {
+        **{order: (with_exif(order, short(order, 0x9207, 5), short(order, 0xA405, 26)), 26.0) for order in "<>"},
+        **{suffix: (saved(suffix, exif=exif.tobytes()), 26.0) for suffix in (".heic", ".avif")},
+        "zero": (with_exif("<", short("<", 0xA405, 0)), None),
+        "other tags": (with_exif("<", short("<", 0x9207, 5)), None),
+        "two numbers": (with_exif("<", struct.pack("<HHIHH", 0xA405, 3, 2, 26, 26)), None),
+        "cut off": (with_exif("<", short("<", 0xA405, 26))[:40], None),
+        "no EXIF": (WITH_END["jpeg"], None),
+        "empty": (b"", None),
+    }
+    for name, (data, expected) in cases.items():
+        (tmp_path / "a").write_bytes(data)
+        assert focal_length_35mm(tmp_path / "a") == expected, name
+    assert focal_length_35mm(tmp_path / "absent.jpg") is None
+
+
+# ---- pixels ------------------------------------------------------------------------------------------------------
+
+
+def exchanged() -> bytes:
+    """The profile of sRGB with red and blue exchanged: the tag table holds each name once, after 128 bytes."""
+    table = bytearray(SRGB)
+    red, blue = table.index(b"rXYZ", 128), table.index(b"bXYZ", 128)
+    table[red : red + 4], table[blue : blue + 4] = b"bXYZ", b"rXYZ"
+    return bytes(table)
+
+
+@pytest.mark.parametrize("suffix", PILLOW)
+def test_colours_of_another_profile_are_converted_and_those_of_srgb_are_kept(tmp_path: Path, suffix: str) -> None:
+    for name, profile in (("plain", b""), ("same", SRGB), ("other", exchanged())):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"a{suffix}").write_bytes(saved(suffix, icc_profile=profile))
+    plain, same, other = (ImageFolder(tmp_path / name) for name in ("plain", "same", "other"))
+    stored = plain.read(f"a{suffix}")
+    np.testing.assert_array_equal(same.read(f"a{suffix}"), stored)
+    assert np.abs(other.read(f"a{suffix}").astype(int) - stored[..., ::-1]).max() <= 2
+    assert (len(same.notes), len(other.notes)) == (0, 1)
+
+
+@pytest.mark.parametrize("profile", [b"", b"no profile", exchanged()[:200], SRGB[:16] + b"GRAY" + SRGB[20:]])
+def test_a_profile_that_cannot_be_applied_changes_nothing(profile: bytes) -> None:
+    assert in_srgb(PATCHES, profile) is PATCHES
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm", ".jpg"])
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_used_bits_of_16_give_the_whole_range(tmp_path: Path, suffix: str, bits: int, channels: int) -> None:
+    suffix = ".ppm" if suffix == ".pgm" and channels == 3 else suffix
+    kind = np.uint8 if suffix == ".jpg" else np.uint16
+    white = 255 if suffix == ".jpg" else 2**bits - 1
+    shares = (0.4, 1.0, 0.7)  # the first image is darker
+    for i, share in enumerate(shares):
+        image = (share * np.rint(white * RAMP)).astype(kind)
+        cv2.imwrite(str(tmp_path / f"{i}{suffix}"), image if channels == 1 else np.dstack([image] * 3))
+    images = ImageFolder(tmp_path)
+    images.size(images.names[0])
+    for i, share in enumerate(shares):
+        image = images.read(f"{i}{suffix}")
+        assert image.dtype == np.uint8 and (image == image[..., :1]).all()
+        assert np.abs(image - 255 * share * RAMP[..., None]).max() < (7.0 if suffix == ".jpg" else 2.0)
+    assert len(images.notes) == (bits < 16 and suffix != ".jpg")
+
+
+def test_brighter_images_than_those_that_were_looked_at_saturate(tmp_path: Path) -> None:
+    for i in range(40):
+        cv2.imwrite(str(tmp_path / f"{i:02d}.png"), np.full((8, 8), 900 if i != 39 else 3000, np.uint16))
+    images = ImageFolder(tmp_path)
+    assert images.read("00.png").max() == 900 >> 2
+    assert images.read("39.png").min() == 255
+
+
+# ---- HEIC and AVIF -----------------------------------------------------------------------------------------------
+
+
+def gradients() -> np.ndarray:
+    """96x64, smooth, with another colour in each corner."""
+    down, right = np.mgrid[0:1:64j, 0:1:96j]
+    return np.round(np.stack([200 * down, 200 * right, 100 + 0 * right], axis=2)).astype(np.uint8)
+
+
+def photograph(form: str, orientation: int = 1) -> bytes:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    if form == "avif":
+        return saved(".avif", gradients(), subsampling="4:4:4", exif=exif.tobytes())
+    with io.BytesIO() as stream:
+        made = pillow_heif.from_pillow(Image.fromarray(gradients()))
+        made.save(stream, quality=95, chroma=444, exif=exif.tobytes())
+        return stream.getvalue()
+
+
+TURNED = {  # the turned picture, from the stored one
+    1: lambda a: a,
+    3: lambda a: a[::-1, ::-1],
+    6: lambda a: np.rot90(a, -1),
+    8: np.rot90,
+    2: lambda a: a[:, ::-1],
+}
+
+
+@pytest.mark.parametrize("orientation", TURNED)
+@pytest.mark.parametrize("form", HEIF)
+def test_photographs_are_turned_upright_once(tmp_path: Path, form: str, orientation: int) -> None:
+    data = photograph(form, orientation)
+    (tmp_path / f"IMG_1.{form.upper()}").write_bytes(data)
+    images = ImageFolder(tmp_path)
+    (name,) = images.names
+    read = images.read(name)
+    assert images.size(name) == read.shape[1::-1]
+    expected = TURNED[orientation](gradients())
+    assert read.shape == expected.shape
+    assert np.abs(read.astype(int) - expected).max() <= 6
+    # FFmpeg, which decodes a file's only picture as it is stored, reads it independently.
+    with av.open(io.BytesIO(data)) as file:
+        stored = next(file.decode(video=0)).to_ndarray(format="rgb24")[:64, :96]
+    assert np.abs(read.astype(int) - TURNED[orientation](stored)).max() <= 3
+
+
+def test_hdr_photographs_are_tone_mapped() -> None:
+    signal = np.round(np.linspace(0, 65535, 96)[None, :, None] * np.ones((64, 1, 3))).astype(np.uint16)
+    stream = io.BytesIO()
+    made = pillow_heif.from_bytes("RGB;16", (96, 64), signal.tobytes())
+    made.save(stream, quality=-1, chroma=444, color_primaries=9, transfer_characteristics=16, matrix_coefficients=9)
+    read, expected = decoded(stream.getvalue()), ToneMapping(Transfer.PQ)(signal)
+    assert read is not None and np.abs(read.astype(int) - expected).max() <= 2
+
+
+@pytest.mark.parametrize("form", HEIF)
+def test_damaged_photographs_are_named(tmp_path: Path, form: str) -> None:
+    whole = photograph(form)
+    size = whole.index(b"ispe") + 8
+    huge = whole[:size] + b"\0\1\0\0\0\1\0\0" + whole[size + 8 :]
+    for data in (whole[: len(whole) * 2 // 3], whole[:12] + np.random.default_rng(3).bytes(500), huge, whole[:32]):
+        (tmp_path / f"a.{form}").write_bytes(data)
+        images = ImageFolder(tmp_path)
+        with pytest.raises(UnreadableImageError, match=f"a.{form}"):
+            images.read(images.names[0])
+
+
+def test_without_the_package_its_name_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.heic").write_bytes(photograph("heic"))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"modp-ti\[heic\]"):
+        ImageFolder(tmp_path).size("a.heic")
