@@ -24,7 +24,7 @@ from modp_ti.commands.shared import (
 __all__ = ["EXAMPLES", "batch"]
 
 EXAMPLES = examples(
-    "modp-ti batch */scene.yaml   (again: goes on with what is not finished)",
+    "modp-ti batch */scene.yaml   (again: resumes what is not finished)",
     "modp-ti batch videos/*.mp4 --fast --jobs 2   (to out/NAME, as modp-ti run)",
     "modp-ti batch */scene.yaml --set refine.steps=3000 -o out/careful",
     "modp-ti batch */scene.yaml --engine ray --cpus 4 --memory 4",
@@ -78,11 +78,10 @@ def batch(
     """Map many recordings, each in a process of its own. Exit code: 0 all are finished, 1 some are not."""
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for the readers to load.
-        from modp_ti.batch.batch import LOGS, PAGE, Shares, run_batch
-        from modp_ti.batch.results import State, as_row
-        from modp_ti.batch.scenes import read_scenes, with_store
         from modp_ti.files.storage import Storage
-        from modp_ti.tasks import open_engine
+        from modp_ti.many.batch import LOGS, PAGE, Shares, run_batch
+        from modp_ti.many.pool import open_pool
+        from modp_ti.many.scenes import read_scenes, with_store
 
         preset = chosen_preset(fast, best)
         if store is not None:
@@ -91,9 +90,9 @@ def batch(
         if store is not None:
             named = with_store(named, store)
         shares = Shares(cpus, gpus, None if memory is None else int(memory * GIGABYTE), attempts)
-        with open_engine(engine.value, address, jobs, output / LOGS) as opened:
-            results = run_batch(named, opened, output, shares, progress_console(quiet))
-        done = sum(row.state in (State.finished, State.before) for row in results)
+        with open_pool(engine.value, output / LOGS, address, jobs) as pool:
+            results = run_batch(named, pool, output, shares, progress_console(quiet))
+        done = sum(result.state.is_done for result in results)
         result.code = 0 if done == len(results) else UNFINISHED
         result.text = f"{done} of {len(results)} scenes are finished; the summary is {output / PAGE}"
-        result.data = {"output": str(output.absolute()), "scenes": [as_row(row) for row in results]}
+        result.data = {"output": str(output.absolute()), "scenes": [result.row for result in results]}

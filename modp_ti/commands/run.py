@@ -91,13 +91,14 @@ def run(
     view: Annotated[bool, typer.Option("--view", help="serve a web page that shows the map as it grows")] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
+    task: Annotated[bool, typer.Option("--task", hidden=True)] = False,  # of a batch: settings from standard input
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
     """Map a recording or a stream while its frames arrive, and write splats, poses, metrics, pictures and a report."""
     if scene is not None and "=" in scene.name and not scene.exists():  # `--stream 0 --set seed=1 source.stop=600`
         scene, more = None, [str(scene), *(more or [])]
     sources = [source for source in (scene, stream, resume, replay) if source is not None]
-    if not sources:
+    if not sources and not task:
         raise typer.BadParameter(
             "name a scene file, a video or a folder of images, a camera (--stream 0), or the output folder of a run to "
             "go on with (--resume OUT)"
@@ -117,7 +118,11 @@ def run(
         preset = chosen_preset(fast, best)
         if len(sources) > 1 and (stream is not None or replay is not None):
             raise InputError("--stream and --replay need no scene file and no --resume: give one of them")
-        if replay is not None:
+        if task:
+            from modp_ti.many.task import carry_out
+
+            folder = carry_out(progress_console(quiet))
+        elif replay is not None:
             folder = _replay(replay, overrides, quiet)
         else:
             tasks = None if engine is None and address is None else (engine or Where.local, address)
@@ -159,7 +164,7 @@ def _run(
         refuse_output_in_input(config, Path.cwd() if scene is None else base_of(scene))
         require_usable(config.output)  # once more in the run: here, before Taichi is loaded
     if config.parts is not None:
-        from modp_ti.parts.mapping import map_in_parts
+        from modp_ti.many.parts import map_in_parts
 
         return map_in_parts(config, *(tasks or (Where.local, None)), progress_console(quiet))
     if tasks is not None:

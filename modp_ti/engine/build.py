@@ -19,7 +19,6 @@ from modp_ti.files.run_folder import PRIVATE
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ALL_HELD_OUT
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.parts.merged_parts import MergedParts
 from pipelines.companions.pace import CompletePace, Pace
 
 __all__ = ["EXPECTED", "build_mapper", "open_conductor", "open_earlier_map", "open_observer"]
@@ -59,7 +58,11 @@ def open_earlier_map(config: SceneConfig, line: ProgressLine) -> EarlierMap:
     """
     if config.onto is not None:
         return SecondVisit(config, line)
-    return EarlierMap() if config.parts is None else MergedParts(config)
+    if config.parts is None:
+        return EarlierMap()
+    from modp_ti.many.merged_parts import MergedParts  # here, because it loads what many runs need
+
+    return MergedParts(config)
 
 
 def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Conductor:

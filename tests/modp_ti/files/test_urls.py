@@ -10,18 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import typer
 import yaml
 from typer.testing import CliRunner
 
-from modp_ti.batch.scenes import with_resources
 from modp_ti.commands.app import app
+from modp_ti.commands.shared import outcome
 from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
 from modp_ti.config.settings import WITH_SECRETS
 from modp_ti.files.errors import InputError
 from modp_ti.files.urls import actual_url, shown_url, without_secrets
+from modp_ti.many.pool import Resources
+from modp_ti.many.scenes import with_resources
 from modp_ti.outputs.report.facts import changed_settings
-from modp_ti.tasks import Resources
-from modp_ti.tasks.task import perform
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 
 if TYPE_CHECKING:
@@ -122,13 +123,12 @@ def test_no_message_holds_a_secret(call: list[str], tmp_path: Path, monkeypatch:
         assert not hold(str(path)) and not (path.is_file() and hold(path.read_text())), path
 
 
-def test_a_fault_of_the_program_does_not_tell_a_secret():
-    def fails(report: object) -> None:
+def test_a_fault_of_the_program_does_not_tell_a_secret(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(typer.Exit), outcome(as_json=True):
         raise RuntimeError(f"{SECRET} is odd")
-
-    answer = perform(fails, print)
-    assert answer.error and answer.traceback
-    assert not hold(answer.error) and not hold(answer.traceback)
+    said, answer = capsys.readouterr()[::-1]
+    assert "Traceback" in said and json.loads(answer)["error"]
+    assert not hold(said) and not hold(answer)
 
 
 def contents(data: bytes) -> bytes:

@@ -1,7 +1,8 @@
-"""Recognises the finished run of a scene by what it left in the output folder."""
+"""Recognises the finished run of a scene by what it left in the output folder or its storage."""
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,15 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
-from modp_ti.files.run_folder import require_whole
+from modp_ti.files.run_folder import appearing, require_whole
 from modp_ti.files.storage import Storage
 
-__all__ = ["finished_metrics", "is_stored"]
+__all__ = ["OUTPUT", "fetch_finished", "finished_metrics"]
 
 # Settings on which neither the map nor the other output files depend, but for the device, in the last digits.
 FREE = ("output", "device", "threads", "snapshot_every", "snapshot_store", "source.prefetch", "view")
+# Folder of the finished run's files within the scene's storage.
+OUTPUT = "output"
 METRICS, SETTINGS = "metrics.json", "config.yaml"
 
 
@@ -38,23 +41,35 @@ def finished_metrics(config: SceneConfig) -> dict[str, Any] | None:
     return metrics if all(file.is_file() for file in maps) else None
 
 
-def is_stored(config: SceneConfig, storage: Storage, folder: Path) -> bool:
-    """Whether a storage holds a finished run with these settings.
+def fetch_finished(config: SceneConfig) -> bool:
+    """Copy the files of a finished run from `snapshot_store` to the output folder, unless it has them already.
 
-    Args:
-        config: The scene's settings.
-        storage: Where its output files may have been copied to.
-        folder: An existing folder for temporary files.
+    Returns:
+        Whether the output folder now holds a finished run of these settings.
 
     Raises:
-        StorageError: If the storage cannot be read.
+        InputError: If the storage cannot be read, or the output folder not be written.
     """
-    if not storage.has(METRICS) or not storage.get(SETTINGS, folder / SETTINGS):
+    if finished_metrics(config) is not None or not config.snapshot_store:
+        return finished_metrics(config) is not None
+    storage = Storage(config.snapshot_store).within(OUTPUT)
+    if not _is_stored(config, storage):
         return False
-    try:
-        return _same(load_scene(folder / SETTINGS), config)
-    except InputError:
-        return False
+    with appearing(config.output) as folder:
+        storage.get_folder(folder)
+    return finished_metrics(config) is not None
+
+
+def _is_stored(config: SceneConfig, storage: Storage) -> bool:
+    """Whether a storage holds a finished run with these settings. Raises StorageError if it cannot be read."""
+    with tempfile.TemporaryDirectory(prefix="modp-ti-batch-") as folder:
+        file = Path(folder) / SETTINGS
+        if not storage.has(METRICS) or not storage.get(SETTINGS, file):
+            return False
+        try:
+            return _same(load_scene(file), config)
+        except InputError:
+            return False
 
 
 def _same(written: SceneConfig, config: SceneConfig) -> bool:

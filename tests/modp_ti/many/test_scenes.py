@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from modp_ti.batch.scenes import SNAPSHOT_EVERY, read_scenes, with_resources, with_store
-from modp_ti.tasks import Resources
+from modp_ti.many.pool import Resources
+from modp_ti.many.scenes import SNAPSHOT_EVERY, read_scenes, with_resources, with_store
 
 SCENE = "source: {path: images}\ntracker: {kind: colmap}\noutput: OUT\n"
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import csv
 import re
 import sys
-from dataclasses import fields
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
-from modp_ti.batch.results import SceneResult, State, as_row, figures, write_csv, write_parquet
-from modp_ti.batch.summary_page import write_summary_page
+from modp_ti.many.results import COLUMNS, SceneResult, State, figures, write_csv, write_parquet, write_summary_page
 
 METRICS = {
     "frames": 9,
@@ -34,7 +32,7 @@ METRICS = {
 
 def results(folder: Path) -> list[SceneResult]:
     return [
-        SceneResult("a", "a.yaml", str(folder / "a b"), State.finished, 2, "host", **figures(METRICS)),
+        SceneResult("a", "a.yaml", str(folder / "a b"), State.finished, 2, "host", figures=figures(METRICS)),
         SceneResult("<i>b</i>", "b.yaml", None, State.failed, error='a "quoted", <b>long</b> line'),
         SceneResult("c", "c.yaml", str(folder / "c"), State.waiting),
     ]
@@ -45,14 +43,14 @@ def test_figures_are_those_of_held_out_frames_or_else_of_all(tmp_path: Path) -> 
     assert (found["scored"], found["psnr"], found["lpips"], found["seconds"]) == ("held_out", 30.0, 0.25, 125.0)
     nothing_held_out = METRICS | {"refined": METRICS["refined"] | {"held_out": {"count": 0}}}
     assert (figures(nothing_held_out)["scored"], figures(nothing_held_out)["psnr"]) == ("all", 31.0)
-    assert set(found) < {field.name for field in fields(SceneResult)}
+    assert set(found) < set(COLUMNS)
 
 
 def test_the_table_is_read_back_as_it_was(tmp_path: Path) -> None:
     write_csv(tmp_path / "batch.csv", results(tmp_path))
     with (tmp_path / "batch.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    expected = [{name: "" if v is None else str(v) for name, v in as_row(r).items()} for r in results(tmp_path)]
+    expected = [{name: "" if v is None else str(v) for name, v in r.row.items()} for r in results(tmp_path)]
     assert rows == expected
     assert rows[1]["error"] == 'a "quoted", <b>long</b> line' and rows[0]["state"] == "finished"
 
@@ -62,7 +60,7 @@ def test_parquet_has_the_same_table_with_types_that_do_not_depend_on_the_values(
     assert write_parquet(tmp_path / "all.parquet", results(tmp_path))
     assert write_parquet(tmp_path / "none.parquet", results(tmp_path)[1:])
     read = parquet.read_table(tmp_path / "all.parquet")
-    assert read.to_pylist() == [as_row(result) for result in results(tmp_path)]
+    assert read.to_pylist() == [result.row for result in results(tmp_path)]
     assert read.schema == parquet.read_table(tmp_path / "none.parquet").schema
 
 

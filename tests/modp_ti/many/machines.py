@@ -43,9 +43,10 @@ def other_machine(cluster: Any) -> Machine:
 
 
 def _children(parent: int) -> list[int]:
+    """Its processes and theirs: also those of the tasks, which a machine takes with it."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
             if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
-                found.append(int(stat.parent.name))
+                found += [int(stat.parent.name), *_children(int(stat.parent.name))]
     return found

@@ -7,8 +7,6 @@ from typing import Any
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.batch.finished import finished_metrics
-from modp_ti.batch.results import figures, last_stage
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.earlier_map import EarlierMap
 from modp_ti.engine.mapper import Mapper
@@ -16,10 +14,11 @@ from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.many.finished import finished_metrics
+from modp_ti.many.parts import Part, part_config, parts_of, steps_in_part
+from modp_ti.many.results import figures, last_stage
 from modp_ti.outputs.formats.exposure import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
-from modp_ti.parts.cutting import Part
-from modp_ti.parts.part_scenes import part_config, parts_of, steps_in_part
 from pipelines.settings import RefineSettings
 from pipelines.whole.merge import MappedPart
 

@@ -10,7 +10,7 @@ import pytest
 from fields.geometry.camera import PinholeCamera
 from fields.map.covisibility import SeenPoints, covisibility
 from modp_ti.files.errors import InputError
-from modp_ti.parts.cutting import MARGIN, SEES_TOO, SLACK, cut
+from modp_ti.many.parts import MARGIN, SEES_TOO, SLACK, cut
 
 CAMERA = PinholeCamera(60.0, 60.0, 40.0, 30.0, 80, 60)
 

@@ -12,7 +12,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.bare_recording import base_of, named_scene
 from modp_ti.inputs.scene_paths import refuse_output_in_input
-from modp_ti.tasks import Resources
+from modp_ti.many.pool import Resources
 
 __all__ = ["SNAPSHOT_EVERY", "Scene", "for_a_task", "read_scenes", "with_resources", "with_store"]
 

@@ -1,1 +1,0 @@
-"""A batch: many recordings, each mapped by a task of its own."""

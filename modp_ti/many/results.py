@@ -1,0 +1,169 @@
+"""Results of a batch: a row for each scene, their tables and the summary page."""
+
+from __future__ import annotations
+
+import csv
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from modp_ti.files.atomic import replace_text, replacing
+from modp_ti.outputs.report import facts
+
+__all__ = ["SceneResult", "State", "figures", "write_csv", "write_parquet", "write_summary_page"]
+
+
+class State(str, Enum):
+    """What became of a scene."""
+
+    finished = "finished"
+    before = "finished before"
+    """An earlier batch or run had finished it, with the same settings."""
+    failed = "failed"
+    waiting = "waiting"
+    """It has not ended yet, or was interrupted; the same command resumes it."""
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the scene is mapped."""
+        return self in (State.finished, State.before)
+
+
+# Type of each column, in order.
+COLUMNS: dict[str, type] = {
+    **dict.fromkeys(("name", "scene", "output", "state"), str),
+    "attempts": int,
+    **dict.fromkeys(("machine", "error"), str),
+    **dict.fromkeys(("frames", "keyframes", "gaussians"), int),
+    "scored": str,
+    **dict.fromkeys(("psnr", "ssim", "lpips", "detail", "ate_rmse"), float),
+    **dict.fromkeys(("seconds", "frames_per_second", "peak_memory_mb"), float),
+    "resumed": int,
+}
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """A row of the tables.
+
+    Attributes:
+        name: Name of the scene in the batch.
+        scene: What the user named.
+        output: Its output folder, None if its settings cannot be read.
+        state: What became of it.
+        attempts: How often it was begun in this batch.
+        machine: Where the last attempt ran, "" if it is not known.
+        error: One line that says why it failed, otherwise "".
+        figures: The other columns, see `figures`; empty if it is not finished.
+    """
+
+    name: str
+    scene: str
+    output: str | None
+    state: State
+    attempts: int = 0
+    machine: str = ""
+    error: str = ""
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The columns as plain values, None where a figure is not known."""
+        values = vars(self) | {"state": self.state.value} | dict(self.figures)
+        return {name: values.get(name) for name in COLUMNS}
+
+
+def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of a finished scene from the content of its `metrics.json`.
+
+    Scores are the means over the held-out frames of the final map, or over all frames (`scored`).
+    """
+    stage = last_stage(metrics)
+    scored = "held_out" if stage["held_out"]["count"] else "all"
+    of_run = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "ate_rmse")
+    return {
+        **{name: metrics.get(name) for name in of_run},
+        "scored": scored,
+        **{name: stage[scored].get(name) for name in ("psnr", "ssim", "lpips", "detail")},
+        "seconds": metrics["seconds"]["total"],
+        "resumed": metrics["snapshots"]["resumed"],
+    }
+
+
+def last_stage(metrics: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the entry of the final map in the content of `metrics.json`."""
+    return next(metrics[stage] for stage in ("refined", "online", "offline") if metrics.get(stage))
+
+
+def write_csv(path: Path, results: Sequence[SceneResult]) -> None:
+    """Write the table with a header line; unknown values are empty. Raises OSError if it cannot be written."""
+    with replacing(path, "w") as file:
+        writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(result.row for result in results)
+
+
+def write_parquet(path: Path, results: Sequence[SceneResult]) -> bool:
+    """Write the table as a Parquet file, and return False if pyarrow is not installed. Raises OSError as `write_csv`.
+
+    The types of the columns do not depend on the values.
+    """
+    try:
+        import pyarrow  # pyright: ignore[reportMissingImports] - not a dependency
+        import pyarrow.parquet  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return False
+    types = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64()}
+    schema = pyarrow.schema([(name, types[kind]) for name, kind in COLUMNS.items()])
+    table = pyarrow.Table.from_pylist([result.row for result in results], schema=schema)
+    with replacing(path) as file:
+        pyarrow.parquet.write_table(table, file)
+    return True
+
+
+def write_summary_page(path: Path, results: Sequence[SceneResult], folder: Path | None = None) -> None:
+    """Write the summary page, with links to the reports of the scenes. Raises OSError if it cannot be written.
+
+    Args:
+        path: The page.
+        results: The results so far.
+        folder: The folder that its links are relative to, so that the folders can be moved together; None for its own.
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.ChoiceLoader(
+            [jinja2.PackageLoader(package, ".") for package in ("modp_ti.many", "modp_ti.outputs.report")]
+        ),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    rows = [result.row | {"link": _link(folder or path.parent, result)} for result in results]
+    page = environment.get_template("summary_page.html.j2").render(
+        rows=rows,
+        finished=sum(result.state.is_done for result in results),
+        failed=[result for result in results if result.state is State.failed],
+        waiting=sum(result.state is State.waiting for result in results),
+        seconds=sum(row["seconds"] or 0.0 for row in rows),
+        frames=sum(row["frames"] or 0 for row in rows),
+        facts=facts,
+        written=time.strftime("%d %B %Y, %H:%M"),
+    )
+    replace_text(path, page)
+
+
+def _link(folder: Path, result: SceneResult) -> str | None:
+    """Return the relative URL of a scene's report or else of its output folder; None if it is not finished."""
+    if result.output is None or not result.state.is_done:
+        return None
+    output = Path(result.output)
+    report = output / "report.html"
+    target = report if report.is_file() else output
+    return quote(Path(os.path.relpath(target, folder.resolve())).as_posix())
