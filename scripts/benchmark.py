@@ -1,12 +1,11 @@
 """Measure speed and memory on this machine, and print them as Markdown or write Markdown and JSON.
 
 The tables contain: the time of a step by stage and by pixel-Gaussian pair; its share of the machine's float32
-throughput and memory bandwidth; how it grows; the cost of the voxels; and the frames per second of whole runs. Every
-measurement runs in its own process. Figures are medians after a warm-up.
+throughput and memory bandwidth; and the frames per second of whole runs. Every measurement runs in its own process.
+Figures are medians after a warm-up.
 
 With --quality, they contain instead the held-out PSNR of scenes against processor time at several budgets, by this
-version of the program and, with --against, by another one. With --scale N, they contain the time, memory and quality of
-a map of N copies of a scene side by side.
+version of the program and, with --against, by another one.
 """
 
 from __future__ import annotations
@@ -22,25 +21,48 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks import quality, quality_report
-from benchmarks.report import report, world_report
+import quality
 from ending import documented_ending
-from experiments import Job, command_line, execute, named_scenes, parser, write_report
+from step import (
+    ADAM_BYTES,
+    BACKWARD_FLOPS,
+    FORWARD_FLOPS,
+    LOSS_FLOPS,
+    SIZES,
+    STAGES,
+    Size,
+    measure_machine,
+    measure_step,
+)
+from tables import Figures, command_line, execute, markdown_table, named_scenes, settings_of, write_report
 
 from fields.runtime.parallel import available_cores
 from modp_ti.files.errors import InputError
 
-# (width, height, Gaussians in view) of a phone's frame, a webcam's frame, and full detail.
-SIZES = [(270, 480, 12_500), (640, 480, 100_000), (1280, 720, 500_000)]
 DEMO = Path(__file__).resolve().parent.parent / "demo" / "scene.yaml"
+RUNS = {
+    "frames": ("frames", ",.0f"),
+    "keyframes": ("keyframes", ",.0f"),
+    "Gaussians": ("gaussians", ",.0f"),
+    "frames per second": ("frames_per_second", ".2f"),
+    "compiling [s]": ("compile", ".1f"),
+    "waiting for frames [s]": ("read", ".2f"),
+    "peak memory [MB]": ("peak_memory_mb", ".0f"),
+    "PSNR": ("psnr", ".2f"),
+}
 
 
 @documented_ending()
 def main() -> None:
     """Measure and print the tables. The exit code is 2 for bad input."""
-    options = parser(__doc__, "scripts/benchmark --quick -o out/benchmark")
+    options = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="example: scripts/benchmark --quick -o out/benchmark",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of every run")
     options.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="also write benchmark.md and .json there")
-    options.add_argument("--quick", action="store_true", help="the first size only; no growth, no voxels, no whole run")
+    options.add_argument("--quick", action="store_true", help="the first size only, and no whole run")
     options.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
     options.add_argument("--scene", action="append", metavar="FILE", help="scene of a whole run (default: the demo)")
     options.add_argument("--repeats", type=int, default=15, help="timed calls a figure (default 15)")
@@ -53,146 +75,174 @@ def main() -> None:
         "--against-budgets", type=int, nargs="+", metavar="STEPS", help="those of the other commit (default: the same)"
     )
     options.add_argument("--runs", type=int, default=1, help="for --quality: runs of each, medians count (default 1)")
-    options.add_argument("--scale", type=int, metavar="N", help="a map of N copies of the scene, side by side")
     options.add_argument("--measure", help=argparse.SUPPRESS)
     arguments = options.parse_args()
     if arguments.measure:
         print(json.dumps(measure(**json.loads(arguments.measure))))
-        return
-    if arguments.quality:
+    elif arguments.quality:
         if arguments.output is None:
             options.error("--quality writes a plot: give a folder with -o")
         if arguments.against_budgets and not arguments.against:
             options.error("--against-budgets are those of another commit: give it with --against")
         measure_quality(arguments)
-        return
-    if arguments.scale:
-        figures = collect_scale(arguments)
-        text = world_report(figures)
     else:
         figures = collect(arguments)
-        text = report(figures)
-    if arguments.output is None:
-        print(text)
-    else:
-        write_report(arguments.output, "benchmark", text, figures)
+        if arguments.output is None:
+            print(report(figures))
+        else:
+            write_report(arguments.output, "benchmark", report(figures), figures)
 
 
 def measure_quality(arguments: argparse.Namespace) -> None:
     """Measure quality against processor time, and write quality.md, quality.json and quality.png."""
     scenes = named_scenes(arguments.scene or [str(DEMO)])
     settings = {"device": arguments.device, **command_line(arguments.set)}
-    for name, scene in scenes.items():
-        Job(name, scene, arguments.output, settings).check()
+    for scene in scenes.values():
+        settings_of(scene, arguments.output, settings)  # reports bad settings before the first run
     with ExitStack() as held:
         programs = {quality.this_program(): arguments.budgets}
         if arguments.against:
             other = held.enter_context(quality.against(arguments.against))
             programs[other] = arguments.against_budgets or arguments.budgets
-        runs = quality.curves(scenes, programs, arguments.runs, settings, arguments.output / "runs")
+        curves = quality.curves(scenes, programs, arguments.runs, settings)
     figures = {
         scene: {program: [asdict(point) for point in points] for program, points in of.items()}
-        for scene, of in runs.items()
+        for scene, of in curves.items()
     }
-    write_report(arguments.output, "quality", quality_report.report(runs), figures)
-    quality_report.plot(runs, arguments.output / "quality.png")
-
-
-def collect_scale(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Map copies of the first scene side by side, and return the figures."""
-    scene = (arguments.scene or [str(DEMO)])[0]
-    settings = [f"{key}={value}" for key, value in {"device": arguments.device, **command_line(arguments.set)}.items()]
-    with tempfile.TemporaryDirectory() as folder:
-        return in_process("scale", scene=scene, copies=arguments.scale, settings=settings, folder=folder)
+    write_report(arguments.output, "quality", quality.report(curves), figures)
+    quality.plot(curves, arguments.output / "quality.png")
 
 
 def collect(arguments: argparse.Namespace) -> dict[str, Any]:
     """Run all measurements and return the figures by kind."""
-    device, repeats = arguments.device, arguments.repeats
-    runs = (arguments.scene or [str(DEMO)], device, command_line(arguments.set))
-    if not arguments.quick:
-        planned_runs(*runs, Path())  # reports bad input now instead of after minutes of measuring
-    cores = available_cores()
-    threads = [cores] if device == "cuda" else sorted({1, cores})
-    on = {"device": device, "threads": cores}
-    figures: dict[str, Any] = {"device": device, "cores": cores, "steps": []}
-    figures["machine"] = {str(n): in_process("machine", device=device, threads=n) for n in threads}
-    for size in SIZES[:1] if arguments.quick else SIZES:
-        row: dict[str, Any] = {"size": size, "threads": {}}
-        for n in threads:
-            twin = size == SIZES[0] and n == 1
-            row["threads"][str(n)] = in_process("step", device=device, threads=n, size=size, repeats=repeats, twin=twin)
-        figures["steps"].append(row)
-    if arguments.quick:
+    device, cores = arguments.device, available_cores()
+    with tempfile.TemporaryDirectory() as folder:
+        overrides = {"refine.steps": "0", "device": device, **command_line(arguments.set)}
+        runs = {
+            (name, "run"): settings_of(file, Path(folder) / name, overrides)  # reports bad input now
+            for name, file in named_scenes(arguments.scene or [str(DEMO)]).items()
+            if not arguments.quick
+        }
+        threads = [cores] if device == "cuda" else sorted({1, cores})
+        figures: dict[str, Any] = {"device": device, "cores": cores, "steps": []}
+        figures["machine"] = {str(n): in_process("machine", device=device, threads=n) for n in threads}
+        for size in SIZES[:1] if arguments.quick else SIZES:
+            common = {"device": device, "size": asdict(size), "repeats": arguments.repeats}
+            steps = {str(n): in_process("step", **common, threads=n, twin=size == SIZES[0] and n == 1) for n in threads}
+            figures["steps"].append({"size": asdict(size), "threads": steps})
+        if runs:
+            kept = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "seconds")
+            figures["runs"] = {
+                name: {key: metrics[key] for key in kept} | {"psnr": metrics["online"]["held_out"]["psnr"]}
+                for (name, _), metrics in execute(runs, Path(folder) / "batch").items()
+            }
         return figures
-    figures["growth"] = in_process("growth", **on, repeats=repeats)
-    figures["frames"] = in_process("frames", **on)
-    figures["voxels"] = in_process("voxels", **on)
-    figures["runs"] = measure_runs(*runs)
-    return figures
 
 
 def in_process(kind: str, **arguments: Any) -> Any:
     """Run one measurement in its own process and return its figures. Raises InputError if it fails."""
-    job = json.dumps({"kind": kind} | arguments)
     print(f"measuring {kind} {arguments.get('size', '')} ...", file=sys.stderr)
-    command = [sys.executable, __file__, "--measure", job]
+    command = [sys.executable, __file__, "--measure", json.dumps({"kind": kind} | arguments)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode:
         raise InputError(f"measuring {kind} ended with exit code {done.returncode}")
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(kind: str, **arguments: Any) -> Any:
+def measure(kind: str, **arguments: Any) -> dict[str, float]:
     """Run one measurement in this process."""
-    from benchmarks import growth, machine, scale, step, voxels
-    from benchmarks.scene import Size
-
-    if "size" in arguments:
-        arguments["size"] = Size(*arguments["size"])
-    if kind == "voxels":
-        return {level: voxels.measure_voxels(**arguments, level=level) for level in voxels.LEVELS}
-    kinds = {
-        "machine": machine.measure_machine,
-        "step": step.measure_step,
-        "growth": growth.measure_growth,
-        "frames": growth.measure_frames,
-        "scale": scale.measure_world,
-    }
-    return kinds[kind](**arguments)
+    if kind == "machine":
+        return measure_machine(**arguments)
+    return measure_step(**arguments | {"size": Size(**arguments["size"])})
 
 
-def planned_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str], folder: Path) -> list[Job]:
-    """Return a job for every scene file, without refinement, with output folders named after the scenes.
+# ---- tables ----------------------------------------------------------------------------------------------------------
 
-    Args:
-        scenes: Scene files.
-        device: "cpu" or "cuda".
-        settings: Overrides by key.
-        folder: Parent of the output folders.
 
-    Raises:
-        InputError: If a scene cannot be run.
-    """
-    overrides = {"refine.steps": "0", "device": device, **settings}
-    jobs = [
-        Job(f"whole run of {name}", scene, folder / name, overrides) for name, scene in named_scenes(scenes).items()
+def report(figures: Mapping[str, Any]) -> str:
+    """Return the tables of all figures (see `collect`)."""
+    columns = {"GFLOP/s": ("gflops", ".0f"), "GB/s": ("gigabytes_per_second", ".1f")}
+    parts = [
+        f"# Benchmark: {figures['device']}, {figures['cores']} cores",
+        "Float32 on this machine: PyTorch's product of 2048 x 2048 matrices, and a = b + s c beyond the caches.",
+        markdown_table("machine", columns, {_threads(n): of for n, of in figures["machine"].items()}),
     ]
-    for job in jobs:
-        job.check()
-    return jobs
+    for row in figures["steps"]:
+        parts += _step(Size(**row["size"]), row["threads"], figures["machine"])
+    if "runs" in figures:
+        runs = {name: {**of, **of["seconds"]} for name, of in figures["runs"].items()}
+        parts += ["## Whole runs, online", markdown_table("scene", RUNS, runs)]
+    return "\n\n".join(parts)
 
 
-def measure_runs(scenes: Sequence[str], device: str, settings: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Run the scenes and return their figures of metrics.json by the scene's name. Raises InputError if a run fails."""
-    with tempfile.TemporaryDirectory() as folder:
-        jobs = planned_runs(scenes, device, settings, Path(folder))
-        results = execute(jobs)
-    kept = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "seconds", "breakdown_percent")
-    return {
-        job.folder.name: {key: metrics[key] for key in kept} | {"psnr": metrics["online"]["held_out"]["psnr"]}
-        for job, metrics in zip(jobs, results, strict=True)
+def _step(size: Size, runs: Mapping[str, Mapping], machine: Mapping[str, Mapping]) -> Sequence[str]:
+    """Return the paragraphs about a step at one size, given its figures and the machine's by number of threads."""
+    first, last = next(iter(runs.values())), runs[max(runs, key=int)]
+    visited, whole = first["pairs visited"], first["pairs of whole tiles"]
+    at_work = ", ".join(f"{of['cores_had']:.2f} with {_threads(n)}" for n, of in runs.items())
+    about = (
+        f"{visited / 1e6:.2f} million pixel-Gaussian pairs visited, {whole / 1e6:.2f} million over whole tiles; "
+        f"{first['visible']:,.0f} Gaussians visible; peak memory of the process {last['peak_memory_mb']:.0f} MB. "
+        f"Cores at work in a step: {at_work}; far fewer than threads where others use the machine."
+    )
+    pairs: dict[str, Figures] = {}
+    shares: dict[str, Figures] = {}
+    for n, of in runs.items():
+        for name, stage, twin in (
+            ("forward", "compositing", "twin"),
+            ("backward", "compositing backward", "twin backward"),
+        ):
+            pairs[f"{name}, {_threads(n)}"] = {
+                "visited": 1e6 * of[stage] / visited,
+                "whole": 1e6 * of[stage] / whole,
+                "twin": of[twin] / of[stage] if twin in of else None,
+            }
+        work = {
+            "compositing": FORWARD_FLOPS * of["pairs visited"],
+            "compositing backward": BACKWARD_FLOPS * of["pairs visited"],
+            "loss": LOSS_FLOPS * 3 * size.width * size.height,
+        }
+        for stage, operations in work.items():
+            rate = operations / of[stage] / 1e6
+            shares[f"{stage}, {_threads(n)}"] = {"flops": rate, "of peak": 100 * rate / machine[n]["gflops"]}
+        rate = ADAM_BYTES * of["visible"] / of["Adam"] / 1e6
+        share = 100 * rate / machine[n]["gigabytes_per_second"]
+        shares[f"Adam, {_threads(n)}"] = {"bytes": rate, "of bandwidth": share}
+    of_pairs = {
+        "ns per pair visited": ("visited", ".2f"),
+        "ns per pair of whole tiles": ("whole", ".2f"),
+        "times faster than the plain twin": ("twin", ".1f"),
     }
+    of_stages = {f"{_threads(n)} [ms]": (n, ".2f") for n in runs}
+    if len(runs) > 1:
+        of_stages["speed-up"] = ("speed-up", ".2f")
+    stages = {
+        "**whole step**" if name == "step" else name: {n: of[name] for n, of in runs.items()}
+        | {"speed-up": first[name] / last[name]}
+        for name in (*STAGES, "step")
+    }
+    of_shares = {
+        "GFLOP/s": ("flops", ".1f"),
+        "% of the machine's": ("of peak", ".0f"),
+        "GB/s": ("bytes", ".1f"),
+        "% of its bandwidth": ("of bandwidth", ".0f"),
+    }
+    counted = (
+        f"Operations counted: {FORWARD_FLOPS} a visited pair forward, {BACKWARD_FLOPS} backward, {LOSS_FLOPS} a pixel "
+        f"and channel of the loss; bytes: {ADAM_BYTES} a Gaussian of Adam, more than 100 % where the caches hold them."
+    )
+    return (
+        f"## {size}",
+        about,
+        markdown_table("compositing", of_pairs, pairs),
+        markdown_table("stage", of_stages, stages),
+        markdown_table("share of the machine", of_shares, shares),
+        counted,
+    )
+
+
+def _threads(n: str) -> str:
+    return "1 thread" if n == "1" else f"{n} threads"
 
 
 if __name__ == "__main__":

@@ -16,14 +16,14 @@ from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
-from benchmarks.scene import Size
 from ending import documented_ending
-from experiments import write_report
 from gpu_kernels.estimate import measure_work
 from gpu_kernels.occupancy import ARCHITECTURES
 from gpu_kernels.survey import survey
 from gpu_kernels.tables import report
 from gpu_kernels.toolkit import version
+from step import Size
+from tables import write_report
 
 from fields.runtime.engine import ENGINES
 from modp_ti.files.errors import InputError

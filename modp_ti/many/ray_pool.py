@@ -61,7 +61,7 @@ def _carry_out(name: str, settings: dict[str, Any], cpus: float, board: Any) -> 
             end = process.end(PATIENCE) or (End.interrupted, "interrupted")
         finally:
             process.close()
-        return *end, machine, log_end(log, LOG)
+        return end[0], end[1], machine, log_end(log, LOG)
 
 
 class RayPool(Pool):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from benchmarks.scene import Size, add_gaussians, camera_of
-from benchmarks.step import ADAM_BYTES
 from numpy.typing import NDArray
+from step import ADAM_BYTES, Size, add_gaussians, camera_of
 
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
 from fields.buffers.tiles import TilePairs

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import tables
 
-from modp_ti.config.scene_file import dump_scene, load_scene
+from modp_ti.config.scene_file import dump_scene, scene_from_data
+from modp_ti.config.settings import SceneConfig
+from modp_ti.many.pool import Ended, LocalPool, Resources
+from modp_ti.many.task import End
 from pipelines.stopwatch import breakdown_percent
 
 DEMO = Path(__file__).resolve().parents[2] / "demo" / "room.mp4"
@@ -30,9 +34,7 @@ def scene(tmp_path: Path) -> Path:
     return file
 
 
-def metrics_of(
-    psnr: float, gaussians: int = 1000, refined: float | None = None, view_renders: int = 5000, **more: object
-) -> dict:
+def metrics_of(psnr: float, gaussians: int = 1000, refined: float | None = None, view_renders: int = 5000) -> dict:
     """metrics.json of a run with these held-out PSNRs; those of all frames are 1 dB higher."""
 
     def section(value: float | None, view_renders: int) -> dict | None:
@@ -44,33 +46,40 @@ def metrics_of(
 
     seconds = {"total": 100.0, "compile": 10.0, "read": 2.0, "track": 5.0, "select": 1.0, "depth": 2.0}
     seconds |= {"occupancy": 1.0, "optimise": 40.0, "refine": 30.0, "evaluate": 5.0, "other": 4.0}
-    metrics = {"frames": 9, "keyframes": 5, "gaussians": gaussians, "frames_per_second": 0.18}
-    metrics |= {
+    return {
+        "frames": 9,
+        "keyframes": 5,
+        "gaussians": gaussians,
+        "frames_per_second": 0.18,
         "peak_memory_mb": 700.0,
         "breakdown_percent": breakdown_percent(seconds, 50.0),
         "online": section(psnr, 1000),
+        "refined": section(refined, view_renders),
+        "offline": None,
+        "seconds": seconds,
+        "snapshots": {"resumed": 0},
     }
-    return metrics | {"refined": section(refined, view_renders), "seconds": seconds} | more
 
 
 @pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """The command lines of the runs that were started; a run only writes its configuration and metrics."""
-    commands: list[list[str]] = []
+def started(monkeypatch: pytest.MonkeyPatch) -> list[SceneConfig]:
+    """The settings of the runs that were begun; a run only writes its configuration and metrics."""
+    configs: list[SceneConfig] = []
 
-    def run(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
-        commands.append(command)
-        assert command[1:3] == ["-m", "modp_ti.run"]
-        overrides = command[5::2]
-        assert command[4::2] == ["--set"] * len(overrides)
-        config = load_scene(command[3], overrides)
-        config.output.mkdir(parents=True, exist_ok=True)
-        (config.output / "metrics.json").write_text(json.dumps(metrics_of(20.0 + len(commands), refined=30.0)))
-        dump_scene(config, config.output / "config.yaml")
-        return subprocess.CompletedProcess(command, 0)
+    class MadeUp(LocalPool):
+        def submit(self, name: str, settings: dict[str, Any], resources: Resources) -> None:
+            config = scene_from_data(settings, name)
+            configs.append(config)
+            config.output.mkdir(parents=True, exist_ok=True)
+            metrics = metrics_of(20.0 + len(configs), refined=30.0)
+            if config.mode == "offline":
+                metrics |= {"online": None, "refined": None, "offline": metrics["refined"]}
+            (config.output / "metrics.json").write_text(json.dumps(metrics))
+            dump_scene(config, config.output / "config.yaml")
+            self._left_out.append(Ended(name, End.done))
 
-    monkeypatch.setattr(subprocess, "run", run)
-    return commands
+    monkeypatch.setattr(tables, "LocalPool", MadeUp)
+    return configs
 
 
 @pytest.fixture

@@ -10,14 +10,24 @@ from pathlib import Path
 import benchmark
 import numpy as np
 import pytest
-from benchmarks import growth
-from benchmarks.growth import HIDDEN, KEYFRAMES, PIXELS, VISIBLE
-from benchmarks.scene import Size, add_gaussians, arrays, camera_of, noise_frame
-from benchmarks.step import ADAM_BYTES, BACKWARD_FLOPS, FORWARD_FLOPS, STAGES, measure_step
+from step import (
+    ADAM_BYTES,
+    BACKWARD_FLOPS,
+    FORWARD_FLOPS,
+    STAGES,
+    Size,
+    add_gaussians,
+    arrays,
+    camera_of,
+    measure_step,
+    noise_frame,
+)
 
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
+from modp_ti.config.scene_file import load_scene
+from modp_ti.config.settings import SceneConfig
 from pipelines.render.renderer import Renderer
 
 pytestmark = pytest.mark.slow
@@ -53,19 +63,10 @@ def test_a_step_is_measured_by_stage_and_its_pairs_are_counted() -> None:
     assert figures["pairs of whole tiles"] % (TILE_WIDTH * TILE_HEIGHT) == 0
 
 
-def test_the_scene_lies_in_the_picture_and_hidden_gaussians_behind_the_camera() -> None:
+def test_the_scene_lies_in_the_picture() -> None:
     camera = camera_of(SMALL.width, SMALL.height)
-    seen, hidden = arrays(SMALL)["position"], arrays(SMALL, hidden=True)["position"]
-    assert camera.contains(camera.project(seen)).all()
-    assert seen[:, 2].min() >= 2.0
-    assert hidden[:, 2].max() <= -2.0
-
-
-def test_the_growth_with_keyframes_is_that_of_frames_that_become_keyframes(monkeypatch) -> None:
-    monkeypatch.setattr(growth, "KEYFRAMES", [2, 12])
-    monkeypatch.setattr(growth, "TIMED", 2)
-    rows = growth.measure_frames("cpu", 2)
-    assert [row["keyframes"] for row in rows] == [2, 12] and all(row["frame"] > 0 for row in rows)
+    position = arrays(SMALL)["position"]
+    assert camera.contains(camera.project(position)).all() and position[:, 2].min() >= 2.0
 
 
 def made_up(kind: str, **arguments: object) -> object:
@@ -73,16 +74,6 @@ def made_up(kind: str, **arguments: object) -> object:
     threads = arguments.get("threads", 1)
     if kind == "machine":
         return {"gflops": 100.0 * threads, "gigabytes_per_second": 20.0}
-    if kind == "growth":
-        cases = {"pixels": PIXELS, "visible": VISIBLE, "hidden": HIDDEN}
-        return {
-            name: [{"pixels": w * h, "visible": n, "hidden": m, "step": 12.5} for w, h, n, m in of]
-            for name, of in cases.items()
-        }
-    if kind == "frames":
-        return [{"keyframes": n, "frame": 33.3} for n in KEYFRAMES]
-    if kind == "voxels":
-        return {"3": {"query": 1.0, "update": 2.0, "admit": 3.0, "megabytes": 4.0}}
     figures = dict.fromkeys(STAGES, 4.0 / threads)
     figures |= {"step": 40.0 / threads, "pairs visited": 1e6, "pairs of whole tiles": 2e6, "visible": 1000}
     return (
@@ -117,24 +108,20 @@ def test_the_tables_say_what_was_measured(monkeypatch, two_cores, tmp_path: Path
     assert f"| compositing backward, 2 threads | {two:.1f} | {two / 2:.0f} | – | – |" in text
     rate = ADAM_BYTES * 1000 / 4e-3 / 1e9
     assert f"| Adam, 1 thread | – | – | {rate:.1f} | {5 * rate:.0f} |" in text
-    assert "Growth" not in text
+    assert "Whole runs" not in text
     figures = json.loads((tmp_path / "benchmark.json").read_text())
     assert figures["machine"]["2"]["gflops"] == 200.0
-    assert figures["steps"][0]["size"] == [270, 480, 12_500]
+    assert figures["steps"][0]["size"] == {"width": 270, "height": 480, "gaussians": 12_500}
 
 
 def test_whole_runs_are_those_of_the_scenes_that_are_named(
-    monkeypatch, two_cores, scene: Path, started: list[list[str]], capsys
+    monkeypatch, two_cores, scene: Path, started: list[SceneConfig], capsys
 ) -> None:
     run(monkeypatch, "--scene", str(scene), "--set", "seed=5")
     text = capsys.readouterr().out
-    assert len(started) == 1
-    assert started[0][3] == str(scene)
-    for override in ("seed=5", "refine.steps=0", "device=cpu"):
-        assert override in started[0]
+    (config,) = started
+    assert (config.source.path, config.seed, config.refine.steps) == (load_scene(scene).source.path, 5, 0)
     assert text.count("pixel-Gaussian pairs visited") == 3
-    assert "| 1,000 | 33.3 |" in text
-    assert "300,000 points" in text
     name = scene.parent.name
     assert f"| {name} | 9 | 5 | 1,000 | 0.18 | 10.0 | 2.00 | 700 | 21.00 |" in text
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.scene import Size
 from gpu_kernels.estimate import Card, count_work, milliseconds
 from gpu_kernels.machine_code import Counts, instructions_of, loop_counts
 from gpu_kernels.occupancy import ARCHITECTURES, blocks_per_multiprocessor, limit, occupancy
 from gpu_kernels.toolkit import Assembled, parse_ptxas
+from step import Size
 
 from modp_ti.files.errors import InputError
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from benchmarks import quality, quality_report
-from benchmarks.quality import Point, Program, frontier, points_of, psnr_at, seconds_to
-from experiments import Job
+import quality
+from quality import Point, frontier, points_of, psnr_at, seconds_to
 
 from modp_ti.files.errors import InputError
 
@@ -41,46 +39,20 @@ def test_quality_and_time_are_read_off_the_same_curve() -> None:
     assert seconds_to(points, 24.5) is None
 
 
-def test_programs_run_interleaved_and_finished_runs_of_commits_are_kept(
-    tmp_path: Path, make_metrics: Callable[..., dict], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_programs_run_interleaved_and_the_median_of_their_time_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[str] = []
-    speeds = {"new": iter([30.0, 10.0, 20.0]), "old+": iter([60.0] * 6)}
+    speeds = {"new": iter([30.0, 10.0, 20.0]), "old": iter([60.0] * 6)}
 
-    def run(program: Program, job: Job) -> float:
-        started.append(program.label)
-        # Only the older version knows the setting.
-        steps = job.overrides["mapping.optimise.steps"]
-        assert job.overrides.get("mapping.optimise.last_steps") == {"new": None, "old+": steps}[program.label]
-        job.folder.mkdir(parents=True)
-        metrics = make_metrics(20.0 + int(steps), refined=30.0)
-        (job.folder / "metrics.json").write_text(json.dumps(metrics))
-        return next(speeds[program.label])
+    def measured(root: Path, scene: Path, steps: int, settings: dict) -> list[Point]:
+        started.append(root.name)
+        return [point(next(speeds[root.name]), 20.0 + steps, steps=steps)]
 
-    monkeypatch.setattr(quality, "_run", run)
-    scene = tmp_path / "scene.yaml"
-    scene.write_text("output: out")
-    programs = {}
-    for label, budgets, setting in (
-        ("new", [4], "last_passes: int = Field("),
-        ("old+", [8, 4], "last_steps: int = Field("),
-    ):
-        settings = tmp_path / label / "pipelines" / "settings.py"
-        settings.parent.mkdir(parents=True)
-        settings.write_text(setting)
-        programs[Program(label, tmp_path / label)] = budgets
-
-    def measure() -> dict[str, dict[str, list[Point]]]:
-        return quality.curves({"room": scene}, programs, 3, {}, tmp_path / "runs")
-
-    curves = measure()
-    assert started == ["new", "old+", "old+", "new", "new", "old+"] + ["old+"] * 3
-    assert [p.seconds for p in curves["room"]["new"]] == [pytest.approx(11.0), pytest.approx(17.0)]  # of 20 s
-    assert [p.psnr for p in curves["room"]["old+"]] == [24.0, 30.0, 28.0, 30.0]
-    started.clear()
-    speeds["old+"] = iter([60.0] * 6)
-    assert measure() == curves
-    assert started == ["old+"] * 6  # a changed working tree may have changed again
+    monkeypatch.setattr(quality, "_measured", measured)
+    programs = {("a+", Path("new")): [4], ("b", Path("old")): [8, 4]}
+    curves = quality.curves({"room": Path("scene.yaml")}, programs, 3, {})
+    assert started == ["new", "old", "old", "new", "new", "old"] + ["old"] * 3
+    assert [(p.seconds, p.psnr) for p in curves["room"]["a+"]] == [(20.0, 24.0)]
+    assert [p.psnr for p in curves["room"]["b"]] == [24.0, 28.0]
 
 
 def test_the_report_compares_the_programs_at_the_same_quality(tmp_path: Path) -> None:
@@ -90,13 +62,13 @@ def test_the_report_compares_the_programs_at_the_same_quality(tmp_path: Path) ->
             "old": [point(40.0, 22.0), point(90.0, 26.0, "refined")],
         }
     }
-    text = quality_report.report(curves)
+    text = quality.report(curves)
     assert "| room, online, 1 steps | 22.00 | 40 | 20 | 50 |" in text
     assert "| room, refined, 1 steps | 26.00 | 90 | – | – |" in text
     # The refined map of `new` is best after a minute; that of `old` has not come yet.
     assert "| room, new | 23.17 | 25.00 |" in text
     assert "| room, old | – | 24.00 |" in text
-    quality_report.plot(curves, tmp_path / "quality.png")
+    quality.plot(curves, tmp_path / "quality.png")
     assert (tmp_path / "quality.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -111,12 +83,12 @@ def test_another_commit_is_checked_out_and_removed(tmp_path: Path, monkeypatch: 
         git("add", ".")
         git("commit", "-m", text)
     monkeypatch.setattr(quality, "ROOT", tmp_path)
-    assert quality.this_program().keeps
+    commit, root = quality.this_program()
+    assert root == tmp_path and not commit.endswith("+")
     (tmp_path / "file.py").write_text("third")
-    assert not quality.this_program().keeps
-    with quality.against("HEAD~1") as program:
-        assert (program.root / "file.py").read_text() == "first"
-        assert program.keeps
-    assert not program.root.exists()
+    assert quality.this_program()[0] == commit + "+"
+    with quality.against("HEAD~1") as (_, other):
+        assert (other / "file.py").read_text() == "first"
+    assert not other.exists()
     with pytest.raises(InputError, match="no such revision"), quality.against("nowhere"):
         pass
