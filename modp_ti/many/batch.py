@@ -158,10 +158,11 @@ class _Batch:
                 continue
             if event.end is not End.interrupted or event.machine:
                 self._change(name, attempts=known.attempts or 1, machine=event.machine or known.machine)
+            attempts = self._results[name].attempts
             lost = event.end in (End.lost, End.interrupted)  # nobody has asked it to end
-            if retry and lost and self._results[name].attempts < self._shares.attempts:
-                self._change(name, attempts=known.attempts + 1)
-                self._table.retried(name, known.attempts + 1, event.error)
+            if retry and lost and attempts < self._shares.attempts:
+                self._change(name, attempts=attempts + 1)
+                self._table.retried(name, attempts + 1, event.error)
                 self._submit(name)
                 continue
             del self._submitted[name]
