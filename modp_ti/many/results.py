@@ -145,9 +145,7 @@ def write_summary_page(path: Path, results: Sequence[SceneResult], folder: Path 
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    rows: list[dict[str, Any]] = [
-        result.row | {"link": _link(folder or path.parent, result)} for result in results
-    ]
+    rows: list[dict[str, Any]] = [result.row | {"link": _link(folder or path.parent, result)} for result in results]
     page = environment.get_template("summary_page.html.j2").render(
         rows=rows,
         finished=sum(result.state.is_done for result in results),
