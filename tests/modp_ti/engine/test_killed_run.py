@@ -66,13 +66,12 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)])
-def test_a_file_run_saves_its_map_and_goes_on(number: int, code: int, recording: Path, tmp_path: Path) -> None:
+def test_a_file_run_saves_its_map_and_goes_on(recording: Path, tmp_path: Path) -> None:
     shutil.copytree(recording, tmp_path / "scene")
     scene, out = str(tmp_path / "scene" / "scene.yaml"), tmp_path / "scene" / "out"
     run = Run(tmp_path, scene, "--set", "refine.steps=1000000", "--set", "snapshot_every=4")
     wait_for((out / "snapshot.npz").exists)
-    assert run.end(number) == code, run.said
+    assert run.end(signal.SIGTERM) == 143, run.said
     assert set(os.listdir(out)) >= SAVED | {"snapshot.npz"}
     assert not list((tmp_path / "temporary").iterdir())
     assert run.said.strip().splitlines()[-1].startswith("error: interrupted after ")

@@ -150,7 +150,7 @@ def test_a_third_visit_that_is_killed_goes_on_as_one_in_peace(second: Path, tmp_
     The high box is gone, so that keyframes of the earlier visits are masked.
     """
     scene = second_scene(Room(without=[2]), tmp_path)
-    options = ["--onto", str(second), "--set", "snapshot_every=2"]
+    options = ["--onto", str(second), "--set", "snapshot_every=2", "--set", "export.report=false"]
     assert run(scene, *options).returncode == 0
     peace = (tmp_path / "out").rename(tmp_path / "peace")
     names = open_run(second).names

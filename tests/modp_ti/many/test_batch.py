@@ -130,20 +130,15 @@ def test_a_batch_finishes_what_it_can_and_repeats_nothing(
 
 def test_the_command_says_which_scenes_are_finished_by_its_exit_code(recordings: Path) -> None:
     done, gone = recordings / "done" / "scene.yaml", recordings / "gone.yaml"
-    folder = recordings / "batch"
-    result = CliRunner().invoke(app, ["batch", str(done), str(done), "-o", str(folder)])
-    assert (result.exit_code, result.stdout) == (
-        0,
-        f"1 of 1 scenes are finished; the summary is {folder / 'index.html'}\n",
-    )
-    assert "done: finished before, 9 frames" in result.stderr
-    result = CliRunner().invoke(app, ["batch", str(done), str(gone), "-o", str(folder), "--json", "--quiet"])
-    data = json.loads(result.stdout)
-    assert (result.exit_code, data["exit_code"], result.stderr) == (1, 1, "")
-    assert [(row["name"], row["state"]) for row in data["scenes"]] == [
-        ("done", "finished before"),
-        ("gone.yaml", "failed"),
-    ]
+    for named, code, states in (
+        ([done, done], 0, ["finished before"]),
+        ([done, gone], 1, ["finished before", "failed"]),
+    ):
+        arguments = ["batch", *map(str, named), "-o", str(recordings / "batch"), "--json", "--quiet"]
+        result = CliRunner().invoke(app, arguments)
+        data = json.loads(result.stdout)
+        assert (result.exit_code, data["exit_code"], result.stderr) == (code, code, "")
+        assert [row["state"] for row in data["scenes"]] == states
 
 
 @pytest.mark.slow
@@ -157,12 +152,7 @@ def test_a_fault_after_a_scene_is_finished_is_told(recordings: Path) -> None:
 
 def test_scenes_with_other_settings_are_not_taken_for_finished(recordings: Path) -> None:
     done = recordings / "done" / "scene.yaml"
-    for override, state in (
-        ("threads=1", State.before),
-        ("source.prefetch=0", State.before),
-        ("seed=4", State.failed),
-        ("export.images=true", State.failed),
-    ):
+    for override, state in (("threads=1", State.before), ("seed=4", State.failed)):
         with LocalPool(recordings / "logs") as pool:  # a task that is begun fails, as the images are gone
             shutil.rmtree(recordings / "done" / "images", ignore_errors=True)
             (recordings / "done" / "images").unlink(missing_ok=True)
@@ -208,13 +198,3 @@ def test_scenes_share_the_cores_unless_told_otherwise(
     (scene,) = read_scenes([recordings / "done" / "scene.yaml"], [f"device={device}"])
     assert scene.config is not None
     assert shares.of(scene.config, machines, scenes) == expected
-
-
-def test_the_table_is_plain_lines_where_there_is_no_terminal(recordings: Path) -> None:
-    with (recordings / "said").open("w") as said, LocalPool(recordings / "logs") as pool:
-        console = Console(file=said, width=500)
-        run_batch(read_scenes(scene_files(recordings)[2:]), pool, recordings / "batch", console=console)
-    lines = (recordings / "said").read_text().splitlines()
-    assert lines[0] == f"scene.yaml: failed: {recordings / 'gone' / 'scene.yaml'}: no such scene file"
-    assert lines[1].startswith("empty: begun on ")
-    assert lines[-1].startswith("empty: failed: ") and "no such folder of images" in lines[-1]

@@ -92,7 +92,7 @@ def test_a_walk_that_comes_home_with_drift_is_closed_however_long_the_thread_tak
     searched = LoopClosing._searched
 
     def late(*arguments):
-        time.sleep(0.5)
+        time.sleep(0.1)  # some frames
         return searched(*arguments)
 
     monkeypatch.setattr(LoopClosing, "_searched", late)
