@@ -25,6 +25,9 @@ LATER, KNOWN, LOST = 0, 1, 2
 
 NOWHERE = np.zeros((4, 4))
 NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+Pose = NDArray[np.float64]
+# World points (N, 3), their pixels (N, 2) and ids (N,).
+Points = tuple[NDArray, NDArray, NDArray]
 
 
 class ServerError(Exception):
@@ -32,7 +35,7 @@ class ServerError(Exception):
 
 
 class Sender:
-    """Client for `tracker: {kind: socket}`.
+    """Client for `tracker: {kind: socket}`; docs/tracker_server.md describes the messages.
 
     Args:
         address: "host:port", or the path of a Unix socket.
@@ -42,29 +45,9 @@ class Sender:
     def __init__(self, address: str, wait: float = 60.0) -> None:
         self.socket = _connected(address, time.monotonic() + wait)
 
-    def hello(
-        self,
-        width: int,
-        height: int,
-        intrinsics: Sequence[float],
-        encoding: int,
-        lens: int = 0,
-        coefficients: Sequence[float] = (),
-        name: str = "",
-    ) -> None:
-        """Send the camera and wait for the server's answer.
-
-        Args:
-            width: Image width [px].
-            height: Image height [px].
-            intrinsics: fx, fy, cx, cy [px], with pixel centres at +0.5.
-            encoding: Encoding of the images, such as RGB8.
-            lens: Number of the lens model.
-            coefficients: Up to 8 distortion coefficients.
-            name: Name of the tracker.
-        """
-        k = [*coefficients, *[0.0] * (8 - len(coefficients))]
-        self.send(HELLO, struct.pack("<IIII4d8d", width, height, encoding, lens, *intrinsics, *k) + name.encode())
+    def hello(self, width: int, height: int, intrinsics: Sequence[float], encoding: int, name: str = "") -> None:
+        """Send the camera without distortion (fx, fy, cx, cy [px], pixel centres at +0.5), and wait for the answer."""
+        self.send(HELLO, struct.pack("<IIII4d8d", width, height, encoding, 0, *intrinsics, *[0.0] * 8) + name.encode())
         self.expect(WELCOME)
 
     def frame(
@@ -72,53 +55,21 @@ class Sender:
         number: int,
         timestamp: float,
         image: bytes,
-        T_camera_world: NDArray[np.float64] | None = None,
-        points: tuple[NDArray, NDArray, NDArray] = NO_POINTS,
-        state: int | None = None,
+        T_camera_world: Pose | None = None,
+        points: Points = NO_POINTS,
     ) -> None:
-        """Send a frame.
-
-        Args:
-            number: The frame's number.
-            timestamp: Time stamp [s].
-            image: The encoded image.
-            T_camera_world: (4, 4) pose, None if not known yet.
-            points: World points (N, 3), their pixels (N, 2) and ids (N,).
-            state: LATER, KNOWN or LOST, None to derive it from the pose.
-        """
-        state = state if state is not None else LATER if T_camera_world is None else KNOWN
+        """Send a frame. Without its (4, 4) pose, `pose` sends it later, with its points."""
+        state = LATER if T_camera_world is None else KNOWN
         self.send(FRAME, _frame(number, state, timestamp, T_camera_world, points, image))
 
-    def pose(
-        self,
-        number: int,
-        T_camera_world: NDArray[np.float64] | None,
-        points: tuple[NDArray, NDArray, NDArray] = NO_POINTS,
-    ) -> None:
-        """Send the pose of a frame that was sent without one.
-
-        Args:
-            number: The frame's number.
-            T_camera_world: (4, 4) pose, None if tracking was lost.
-            points: World points (N, 3), their pixels (N, 2) and ids (N,).
-        """
+    def pose(self, number: int, T_camera_world: Pose | None, points: Points = NO_POINTS) -> None:
+        """Send the pose of a frame that was sent without one, None if tracking was lost."""
         self.send(POSE, _frame(number, LOST if T_camera_world is None else KNOWN, 0.0, T_camera_world, points, b""))
 
     def correction(
-        self,
-        numbers: NDArray[np.integer],
-        T_camera_world: NDArray[np.float64],
-        ids: NDArray[np.integer] | None = None,
-        xyz: NDArray[np.float64] | None = None,
+        self, numbers: NDArray, T_camera_world: NDArray, ids: NDArray | None = None, xyz: NDArray | None = None
     ) -> None:
-        """Send revised poses and points.
-
-        Args:
-            numbers: (N,) numbers of the frames, ascending.
-            T_camera_world: (N, 4, 4) poses.
-            ids: (M,) ids of the points, or None.
-            xyz: (M, 3) positions of the points, or None.
-        """
+        """Send revised poses (N, 4, 4) of the frames with these ascending numbers, and positions (M, 3) of points."""
         ids, xyz = (np.zeros(0), np.zeros((0, 3))) if ids is None or xyz is None else (ids, xyz)
         payload = struct.pack("<II", len(numbers), len(ids))
         for number, T in zip(numbers, T_camera_world, strict=True):
@@ -128,11 +79,7 @@ class Sender:
         self.send(CORRECTION, payload)
 
     def end(self) -> int:
-        """Announce the end and wait until the last frame has been passed to the mapper.
-
-        Returns:
-            Number of frames that were passed to the mapper.
-        """
+        """Announce the end, and return the number of frames that were passed to the mapper, once all were."""
         self.send(END, b"")
         return struct.unpack("<I", self.expect(DONE))[0]
 
@@ -168,12 +115,7 @@ class Sender:
 
 
 def _frame(
-    number: int,
-    state: int,
-    timestamp: float,
-    T_camera_world: NDArray[np.float64] | None,
-    points: tuple[NDArray, NDArray, NDArray],
-    image: bytes,
+    number: int, state: int, timestamp: float, T_camera_world: Pose | None, points: Points, image: bytes
 ) -> bytes:
     xyz, pixels, ids = points
     table = np.zeros(len(ids), dtype=[("id", "<i8"), ("xyz", "<f8", 3), ("pixel", "<f8", 2)])
@@ -203,18 +145,15 @@ def _connected(address: str, deadline: float) -> socket.socket:
 def play(
     scene: Path, overrides: Sequence[str], address: str, wait: float, late: int = 0, rate: float | None = None
 ) -> int:
-    """Send a scene's frames as its tracker delivers them.
+    """Send a scene's frames as its tracker delivers them, and return how many were passed to the mapper.
 
     Args:
         scene: Scene file.
         overrides: `KEY=VALUE` settings.
-        address: See `Sender`.
-        wait: See `Sender`.
+        address: See `Sender`, as `wait`.
+        wait: How long to wait for the run to listen [s].
         late: Send poses and points this many frames after their images; 0 sends them together.
         rate: Maximum frames per second, None for no limit.
-
-    Returns:
-        Number of frames that were passed to the mapper.
     """
     from fields.frames.pose_correction import PoseCorrection
     from modp_ti.config.scene_file import load_scene
