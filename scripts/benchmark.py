@@ -153,7 +153,8 @@ def measure(kind: str, **arguments: Any) -> dict[str, float]:
     """Run one measurement in this process."""
     if kind == "machine":
         return measure_machine(**arguments)
-    return measure_step(**arguments | {"size": Size(**arguments["size"])})
+    arguments["size"] = Size(**arguments["size"])
+    return measure_step(**arguments)
 
 
 # ---- tables ----------------------------------------------------------------------------------------------------------

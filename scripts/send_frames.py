@@ -164,9 +164,10 @@ def play(
     waiting: deque = deque()
     next_time = time.monotonic()
     sender: Sender | None = None
+    camera = None
 
     def send_poses(kept: int) -> None:
-        while len(waiting) > kept:
+        while sender is not None and len(waiting) > kept:
             sender.pose(*waiting.popleft())
 
     try:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fields.buffers.tiles import TILE_PIXELS, TILE_WIDTH
 from fields.frames.tracked_frame import TrackedFrame
@@ -73,7 +73,7 @@ def camera_of(width: int, height: int) -> PinholeCamera:
     return PinholeCamera(0.85 * width, 0.85 * width, width / 2, height / 2, width, height)
 
 
-def arrays(size: Size) -> dict[str, NDArray[np.float64]]:
+def arrays(size: Size) -> dict[str, Any]:
     """Return random Gaussians at depths of 2 to 6 units by name, as `GaussianField.append` takes them."""
     rng = np.random.default_rng(0)
     camera, n = camera_of(size.width, size.height), size.gaussians
@@ -178,15 +178,16 @@ def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool
         renderer.compositing.backward, renderer.projection.backward,
         lambda: optimiser.aspect.backward(weights.aspect_weight, store.scene_depth), lambda: optimiser.adam.step(still),
     )  # fmt: skip
-    figures = milliseconds(dict(zip(STAGES, calls, strict=True)), repeats)
+    pairs: Any = renderer.pairs  # whose form depends on the device
+    figures: dict[str, Any] = milliseconds(dict(zip(STAGES, calls, strict=True)), repeats)
     figures["visible"] = renderer.projected.seen[None]  # on a GPU, `count` is only an upper bound
     # On a GPU, one thread per pixel visits whole tiles.
-    figures["pairs visited"] = figures["pairs of whole tiles"] = renderer.pairs.count * TILE_PIXELS
+    figures["pairs visited"] = figures["pairs of whole tiles"] = pairs.count * TILE_PIXELS
     if on_cpu:
-        rows = renderer.pairs.rows_to_numpy()
+        rows = pairs.rows_to_numpy()
         figures["pairs visited"] = int(((rows >> 16) - (rows & 0xFFFF)).sum()) * TILE_WIDTH
     if on_cpu and twin:
-        plain = ReferenceCompositing(renderer.view, renderer.projected, renderer.pairs, renderer.images)
+        plain = ReferenceCompositing(renderer.view, renderer.projected, pairs, renderer.images)
         figures |= milliseconds({"twin": plain.forward, "twin backward": plain.backward}, min(repeats, 5))
     wall, busy = time.perf_counter(), time.process_time()
     figures |= milliseconds({"step": lambda: optimiser.step(store, [0], still, pose_rate=0.0)}, repeats)

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import benchmark
 import numpy as np
@@ -69,7 +70,7 @@ def test_the_scene_lies_in_the_picture() -> None:
     assert camera.contains(camera.project(position)).all() and position[:, 2].min() >= 2.0
 
 
-def made_up(kind: str, **arguments: object) -> object:
+def made_up(kind: str, **arguments: Any) -> dict[str, Any]:
     """Figures from which the tables' numbers can be told by hand."""
     threads = arguments.get("threads", 1)
     if kind == "machine":

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tables
@@ -17,7 +18,7 @@ from modp_ti.files.errors import InputError
 
 @pytest.mark.parametrize("variant", list(tables.VARIANTS))
 def test_every_variant_changes_what_it_names_and_nothing_else(scene: Path, variant: str) -> None:
-    def flat(overrides: dict[str, str]) -> dict[str, object]:
+    def flat(overrides: dict[str, str]) -> dict[str, Any]:
         settings = load_scene(scene, [f"{key}={value}" for key, value in overrides.items()]).mapping.model_dump()
         return {f"mapping.{a}.{b}": v for a, of in settings.items() if isinstance(of, dict) for b, v in of.items()}
 

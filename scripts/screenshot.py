@@ -1,16 +1,22 @@
-"""Pages in headless Chromium, with software WebGL for machines without a GPU."""
+"""Take a screenshot of the viewer's page in headless Chromium: `scripts/screenshot URL FILE.png`."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from ending import documented_ending
+
+from modp_ti.files.errors import InputError
+
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
+# Software WebGL for machines without a GPU.
 OPTIONS = [
     "--no-sandbox",
     "--use-gl=angle",
@@ -20,7 +26,7 @@ OPTIONS = [
 ]
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 # Timeout for the page to load with software rendering on a busy machine [ms].
-PATIENCE = 300_000
+PATIENCE = 120_000
 
 
 def missing() -> str | None:
@@ -62,3 +68,28 @@ def choose_mode(page: Page, mode: str) -> None:
     """Select the display mode."""
     page.locator("input[role=combobox]:visible").first.click()
     page.get_by_role("option", name=mode, exact=True).click()
+
+
+@documented_ending()
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("url", help="what `modp-ti run --view` or `modp-ti view` printed")
+    parser.add_argument("file", help="PNG to write")
+    parser.add_argument("--mode", default="splats", help="what the page shows")
+    parser.add_argument("--wait", type=float, default=15.0, help="seconds for the page to show it")
+    parser.add_argument("--until", help="text in the page that is waited for first, two minutes long: `frame 30`")
+    arguments = parser.parse_args()
+    if lacking := missing():
+        raise InputError(lacking)
+    with open_page(arguments.url) as page:
+        if arguments.until:
+            page.get_by_text(arguments.until).first.wait_for()
+        if arguments.mode != "splats":
+            choose_mode(page, arguments.mode)
+        page.wait_for_timeout(1000 * arguments.wait)
+        page.screenshot(path=arguments.file)
+
+
+if __name__ == "__main__":
+    main()
