@@ -128,7 +128,7 @@ def test_work_is_that_of_warps_of_two_rows() -> None:
         for pair in range(0, n, 2):
             rows += max(len(these) for these in reached[pair : pair + 2])
         k += n
-    work = count_work(Size(16, 640, 100), per_tile, packed)
+    work = count_work(Size(16, 640, 100), per_tile.astype(np.int32), packed)
     assert (work.tiles, work.pairs, work.hits, work.rows, work.pixel_pairs) == (40, k, hits, rows, pixels)
     assert work.batches == {"forward": np.count_nonzero(per_tile), "backward": np.count_nonzero(per_tile)}
 
