@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["EndingSignals", "exit_code", "left_to_parent", "withheld"]
+__all__ = ["EndingSignals", "RecordingInterrupt", "exit_code", "left_to_parent", "withheld"]
 
 ENDING = tuple(number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGHUP"))
 # Time [s] after a signal within which a SIGHUP says nothing new: shell and system both send it, systemd after SIGTERM.
@@ -67,6 +67,30 @@ class EndingSignals:
             before[number](number, None)
 
         return pass_on
+
+
+class RecordingInterrupt:
+    """Handler of Ctrl-C, SIGTERM and SIGHUP while a live source records. It must be made in the main thread.
+
+    The first of them gives the signals back to the handlers that were there before. If the recording had ended already,
+    that handler is called at once.
+
+    Args:
+        finish: Ends the recording; returns whether it was going on. It is called in the signal handler.
+    """
+
+    def __init__(self, finish: Callable[[], bool]) -> None:
+        self._finish = finish
+        self._signals = EndingSignals(self._pressed, others=True)
+
+    def give_back(self) -> None:
+        """Restore the handlers that were there before."""
+        self._signals.give_back()
+
+    def _pressed(self, number: int) -> None:
+        pass_on = self._signals.give_back()
+        if not self._finish():
+            pass_on(number)
 
 
 @contextmanager

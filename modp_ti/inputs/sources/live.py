@@ -10,17 +10,17 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from modp_ti.files.ending_signals import RecordingInterrupt
 from modp_ti.files.errors import InputError
 from modp_ti.files.urls import shown_url
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
-from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import FrameStore, kept_frames
 from modp_ti.inputs.sources.image_pixels import quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -57,12 +57,15 @@ class LiveSource(ImageSource):
     Args:
         stream: Number of a camera, or URL.
         folder: Folder for the frames, which belongs to the caller. If it is None, `close` removes a temporary one.
+        clock: Monotonic clock [s], by which frames arrive and the tracker's time is measured.
 
     Raises:
         InputError: If the stream cannot be opened or sends no frame.
     """
 
-    def __init__(self, stream: int | str, folder: Path | None = None) -> None:
+    def __init__(
+        self, stream: int | str, folder: Path | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         if isinstance(stream, str) and stream.isdigit():
             stream = int(stream)
         super().__init__(Path(_shown(stream)))
@@ -76,7 +79,7 @@ class LiveSource(ImageSource):
         self._received: list[float] = []
         self._capture = _open(stream)
         # The system clock may be adjusted during the recording, so times advance with the monotonic clock.
-        self._clock = time.time() - time.monotonic()
+        self._clock, self._epoch = clock, time.time() - clock()
         first = self._grab()
         if first is None or first[1] is None:
             self._capture.release()
@@ -192,7 +195,7 @@ class LiveSource(ImageSource):
 
         try:
             more = self._capture.grab()
-            arrived = time.monotonic()
+            arrived = self._clock()
             with self._changed:
                 wanted = self._backlog.wants()
             if more and not wanted:
@@ -250,7 +253,7 @@ class LiveSource(ImageSource):
         with self._delivering:
             while len(self._names) <= position:
                 with self._changed:
-                    while (taken := self._backlog.take(time.monotonic())) is None:
+                    while (taken := self._backlog.take(self._clock())) is None:
                         if self._ended:
                             return False
                         self._changed.wait()
@@ -275,9 +278,9 @@ class LiveSource(ImageSource):
         else:
             self._store.write(self._store.file(number), captured.image)
             self._last = name, captured.image  # the tracker reads it next, so it need not be decoded
-        self._store.date(number, self._clock + arrived)
+        self._store.date(number, self._epoch + arrived)
         self._received.append(arrived)
-        self._append(name, self._clock + arrived)
+        self._append(name, self._epoch + arrived)
 
     def _interrupted(self) -> bool:
         """End the recording in a signal handler; return whether it was going on."""

@@ -19,14 +19,13 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.child_environment import child_environment
-from modp_ti.files.ending_signals import withheld
+from modp_ti.files.ending_signals import RecordingInterrupt, withheld
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.replay import read_again
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
-from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
 from modp_ti.inputs.sources.frame_store import StoredFrames, kept_frames
 from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
 from modp_ti.inputs.tracking_process.frame_record import FrameRecord

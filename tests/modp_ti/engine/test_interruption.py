@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from modp_ti.engine.interruption import Interruption, RunStopped
-from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
+from modp_ti.files.ending_signals import RecordingInterrupt
 
 
 def press() -> None:
@@ -92,7 +93,7 @@ def test_afterwards_it_is_what_it_was() -> None:
 
 
 @pytest.mark.parametrize("taken", [signal.SIG_IGN, lambda *_: None])
-def test_it_is_left_to_whoever_has_it_already(taken: object) -> None:
+def test_it_is_left_to_whoever_has_it_already(taken: Any) -> None:
     signal.signal(signal.SIGINT, taken)
     with Interruption(lambda: pytest.fail("not ours")) as stop:
         press()

@@ -9,8 +9,7 @@ import pytest
 
 from modp_ti.engine.interruption import Interruption
 from modp_ti.files import ending_signals
-from modp_ti.files.ending_signals import EndingSignals, exit_code
-from modp_ti.inputs.sources.ctrl_c import RecordingInterrupt
+from modp_ti.files.ending_signals import EndingSignals, RecordingInterrupt, exit_code
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 
@@ -34,7 +33,7 @@ def as_in_a_terminal() -> Iterator[None]:
 @pytest.mark.parametrize("second", CODES)
 @pytest.mark.parametrize("first", CODES)
 def test_the_first_is_noted_and_a_second_stops_at_once(
-    first: int, second: int, monkeypatch: pytest.MonkeyPatch
+    first: signal.Signals, second: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ending_signals, "SAME_HANGUP", 0.0)
     signals = EndingSignals()

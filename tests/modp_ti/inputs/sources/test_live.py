@@ -20,7 +20,7 @@ from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.sources import live, thinning
+from modp_ti.inputs.sources import live
 from modp_ti.inputs.sources.live import LiveSource
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.patience import PATIENCE
@@ -49,11 +49,14 @@ def camera():
 
 @pytest.fixture
 def opened(camera):
-    """Opens the camera, which needs some frames sent to begin with, and closes it at the end of the test."""
+    """Opens the camera, which needs some frames sent to begin with, and closes it at the end of the test.
+
+    By its clock no time passes unless the test says so: a pause of this machine is no slow tracker, nor a slow camera.
+    """
     sources = []
 
-    def make() -> LiveSource:
-        sources.append(LiveSource(camera.url))
+    def make(clock=lambda: 100.0) -> LiveSource:
+        sources.append(LiveSource(camera.url, clock=clock))
         return sources[-1]
 
     yield make
@@ -77,7 +80,7 @@ def test_frames_arrive_in_order_with_their_times_and_can_be_read_again(camera, o
     camera.send(*range(6))
     camera.end()
     before = time.time()
-    source = opened()
+    source = opened(time.monotonic)
     names = list(source.arriving(0, None, 1))
     assert names == [f"live_{i:06d}" for i in range(6)] == list(source.names)
     times = [source.timestamp(name) for name in names]
@@ -104,7 +107,7 @@ def test_what_is_read_again_is_what_the_decoder_gave(camera, opened):
     camera.end()
     source = opened()
     name = list(source.arriving(0, None, 1))[3]
-    expected = cv2.imdecode(np.frombuffer(jpeg(3), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    expected = np.asarray(cv2.imdecode(np.frombuffer(jpeg(3), np.uint8), cv2.IMREAD_COLOR))[..., ::-1]
     image = source.read(name)
     assert np.abs(image.astype(int) - expected).max() <= 2  # two decoders of JPEG
     source._last = None  # so that it is read from the disk
@@ -123,7 +126,6 @@ def test_a_frame_is_delivered_before_the_next_has_come(camera, opened):
 
 def test_frames_that_nobody_takes_wait_on_disk_beyond_a_limit_of_memory(camera, opened, monkeypatch):
     monkeypatch.setattr(live, "MEMORY", 3 * 64 * 48 * 3)
-    monkeypatch.setattr(thinning, "FEWEST_COSTS", 20)  # nothing is thinned, however long this machine pauses
     camera.send(*range(20))
     camera.end()
     source = opened()
@@ -141,12 +143,13 @@ def test_a_slow_tracker_gets_thinned_frames_and_all_are_counted(camera, opened, 
     monkeypatch.setattr(live, "MEMORY", 3 * 64 * 48 * 3)
     camera.send(*range(45))
     camera.end()
-    source = opened()
+    now = [100.0]
+    source = opened(lambda: now[0])
     wait_until(lambda: not source._thread.is_alive())
     taken = []
     for name in source.arriving(0, None, 1):
         taken += numbers(source, [name])
-        time.sleep(0.02)  # the 45 frames came in much less
+        now[0] += 0.02  # the 45 frames came in none
     assert len(taken) + source.arrivals.thinned == source.arrivals.arrived == 45
     assert len(taken) < 45 and taken == sorted(set(taken))
     assert source.notes[-2].startswith(f"{45 - len(taken)} of 45 frames of ")
@@ -251,6 +254,7 @@ def test_given_intrinsics_are_for_the_streams_size(camera):
     source = open_source(settings)
     camera.end()
     source.close()
+    assert source.intrinsics is not None
     assert (source.intrinsics.camera.cx, source.intrinsics.camera.height) == (32.0, 48)
 
 
@@ -296,7 +300,7 @@ def test_room_for_the_map_is_kept_on_the_disk(camera, opened, monkeypatch):
 
 def test_a_tracker_without_a_map_says_that_the_disk_was_full(camera, opened, monkeypatch):
     camera.send(*range(6))
-    source = opened()
+    source = opened(time.monotonic)
     tracker = open_klt(SourceSettings(stream=camera.url), images=source)
     arriving = tracker.events()
     monkeypatch.setattr("modp_ti.inputs.sources.frame_store.has_room", lambda *_: len(source.names) < 3)
